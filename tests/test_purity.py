@@ -58,7 +58,7 @@ def test_datagen() -> None:
     colours = np.full((2, 3, 8, 8), 99.0)
     same_after(
         lambda: elevation.inclination_deg(
-            *elevation.horn_gradient(elevation.framed(z), 0.5)
+            *elevation.horn_gradient(elevation.pad_missing(z), 0.5)
         ),
         z,
     )

@@ -1,8 +1,7 @@
-"""The command `benchnav-datagen`: make, list, show, check, combine, import, export and
-draw datasets.
+"""Command `benchnav-datagen`: create, inspect, merge, import and export datasets.
 
-What is heavy is imported where it is called, or asked of `datagen` there, so that the
-command's help is quick.
+Slow modules are imported where they are used, directly or through `datagen`. The
+command's help is fast therefore.
 """
 
 import sys
@@ -19,8 +18,8 @@ from benchnav.core.store import check_workers, read_shard, replacing, write_text
 from benchnav.core.tables import Table, print_table
 from benchnav.datagen.import_commands import import_dem, import_drives
 
-# A dataset of more becomes a folder of files.
-_MOST_CELLS_OF_A_FILE = 2**28
+# A larger dataset is a folder of files.
+_MAX_CELLS_PER_FILE = 2**28
 
 
 def create(
@@ -42,21 +41,20 @@ def create(
         recipe: Id of a shipped recipe, such as paper-v1, or path of a YAML file.
         overrides: Changes to it, such as id=mine splits.train.maps=50
             scenarios.hs.severity=0.5.
-        out: File .h5, or a folder for many files; datasets/ID.h5 if not given,
+        out: File .h5, or a folder for many files. If empty, datasets/ID.h5, or
             datasets/ID for many maps.
-        jobs: Worker processes of this machine; a cluster has its own. The result is the
-            same for any number.
-        seed: Root seed in place of the recipe's; makes other maps of the same classes,
-            under the id ID-seedN.
-        splits: Only these splits, for example [test/std,test/hg]; the same maps as in
-            the whole.
-        first: Number of maps of each split to make, the first of the whole dataset; 0
-            makes all.
-        shard: Make only this shard of the maps, such as 2/5; the others may be made on
-            other machines.
+        jobs: Worker processes on this machine; a cluster has its own. The result does
+            not depend on their number.
+        seed: Root seed instead of the recipe's, for other maps of the same classes;
+            their id is ID-seedN.
+        splits: Only these splits, for example [test/std,test/hg]; their maps are the
+            same as in the complete dataset.
+        first: Only this number of maps of each split, from the first; 0 for all.
+        shard: Only this shard of the maps, such as 2/5; other machines may make the
+            others.
         backend: Worker processes on this machine, or those of a Dask cluster.
         scheduler: Address of the Dask cluster's scheduler, tcp://HOST:PORT.
-        overwrite: Replace what is there.
+        overwrite: Replace an existing dataset.
     """
     from benchnav.datagen.difficulty import table
     from benchnav.datagen.files.describe import written
@@ -64,30 +62,27 @@ def create(
 
     check_workers(jobs, backend, scheduler)
     expect(first >= 0, f"`first` ≥ 0, got {first}.")
-    own = read_shard(shard)
-    chosen = datagen.load_recipe(recipe, overrides)
-    if seed is not None and seed != chosen.seed:
-        chosen = replace(chosen, seed=seed, id=f"{chosen.id}-seed{seed}")
+    requested = read_shard(shard)
+    loaded = datagen.load_recipe(recipe, overrides)
+    if seed is not None and seed != loaded.seed:
+        loaded = replace(loaded, seed=seed, id=f"{loaded.id}-seed{seed}")
     sizes = {}
-    for name in choose("splits", splits, chosen.splits):
-        spec = chosen.splits[name]
+    for name in choose("splits", splits, loaded.splits):
+        spec = loaded.splits[name]
         sizes[name] = replace(spec, maps=min(first or spec.maps, spec.maps))
-    chosen, maps = (
-        replace(chosen, splits=sizes),
-        sum(spec.maps for spec in sizes.values()),
-    )
-    is_folder = (
-        own is not None or maps * chosen.height * chosen.width > _MOST_CELLS_OF_A_FILE
-    )
-    path = Path(out or f"datasets/{chosen.id}{'' if is_folder else '.h5'}")
-    steps = datagen.create_dataset(chosen, path, jobs, scheduler, own, overwrite)
+    loaded = replace(loaded, splits=sizes)
+    n_maps = sum(spec.maps for spec in sizes.values())
+    n_cells = n_maps * loaded.height * loaded.width
+    is_folder = requested is not None or n_cells > _MAX_CELLS_PER_FILE
+    path = Path(out or f"datasets/{loaded.id}{'' if is_folder else '.h5'}")
+    steps = datagen.create_dataset(loaded, path, jobs, scheduler, requested, overwrite)
     done, total = next(steps)
     if done:
-        tell(f"{done} of {total} maps were there already")
+        tell(f"{done} of {total} maps exist already")
     show_progress(chain([(done, total)], steps), "maps")
     if not is_dataset(path):
         print(
-            f"{path}: shard {own} is made\n"
+            f"{path}: shard {requested} is made\n"
             "The last shard made in this folder finishes the dataset. Join shards of "
             "several folders with\n"
             f"benchnav-datagen merge {path} OTHER … --out OUT"
@@ -97,10 +92,10 @@ def create(
 
 
 def list_datasets(folder: str = "") -> None:
-    """List the shipped recipes and the datasets at hand.
+    """List the shipped recipes and the local datasets.
 
     Args:
-        folder: Where to look for files; where ids are looked up when not given.
+        folder: Folder to search. If empty, all folders in which ids are looked up.
     """
     from benchnav.datagen.files.describe import widest
     from benchnav.datagen.files.find import dataset_folders
@@ -112,37 +107,31 @@ def list_datasets(folder: str = "") -> None:
         f"`folder` as a folder that exists, got {folder!r}.",
     )
     print("recipes:")
-    wide = widest(datagen.shipped_recipes())
-    for name in datagen.shipped_recipes():
-        sizes = ", ".join(
-            f"{split} {maps}" for split, maps in shipped_sizes(name).items()
-        )
-        print(f"  {name:{wide}} {sizes}")
-    for place in [Path(folder)] if folder else dataset_folders():
-        folders = [manifest.parent for manifest in place.glob(f"*/{FOLDER_MANIFEST}")]
-        files = sorted([*place.glob("*.h5"), *folders])
-        print(f"files in {place}:" if files else f"no files in {place}")
-        wide = widest(path.name for path in files)
+    recipes = datagen.shipped_recipes()
+    width = widest(recipes)
+    for name in recipes:
+        sizes = [f"{split} {maps}" for split, maps in shipped_sizes(name).items()]
+        print(f"  {name:{width}} {', '.join(sizes)}")
+    for parent in [Path(folder)] if folder else dataset_folders():
+        folders = [manifest.parent for manifest in parent.glob(f"*/{FOLDER_MANIFEST}")]
+        files = sorted([*parent.glob("*.h5"), *folders])
+        print(f"files in {parent}:" if files else f"no files in {parent}")
+        width = widest(path.name for path in files)
         for path in files:
             try:
                 dataset = datagen.TerrainDataset(path)
             except DatasetError as error:
-                print(f"  {path.name:{wide}} not readable: {error}")
+                print(f"  {path.name:{width}} not readable: {error}")
                 continue
-            sizes = ", ".join(
-                f"{split} {entry['maps']}" for split, entry in dataset.splits.items()
-            )
-            layers = (
-                f"; layers {', '.join(dataset.layer_names)}"
-                if dataset.layer_names
-                else ""
-            )
-            print(f"  {path.name:{wide}} {dataset.id:14} {sizes}{layers}")
+            splits = dataset.splits.items()
+            text = ", ".join(f"{split} {entry['maps']}" for split, entry in splits)
+            if dataset.layer_names:
+                text += f"; layers {', '.join(dataset.layer_names)}"
+            print(f"  {path.name:{width}} {dataset.id:14} {text}")
 
 
 def show(file: str, json: bool = False) -> None:
-    """Show what a dataset holds: splits, scenarios, sizes, class table, provenance,
-    digests.
+    """Show splits, scenarios, sizes, class table, provenance and digests of a dataset.
 
     Args:
         file: Path or id of a dataset.
@@ -164,7 +153,7 @@ def show(file: str, json: bool = False) -> None:
 
 
 def validate(file: str) -> int:
-    """Check a dataset whole; exit status 1 when something is wrong.
+    """Check a complete dataset; the exit status is 1 if it has faults.
 
     Args:
         file: Path or id of a dataset.
@@ -181,38 +170,36 @@ def validate(file: str) -> int:
         print(line)
     entries = datagen.TerrainDataset(path).splits.values()
     if not faults:
-        print(
-            f"{path}: sound, {sum(entry['maps'] for entry in entries)} maps in "
-            f"{len(entries)} split(s)"
-        )
+        n_maps = sum(entry["maps"] for entry in entries)
+        print(f"{path}: sound, {n_maps} maps in {len(entries)} split(s)")
         return 0
     print(f"{path}: {len(faults)} fault(s)")
     files = sorted({fault.file for fault in faults if fault.file})
-    if not all("recipe" in part for entry in entries for part in entry["parts"]):
-        print("To mend it, import its maps again.")
+    parts = [part for entry in entries for part in entry["parts"]]
+    if not all("recipe" in part for part in parts):
+        print("To repair it, import its maps again.")
     elif files:
         print(
-            f"To mend it, remove {' '.join(files)} in {path} and give the command "
+            f"To repair it, remove {' '.join(files)} in {path} and run the command "
             "that made it again."
         )
     else:
         print(
-            "To mend it, make the file again with --overwrite. The same recipe and "
+            "To repair it, make the file again with --overwrite. The same recipe and "
             "version give the same digests."
         )
     return 1
 
 
 def merge(files: list[str], out: str, id: str = "", overwrite: bool = False) -> None:
-    """Combine datasets of the same grid and classes to one; splits of one name are
-    joined.
+    """Merge datasets of the same grid and classes; splits of the same name are joined.
 
     Args:
         files: Paths or ids of two or more datasets, or folders with the shards of one.
         out: File .h5 to write, or a folder for many files.
-        id: Id of the new dataset; the name of the file when not given. Shards keep that
-            of their recipe.
-        overwrite: Replace what is there.
+        id: Id of the new dataset. If empty, the name of the file; shards keep the id of
+            their recipe.
+        overwrite: Replace an existing dataset.
     """
     from benchnav.datagen.files.describe import written
     from benchnav.datagen.files.merge import merge as merge_datasets
@@ -227,17 +214,15 @@ def merge(files: list[str], out: str, id: str = "", overwrite: bool = False) -> 
 
 
 def ground(file: str, out: str = "", overwrite: bool = False) -> None:
-    """Write what is known of ground before any of it is seen: statistics of all maps of
-    the split train together.
+    """Write terrain statistics over all maps of the split train.
 
-    Beliefs need them of cells that a robot has not seen yet, and of classes that look
-    alike.
+    Beliefs need them for unobserved cells, and for look-alike classes.
 
     Args:
         file: Path or id of a dataset with a split train.
-        out: File .json to write; beside the dataset, as DATASET.ground.json, when not
-            given. There they are found of any model that brings none of its own.
-        overwrite: Replace a file that is there.
+        out: File .json to write. If empty, DATASET.ground.json next to the dataset,
+            where models without their own statistics find it.
+        overwrite: Replace an existing file.
     """
     from benchnav.datagen.ground import fit_ground, ground_file
 
@@ -249,17 +234,16 @@ def ground(file: str, out: str = "", overwrite: bool = False) -> None:
         f"`out` as a new file, got {path}, which exists. Pass --overwrite to replace "
         "it.",
     )
-    found = fit_ground(dataset)
-    write_text(path, found.to_json())
-    pairs = ", ".join(" and ".join(pair) for pair in found.look_alikes)
-    alike = (
-        f"; {pairs} look alike, strength of the field {found.potts_strength:.2f}"
-        if pairs
-        else ""
-    )
+    statistics = fit_ground(dataset)
+    write_text(path, statistics.to_json())
+    pairs = ", ".join(" and ".join(pair) for pair in statistics.look_alikes)
+    look_alikes = ""
+    if pairs:
+        strength = f"{statistics.potts_strength:.2f}"
+        look_alikes = f"; {pairs} look alike, strength of the field {strength}"
     print(
         f"wrote {path}: λ of {dataset.map_count('train')} maps by "
-        f"{len(found.weights)} Gaussians{alike}"
+        f"{len(statistics.weights)} Gaussians{look_alikes}"
     )
 
 
@@ -275,22 +259,22 @@ def export(
     date: str = "",
     overwrite: bool = False,
 ) -> None:
-    """Export a dataset to Parquet files with Croissant metadata, which other tools read
-    without this package.
+    """Export a dataset to Parquet files with Croissant metadata, for other tools.
 
     Args:
         file: Path or id of a dataset.
         out: Folder to write.
         splits: Only these splits, for example [test/std,test/hg].
         fields: Only these fields, for example [rgb,class_id].
-        maps_per_file: Most maps of a file; 0 makes files of a few hundred MB at most.
-        license: Name in the SPDX list, such as CC-BY-4.0, or a URL; of maps of a
-            shipped recipe MIT when not given.
-        creator: Who made the maps; of maps of a shipped recipe the BenchNav authors
-            when not given.
-        url: Where the dataset will be found.
-        date: Date of publication, YYYY-MM-DD; today when not given.
-        overwrite: Replace an exported dataset that is there.
+        maps_per_file: Maximum number of maps of a file; 0 limits files to a few hundred
+            MB.
+        license: Name in the SPDX list, such as CC-BY-4.0, or a URL. If empty, MIT for
+            maps of a shipped recipe.
+        creator: Creator of the maps. If empty, the BenchNav authors for maps of a
+            shipped recipe.
+        url: Future address of the dataset.
+        date: Date of publication, YYYY-MM-DD. If empty, today.
+        overwrite: Replace an existing exported dataset.
     """
     from rich.filesize import decimal
 
@@ -302,12 +286,12 @@ def export(
     expect(
         (license and creator) or is_ours(dataset, chosen),
         f"`license` and `creator` of {dataset.id}, whose maps are not of a shipped "
-        "recipe, got none. Pass yours; of "
-        "imported maps those of the elevation model, its classes and photo.",
+        "recipe, got none. Pass yours; for imported maps, those of the elevation "
+        "model, its classes and photo.",
     )
-    publication = Publication(
-        license=license or "MIT", creator=creator or AUTHORS, url=url, date=date
-    )
+    license = license or "MIT"
+    creator = creator or AUTHORS
+    publication = Publication(license=license, creator=creator, url=url, date=date)
     path = Path(out)
     steps = export_dataset(
         dataset, path, publication, chosen, fields, maps_per_file, overwrite
@@ -328,27 +312,23 @@ def preview(
     out: str = "",
     contact_sheet: bool = False,
 ) -> None:
-    """Draw maps of a dataset to a picture.
+    """Draw maps of a dataset to an image file.
 
     Args:
         file: Path or id of a dataset.
-        split: Which split; test/std, or else the first, when not given.
-        maps: Which maps; [0, 1, 2] when not given.
-        out: Picture to write; preview-SPLIT.png or contact-SPLIT.png when not given.
-        contact_sheet: Thumbnails of the split's maps instead; of a large one, of its
-            first 100.
+        split: Split to draw. If empty, test/std, or else the first.
+        maps: Indices of the maps. If not given, [0, 1, 2].
+        out: Image file to write. If empty, preview-SPLIT.png or contact-SPLIT.png.
+        contact_sheet: Draw thumbnails of up to 100 maps of the split instead.
     """
     from benchnav.datagen.preview import contact_sheet_figure, preview_figure
     from benchnav.viz.style import save
 
     dataset = _opened(file)
-    split = split or (
-        "test/std" if "test/std" in dataset.splits else next(iter(dataset.splits))
-    )
-    path = Path(
-        out
-        or f"{'contact' if contact_sheet else 'preview'}-{split.replace('/', '-')}.png"
-    )
+    default = "test/std" if "test/std" in dataset.splits else next(iter(dataset.splits))
+    split = split or default
+    kind = "contact" if contact_sheet else "preview"
+    path = Path(out or f"{kind}-{split.replace('/', '-')}.png")
     expect(
         path.suffix in (".png", ".pdf", ".svg", ".jpg"),
         f"`out` to end in .png, .pdf, .svg or .jpg, got {str(path)!r}.",
@@ -358,19 +338,16 @@ def preview(
     if contact_sheet:
         figure = contact_sheet_figure(dataset, split)
     else:
-        some = (
-            range(min(3, dataset.map_count(split)))
-            if maps is None
-            else sorted(set(maps))
-        )
-        figure = preview_figure(dataset, split, list(some))
+        if maps is None:
+            maps = list(range(min(3, dataset.map_count(split))))
+        figure = preview_figure(dataset, split, sorted(set(maps)))
     with replacing(path) as partial:
         save(figure, partial, path.suffix[1:])
     print(f"wrote {path}")
 
 
 def _opened(file: str) -> "datagen.TerrainDataset":
-    """The dataset of a path or an id."""
+    """Return the dataset of a path or an id."""
     return datagen.TerrainDataset(datagen.find_dataset(file))
 
 
@@ -398,7 +375,7 @@ def main() -> None:
     status = run("benchnav-datagen", description, COMMANDS)
     if status == INTERRUPTED and sys.argv[1] == "create":
         tell(
-            "benchnav-datagen: finished maps are kept; to go on, give the same "
-            "command again"
+            "benchnav-datagen: finished maps are kept; to resume, run the same command "
+            "again"
         )
     sys.exit(status)

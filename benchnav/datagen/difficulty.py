@@ -1,8 +1,7 @@
-"""How hard the maps of a dataset are to cross, a split at a time.
+"""Difficulty of the maps of a dataset, split by split.
 
-Hard ground is told before anything is trained or driven on it: where a straight line to
-the goal is free on nearly every map, no planner has anything to plan. Letters in
-shapes: B maps, H×W cells.
+It is measured before training and evaluation: if a straight line to the goal is free on
+nearly every map, planners have nothing to plan. Letters in shapes: B maps, H×W cells.
 """
 
 import numpy as np
@@ -24,7 +23,6 @@ _HEADINGS = (
     "time s,\nrange",
     "straight\nfree",
 )
-# What columns hold.
 _NOTES = (
     "stuck: true mean λ ≤ λ_stuck. soft ground: classes with soft spots, which no "
     "colour shows. soft spots: of all.",
@@ -34,10 +32,10 @@ _NOTES = (
 
 
 def of_split(dataset: TerrainDataset, split: str) -> Maps:
-    """Measures all maps of a split, some at a time; see `measure`.
+    """Return the difficulty of all maps of a split, measured in chunks; see `measure`.
 
     Raises:
-        DatasetError: there is no such split, or its data are damaged.
+        DatasetError: If there is no such split, or its data are damaged.
     """
     fields = (
         "class_id",
@@ -47,74 +45,71 @@ def of_split(dataset: TerrainDataset, split: str) -> Maps:
         "reference_time_s",
         *dataset.truth_names,
     )
-    return join_maps(
-        [measure(maps, dataset.recipe) for _, maps in dataset.chunks(split, fields)]
-    )
+    chunks = dataset.chunks(split, fields)
+    return join_maps([measure(maps, dataset.recipe) for _, maps in chunks])
 
 
 def measure(maps: Maps, recipe: Recipe) -> Maps:
-    """Measures what stands in a robot's way on some maps.
+    """Return the difficulty of some maps.
 
     Args:
         maps: `class_id`, `slope_deg`, `start_m`, `goal_m` and `reference_time_s`, as
-            stored, and the fields of `schema.TRUTH` where the dataset has them.
+            stored, and the fields of `schema.TRUTH`, if the dataset has them.
         recipe: class table, resolution and λ_stuck.
 
     Returns:
-        Of each map, arrays of shape [B]; shares are of the cells whose class is known:
-            stuck: share of the cells whose true E[λ] is at most λ_stuck.
-            soft_ground: share of the cells whose class has soft spots.
-            soft_spots: share of the ground that is a soft spot, in the mean over all
-                draws of λ.
+        Arrays of shape [B]; fractions are relative to all labelled cells of a map:
+            stuck: fraction of cells whose true E[λ] is at most λ_stuck.
+            soft_ground: fraction of cells whose class has soft spots.
+            soft_spots: expected fraction of soft spots over all draws of λ.
             straight: whether all cells of the straight line from start to goal have a
                 true E[λ] above λ_stuck.
-            reference_times_s: grid reference time, not finite where there is none.
+            reference_times_s: grid reference time, non-finite if it is missing.
     """
     truth = latent.stored_truth(maps, recipe.classes)
-    stuck = latent.expected_of(truth) <= recipe.stuck_threshold  # not where it is NaN
-    spots = truth[0][:, 1:].sum(axis=1)  # weight of the soft spots
+    stuck = latent.expected_of(truth) <= recipe.stuck_threshold  # False at NaN
+    soft_weight = truth[0][:, 1:].sum(axis=1)
     labelled = maps["class_id"] != UNLABELLED
     on_line = crossed_cells(recipe.grid, maps["start_m"], maps["goal_m"])
     counts = np.maximum(1, labelled.sum(axis=(1, 2)))
-    shares = {"stuck": stuck, "soft_ground": spots > 0, "soft_spots": spots}
+
+    def mean(values: ndarray) -> ndarray:
+        return (values * labelled).sum(axis=(1, 2)) / counts
+
     return {
-        **{
-            name: (values * labelled).sum(axis=(1, 2)) / counts
-            for name, values in shares.items()
-        },
+        "stuck": mean(stuck),
+        "soft_ground": mean(soft_weight > 0),
+        "soft_spots": mean(soft_weight),
         "straight": ~(stuck & on_line).any(axis=(1, 2)),
         "reference_times_s": maps["reference_time_s"].astype(np.float64),
     }
 
 
 def crossed_cells(grid: Grid, start_m: ndarray, goal_m: ndarray) -> ndarray:
-    """The cells that the straight line between two positions runs through.
+    """Return a mask of the cells that straight lines cross.
 
-    A line along a border between cells lies in those beyond it, as positions do; a
-    corner that is only touched is not run through.
+    A line along a border between cells lies in the cells beyond it, as positions do. A
+    corner that a line only touches is not crossed.
 
     Args:
-        grid: size and resolution.
-        start_m: (x, y), shape [B, 2].
-        goal_m: (x, y), shape [B, 2].
+        grid: size and resolution of the maps.
+        start_m: (x, y) in metres, shape [B, 2].
+        goal_m: (x, y) in metres, shape [B, 2].
 
     Returns:
         bool, shape [B, H, W].
     """
     start = start_m.astype(np.float64) / grid.resolution_m
     along = goal_m.astype(np.float64) / grid.resolution_m - start
-    # Where the line comes into each row and column of cells and leaves it, as shares of
-    # its length; one along a border lies beyond it.
+    # Cuts with the borders of rows and columns, as fractions of the line's length; a
+    # line along a border lies beyond it.
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         cuts = (np.arange(max(grid.shape) + 1) - start[..., None]) / along[..., None]
     cuts = np.nan_to_num(cuts, nan=-np.inf)
-    ends = (
-        np.minimum(cuts[..., 1:], cuts[..., :-1]),
-        np.maximum(cuts[..., 1:], cuts[..., :-1]),
-    )
-    (x_in, y_in), (x_out, y_out) = (
-        np.moveaxis(values.clip(0, 1), 1, 0) for values in ends
-    )
+    first = np.minimum(cuts[..., 1:], cuts[..., :-1]).clip(0, 1)
+    last = np.maximum(cuts[..., 1:], cuts[..., :-1]).clip(0, 1)
+    x_in, y_in = np.moveaxis(first, 1, 0)
+    x_out, y_out = np.moveaxis(last, 1, 0)
     enter = np.maximum(x_in[:, None, : grid.width], y_in[:, : grid.height, None])
     leave = np.minimum(x_out[:, None, : grid.width], y_out[:, : grid.height, None])
     # Cuts of both kinds at a corner may differ in their last bits.
@@ -122,7 +117,7 @@ def crossed_cells(grid: Grid, start_m: ndarray, goal_m: ndarray) -> ndarray:
 
 
 def table(dataset: TerrainDataset) -> Table:
-    """Formats how hard every split of a dataset is."""
+    """Return a table of the difficulty of each split of a dataset."""
     stuck = dataset.recipe.stuck_threshold
     rows = []
     for split in dataset.splits:
@@ -131,17 +126,15 @@ def table(dataset: TerrainDataset) -> Table:
             f"{100 * measured[name].mean():.1f}"
             for name in ("stuck", "soft_ground", "soft_spots")
         )
-        times, typical, spread = measured["reference_times_s"], NOTHING, NOTHING
+        times = measured["reference_times_s"]
         times = times[np.isfinite(times)]
+        median = time_range = NOTHING
         if len(times):
-            typical, spread = (
-                f"{np.median(times):.1f}",
-                f"{times.min():.1f}–{times.max():.1f}",
-            )
+            median = f"{np.median(times):.1f}"
+            time_range = f"{times.min():.1f}–{times.max():.1f}"
         straight = measured["straight"]
-        rows.append(
-            (split, *percent, typical, spread, f"{straight.sum()}/{len(straight)}")
-        )
+        straight_free = f"{straight.sum()}/{len(straight)}"
+        rows.append((split, *percent, median, time_range, straight_free))
     return Table(
         title=f"how hard the maps are (λ_stuck {stuck:g})",
         headings=_HEADINGS,

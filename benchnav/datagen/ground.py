@@ -1,10 +1,8 @@
-"""Statistics of the ground of all training maps together: how they are fitted, and
-where they are found.
+"""Terrain statistics over all training maps: fitting, and lookup.
 
-They say what is known of a cell that nobody has seen: one mixture of λ, never keyed by
-environment, and the mean of every layer; and how strongly two classes of one colour
-hang together. Letters in shapes: B maps, H×W cells, N bins, K components, P pairs of
-    classes.
+They describe unobserved cells by one mixture of λ over all environments, and the mean
+of each layer. They also contain the coupling of neighbouring cells of look-alike
+classes. Letters in shapes: B maps, H×W cells, N bins, K components, P pairs of classes.
 
 Sources: Dempster et al. (1977), "Maximum likelihood from incomplete data via the EM
 algorithm"; Besag (1975), "Statistical analysis of non-lattice data"
@@ -30,22 +28,19 @@ from benchnav.datagen.schema import Maps
 
 TRAIN = "train"
 
-_SEEN_LAYERS = (
-    "rgb",
-    "elevation_m",
-    "slope_deg",
-)  # which an `Observation` has beside those of the dataset
+# Layers of an `Observation` in addition to those of the dataset.
+_OBSERVED_LAYERS = ("rgb", "elevation_m", "slope_deg")
 _BINS = 1024  # of λ between 0 and 1
 _COMPONENTS = 8
 _STEPS = 1000  # of EM
-_LEAST_STD = 2 / _BINS
-# What lies at 0 and 1 beyond the tails of the others is of two components far outside,
-# which are clipped whole.
+_MIN_STD = 2 / _BINS
+# Atoms at 0 and 1 that the tails do not explain: two components far outside [0, 1],
+# which are clipped completely.
 _ATOMS = ((-1.0, 0.1), (2.0, 0.1))
 _DIGITS = 6
-# Settings of recipes that say which ground there is; the scenario of `train` is std in
-# all that are shipped.
-_OF_GROUND = (
+# Settings of recipes that determine the terrain. The scenario of `train` is std in all
+# shipped recipes.
+_TERRAIN_SETTINGS = (
     "synthesis",
     "classes",
     "occupancy",
@@ -55,18 +50,18 @@ _OF_GROUND = (
     "correlation_m",
     "layers",
 )
-# of fields and strength, so that both are finite where classes are never mixed
+# Prior of h and β: both are finite even if classes are never neighbours.
 _PRIOR_STD = 10.0
 
 
 def fit_ground(dataset: TerrainDataset) -> GroundStatistics:
-    """Fits the statistics of a dataset's split `train`, some maps at a time.
+    """Return the statistics of a dataset's split `train`, fitted in chunks.
 
     Args:
         dataset: the maps.
 
     Raises:
-        DatasetError: there is no such split, or λ of none of its cells is known.
+        DatasetError: If there is no such split, or λ of all its cells is missing.
     """
     pairs = look_alike_pairs(dataset.recipe)
     inner, ends = np.zeros(_BINS), np.zeros(2)
@@ -76,13 +71,12 @@ def fit_ground(dataset: TerrainDataset) -> GroundStatistics:
         inside = value[(value > 0) & (value < 1)]
         inner += np.histogram(inside, _BINS, (0, 1))[0]
         ends += (value == 0).sum(), (value == 1).sum()
-        for place, pair in enumerate(pairs):
-            neighbours[place] += count_neighbours(maps["class_id"], pair)
+        for index, pair in enumerate(pairs):
+            neighbours[index] += count_neighbours(maps["class_id"], pair)
     if not inner.sum() + ends.sum():
         raise DatasetError(
-            f"Expected cells of known traversability in split {TRAIN} of "
-            f"{dataset.path}, got none. "
-            "Statistics of the ground need them."
+            f"Expected cells with traversability in split {TRAIN} of {dataset.path}, "
+            "got only NaN. Terrain statistics need them."
         )
     weights, means, stds = (_rounded(values) for values in fit_mixture(inner, ends))
     names = [item.name for item in dataset.recipe.classes]
@@ -91,38 +85,39 @@ def fit_ground(dataset: TerrainDataset) -> GroundStatistics:
         means=means,
         stds=stds,
         layer_means=layer_means(dataset),
-        look_alikes=tuple((names[one], names[other]) for one, other in pairs),
+        look_alikes=tuple((names[a], names[b]) for a, b in pairs),
         potts_strength=round(fit_potts_strength(neighbours), _DIGITS) if pairs else 0.0,
     )
 
 
 def layer_means(dataset: TerrainDataset) -> dict[str, tuple[float, ...]]:
-    """Means of the layers of the split `train` over their known cells, by name; of
-    directions the mean direction.
+    """Return the means of the layers of `train` over all cells that are not missing.
 
     Returns:
-        Of `rgb` three numbers, of any other layer one, in its unit.
+        By name: three numbers for `rgb`, one for each other layer, in its unit. For
+        directions, the mean direction.
     """
-    names = (*_SEEN_LAYERS, *dataset.layer_names)
+    names = (*_OBSERVED_LAYERS, *dataset.layer_names)
     sums = {name: np.zeros(4 if name == "rgb" else 3) for name in names}
     for _, maps in dataset.chunks(TRAIN, names):
         for name in names:
             sums[name] += _sums_of(name, maps)
-    return {name: _rounded(_mean_of(name, found)) for name, found in sums.items()}
+    return {name: _rounded(_mean_of(name, total)) for name, total in sums.items()}
 
 
 def look_alike_pairs(recipe: Recipe) -> list[tuple[int, int]]:
-    """Pairs of classes of one colour, by their ids."""
-    units = dict.fromkeys(look_alike_classes(recipe.classes))
-    return [pair for unit in units for pair in combinations(unit, 2)]
+    """Return the pairs of classes of one colour, by their ids."""
+    pairs: list[tuple[int, int]] = []
+    for unit in dict.fromkeys(look_alike_classes(recipe.classes)):
+        pairs += combinations(unit, 2)
+    return pairs
 
 
 def fit_mixture(inner: ndarray, ends: ndarray) -> tuple[ndarray, ndarray, ndarray]:
-    """Fits a Gaussian mixture clipped to [0, 1] to counts of λ, by expectation and
-    maximisation.
+    """Fit a Gaussian mixture, clipped to [0, 1], to counts of λ by EM.
 
-    What is at 0 or 1 is clipped: it counts by the moments of the components beyond the
-    end. Two more components, far outside, take what the others do not explain there.
+    Values at 0 and 1 are clipped: they enter by the moments of the components beyond
+    each end. Two more components, far outside, explain the remaining atoms.
 
     Args:
         inner: counts of bins of equal width between 0 and 1, shape [N].
@@ -131,170 +126,147 @@ def fit_mixture(inner: ndarray, ends: ndarray) -> tuple[ndarray, ndarray, ndarra
     Returns:
         Weights, means and standard deviations before clipping, each of shape [K + 2].
     """
-    total, share = (
-        inner.sum() + ends.sum(),
-        (np.arange(_COMPONENTS) + 0.5) / _COMPONENTS,
-    )
+    total = inner.sum() + ends.sum()
     centre = (np.arange(len(inner)) + 0.5) / len(inner)
-    order = inner.cumsum() / max(inner.sum(), 1)
-    means = centre[np.searchsorted(order, share).clip(max=len(inner) - 1)]
+    # Initial means: quantiles of the counts.
+    levels = (np.arange(_COMPONENTS) + 0.5) / _COMPONENTS
+    cdf = inner.cumsum() / max(inner.sum(), 1)
+    means = centre[np.searchsorted(cdf, levels).clip(max=len(inner) - 1)]
     stds = np.full(_COMPONENTS, 0.1)
     weights = np.full(_COMPONENTS + 2, 1 / (_COMPONENTS + 2))
     atoms = weights[-2:]
     for _ in range(_STEPS):
-        own = weights[:_COMPONENTS, None]
+        inner_weights = weights[:_COMPONENTS, None]
         z = (centre - means[:, None]) / stds[:, None]
-        density = own * _density(z) / stds[:, None]
-        inside = (
-            inner * density / density.sum(0).clip(min=1e-300)
-        )  # counts that belong to each component
-        # Beyond each end, by its distance in standard deviations outwards.
-        reach = np.stack([means, 1 - means], 1) / stds[:, None]
-        tail = ndtr(-reach)
-        clipped = own * tail
+        density = inner_weights * _density(z) / stds[:, None]
+        # Expected counts of each component, inside [0, 1] and beyond each end.
+        inside = inner * density / density.sum(0).clip(min=1e-300)
+        to_end = np.stack([means, 1 - means], 1) / stds[:, None]
+        tail = ndtr(-to_end)
+        clipped = inner_weights * tail
         beyond = ends * clipped / (clipped.sum(0) + atoms).clip(min=1e-300)
-        left = ends - beyond.sum(0)
-        # E[Z] and E[Z²] of what is clipped, Z outwards.
-        first = _density(reach) / tail.clip(min=1e-300)
-        second = 1 + reach * first
+        atom_counts = ends - beyond.sum(0)
+        # E[Z] and E[Z²] beyond an end; Z points outwards.
+        first = _density(to_end) / tail.clip(min=1e-300)
+        second = 1 + to_end * first
         counts = inside.sum(1) + beyond.sum(1)
+        divisor = counts.clip(min=1e-300)
         outward = np.array([-1, 1])
-        shift = ((inside * z).sum(1) + (beyond * first * outward).sum(1)) / counts.clip(
-            min=1e-300
-        )
-        square = ((inside * z**2).sum(1) + (beyond * second).sum(1)) / counts.clip(
-            min=1e-300
-        )
-        means, stds = (
-            means + stds * shift,
-            stds * np.sqrt((square - shift**2).clip(min=0)),
-        )
-        stds = stds.clip(min=_LEAST_STD)
-        weights = np.concatenate([counts, left]) / total
+        shift = ((inside * z).sum(1) + (beyond * first * outward).sum(1)) / divisor
+        square = ((inside * z**2).sum(1) + (beyond * second).sum(1)) / divisor
+        means = means + stds * shift
+        stds = stds * np.sqrt((square - shift**2).clip(min=0))
+        stds = stds.clip(min=_MIN_STD)
+        weights = np.concatenate([counts, atom_counts]) / total
         atoms = weights[-2:]
     far_means, far_stds = np.transpose(_ATOMS)
     return weights, np.concatenate([means, far_means]), np.concatenate([stds, far_stds])
 
 
 def count_neighbours(class_id: ndarray, pair: tuple[int, int]) -> ndarray:
-    """Counts cells of two classes by their four neighbours.
+    """Count cells of two classes by their four neighbours.
 
     Args:
-        class_id: shape [B, H, W].
+        class_id: class indices, shape [B, H, W].
         pair: ids of the classes a and b.
 
     Returns:
-        How many cells there are by n_a − n_b + 4, the neighbours of the pair alone
-        counted, and by whether they are of a; shape [9, 2].
+        Counts, int64, shape [9, 2]: by n_a − n_b + 4 over the four neighbours, and by
+        whether the cell is of class a.
     """
     sign = (class_id == pair[0]).astype(np.int8) - (class_id == pair[1]).astype(np.int8)
-    framed = np.pad(sign, ((0, 0), (1, 1), (1, 1)))
-    around = (
-        framed[:, :-2, 1:-1]
-        + framed[:, 2:, 1:-1]
-        + framed[:, 1:-1, :-2]
-        + framed[:, 1:-1, 2:]
-    )
-    own = sign != 0
-    return np.bincount(2 * (around[own] + 4) + (sign[own] > 0), minlength=18).reshape(
-        9, 2
-    )
+    padded = np.pad(sign, ((0, 0), (1, 1), (1, 1)))
+    vertical = padded[:, :-2, 1:-1] + padded[:, 2:, 1:-1]
+    horizontal = padded[:, 1:-1, :-2] + padded[:, 1:-1, 2:]
+    difference = vertical + horizontal
+    in_pair = sign != 0
+    bins = 2 * (difference[in_pair] + 4) + (sign[in_pair] > 0)
+    return np.bincount(bins, minlength=18).reshape(9, 2)
 
 
 def fit_potts_strength(neighbours: ndarray) -> float:
-    """Fits β of P(cell is a | its neighbours) = σ(h + β·(n_a − n_b)) by maximum
-    pseudo-likelihood, by Newton's method.
+    """Fit β of P(cell is a | its neighbours) = σ(h + β·(n_a − n_b)).
+
+    By maximum pseudo-likelihood and Newton's method. Each pair of classes has its own
+    h, which fits the frequencies of its classes.
 
     Args:
-        neighbours: counts of each pair, as `count_neighbours` gives them, shape [P, 9,
-            2]. Each pair has a field h of its own, for the shares of its classes.
+        neighbours: counts of each pair from `count_neighbours`, shape [P, 9, 2].
     """
-    pairs, difference = len(neighbours), np.arange(-4, 5)
-    design = np.zeros((pairs, 9, pairs + 1))
-    design[..., -1] = difference
-    for place in range(pairs):
-        design[place, :, place] = 1
-    rows, of_a, count = (
-        design.reshape(-1, pairs + 1),
-        neighbours[..., 1].ravel(),
-        neighbours.sum(-1).ravel(),
-    )
-    found, precision = np.zeros(pairs + 1), 1 / _PRIOR_STD**2
+    n_pairs = len(neighbours)
+    design = np.zeros((n_pairs, 9, n_pairs + 1))
+    design[..., -1] = np.arange(-4, 5)
+    for index in range(n_pairs):
+        design[index, :, index] = 1
+    rows = design.reshape(-1, n_pairs + 1)
+    count_a = neighbours[..., 1].ravel()
+    count = neighbours.sum(-1).ravel()
+    coefficients = np.zeros(n_pairs + 1)
+    precision = 1 / _PRIOR_STD**2
 
-    def loss(at: ndarray) -> float:
-        logit = rows @ at
-        return float(
-            (count * np.logaddexp(0, logit) - of_a * logit).sum()
-            + precision * at @ at / 2
-        )
+    def loss(candidate: ndarray) -> float:
+        logit = rows @ candidate
+        likelihood = (count * np.logaddexp(0, logit) - count_a * logit).sum()
+        return float(likelihood + precision * candidate @ candidate / 2)
 
     for _ in range(100):
-        chance = expit(rows @ found)
-        slope = rows.T @ (of_a - count * chance) - precision * found
-        curvature = (
-            rows.T * (count * chance * (1 - chance))
-        ) @ rows + precision * np.eye(pairs + 1)
-        step = np.linalg.solve(curvature, slope)
-        while loss(found + step) > loss(found) and np.abs(step).max() > 1e-12:
+        probability = expit(rows @ coefficients)
+        gradient = rows.T @ (count_a - count * probability) - precision * coefficients
+        variance = count * probability * (1 - probability)
+        hessian = (rows.T * variance) @ rows + precision * np.eye(n_pairs + 1)
+        step = np.linalg.solve(hessian, gradient)
+        current = loss(coefficients)
+        while loss(coefficients + step) > current and np.abs(step).max() > 1e-12:
             step = step / 2
-        found = found + step
+        coefficients = coefficients + step
         if np.abs(step).max() < 1e-9:
             break
-    return float(found[-1])
+    return float(coefficients[-1])
 
 
 def ground_file(path: Path) -> Path:
-    """Where the statistics of a dataset's ground are kept: beside its file or folder."""
-    return path.with_name(
-        f"{path.stem if path.suffix == '.h5' else path.name}.ground.json"
-    )
+    """Return the path of a dataset's terrain statistics, next to its file or folder."""
+    name = path.stem if path.suffix == ".h5" else path.name
+    return path.with_name(f"{name}.ground.json")
 
 
 def find_ground(dataset: TerrainDataset) -> GroundStatistics | None:
-    """Finds statistics of a dataset's ground: those beside it, else those of the
-    shipped recipe of its maps.
+    """Return terrain statistics for a dataset; None if no file fits.
+
+    The file next to the dataset is used first, then those of the shipped recipe with
+    the same terrain.
 
     Args:
-        dataset: of any splits, of which `train` need not be one.
-
-    Returns:
-        None where there are none.
+        dataset: dataset of any splits; it need not have `train`.
     """
-    beside = ground_file(dataset.path)
-    if beside.is_file():
-        return GroundStatistics.from_json(beside.read_text())
+    path = ground_file(dataset.path)
+    if path.is_file():
+        return GroundStatistics.from_json(path.read_text())
     for path in sorted((RECIPES / "ground").glob("*.json")):
-        if _is_ground_of(load_recipe(path.stem), dataset.recipe):
+        if _has_same_terrain(load_recipe(path.stem), dataset.recipe):
             return GroundStatistics.from_json(path.read_text())
     return None
 
 
-def _is_ground_of(shipped: Recipe, recipe: Recipe) -> bool:
-    """Tells whether maps of a recipe are on the ground of a shipped one, whatever their
-    size, number and light.
-    """
-    return all(getattr(recipe, name) == getattr(shipped, name) for name in _OF_GROUND)
+def _has_same_terrain(a: Recipe, b: Recipe) -> bool:
+    """Return whether recipes differ only in size, number or light of their maps."""
+    return all(getattr(a, name) == getattr(b, name) for name in _TERRAIN_SETTINGS)
 
 
 def _sums_of(name: str, maps: Maps) -> ndarray:
-    """Sums of the channels of a layer over its known cells, and how many these are."""
+    """Return sums of a layer's channels over its finite cells, and their number."""
     values = maps[name]
     if name == "rgb":
         return np.array([*values.sum((0, 2, 3), dtype=np.float64), values[:, 0].size])
-    known = values[np.isfinite(values)].astype(np.float64)
+    values = values[np.isfinite(values)].astype(np.float64)
     if is_azimuth(name):
-        return np.array(
-            [
-                np.cos(np.deg2rad(known)).sum(),
-                np.sin(np.deg2rad(known)).sum(),
-                known.size,
-            ]
-        )
-    return np.array([known.sum(), 0, known.size])
+        angle = np.deg2rad(values)
+        return np.array([np.cos(angle).sum(), np.sin(angle).sum(), values.size])
+    return np.array([values.sum(), 0, values.size])
 
 
 def _mean_of(name: str, sums: ndarray) -> ndarray:
-    """Means of a layer from `_sums_of`."""
+    """Return the means of a layer from `_sums_of`."""
     count = max(sums[-1], 1)
     if name == "rgb":
         return sums[:3] / count

@@ -1,7 +1,6 @@
-"""The commands that import real ground: `benchnav-datagen import-dem` and
-`import-drives`.
+"""Commands that import real data: `benchnav-datagen import-dem` and `import-drives`.
 
-What is heavy is imported where it is called, so that the command's help is quick.
+Slow modules are imported where they are used. The command's help is fast therefore.
 """
 
 import shlex
@@ -19,25 +18,25 @@ from benchnav.datagen.dem.raster import Cut, GroundOptions, Rasters
 if TYPE_CHECKING:
     from benchnav.datagen.dem.extent import GroundError
 
-_MOST_BACK = 0.1  # of the rows (choice)
+_MAX_BACKWARD = 0.1  # of the rows (choice)
 _FEW_REVERSES = 0.01  # of the rows, which noise may show (choice)
 _COARSE_M = 0.2  # resolution that is too coarse for speeds of 2 s (choice)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImportOptions:
-    """What real ground is made into.
+    """Output of an import.
 
     Args:
         out: File .h5 to write, or a folder for many files.
-        id: Id of the dataset; the name of the output when not given.
-        recipe: Id or path of a recipe that gives size, resolution, start, goal, class
-            table and light.
-        stride: Metres from one map to the next; a map's width when not given. Less
-            makes maps of a split overlap.
+        id: Id of the dataset. If empty, the name of the output.
+        recipe: Id or path of a recipe with size, resolution, start, goal, class table
+            and light.
+        stride: Metres from one map to the next. If not given, a map's width; maps of a
+            split overlap if it is less.
         solvable: Keep only maps whose goal can be reached, and store the grid reference
             time.
-        overwrite: Replace what is there.
+        overwrite: Replace an existing dataset.
     """
 
     out: str
@@ -59,18 +58,18 @@ def import_dem(
 ) -> None:
     """Make a dataset from a real elevation model; needs the extra benchnav[geo].
 
-    Rasters may be anything that GDAL opens: files, https:// and s3:// addresses, zip://
-        archives, mosaics (.vrt).
+    GDAL opens the rasters: files, https:// and s3:// addresses, zip:// archives,
+    mosaics (.vrt).
 
     Args:
-        rasters: What there is of the ground beside its elevation.
-        ground: How the elevation model is read and cut.
-        options: What is made of it.
+        rasters: Further rasters of the terrain.
+        ground: Reading and cutting of the elevation model.
+        options: Output.
         dem: Raster of elevations, in any coordinate reference system.
         overrides: Changes to the recipe, such as resolution_m=1 goal_m=[50,50].
-        splits: Splits and their shares of the maps, such as
+        splits: Splits and their fractions of the maps, such as
             train:0.7,valid:0.1,test/site:0.2; no two of them touch.
-        scenario: Which of the recipe's scenarios lights the maps.
+        scenario: Scenario of the recipe that lights the maps.
     """
     dataset = _import(
         options, overrides, splits, ground, scenario, dem=dem, rasters=rasters
@@ -78,10 +77,10 @@ def import_dem(
     for split, entry in dataset.splits.items():
         left_out = entry["parts"][0]["source"]["left_out"]
         between = left_out.pop("between_splits")
-        reasons = ", ".join(
+        reasons = [
             f"{count} {reason.replace('_', ' ')}" for reason, count in left_out.items()
-        )
-        print(f"  left out of {split}: {reasons}")
+        ]
+        print(f"  left out of {split}: {', '.join(reasons)}")
         _tell_unlabelled(dataset, split)
         _tell_groups(dataset, split)
     if between:
@@ -105,29 +104,29 @@ def import_drives(
     """Make a dataset of measured traversability from a robot's drives; needs the extra
     benchnav[geo].
 
-    Traversability is measured over commanded speed, of each cell the mean. Rasters are
-    as for import-dem.
+    Traversability of a cell is the mean of measured over commanded speed. Rasters are
+    as in import-dem.
 
     Args:
-        ground: How the elevation model is read and cut.
-        options: What is made of them.
+        ground: Reading and cutting of the elevation model.
+        options: Output.
         drives: Log, a file .csv, .tsv, one of these with .gz, or .parquet, with the
             columns time_s, x_m and y_m (in the coordinate reference system of the
             elevation model) or longitude_deg and latitude_deg, commanded_m_s,
-            measured_m_s and, of several drives, drive.
+            measured_m_s and, for several drives, drive.
         dem: Raster of elevations, in any coordinate reference system.
         overrides: Changes to the recipe, such as resolution_m=1 goal_m=[50,50].
-        photo: Raster of red, green and blue; painted by the class when not given.
-        classes: Raster of terrain classes; no cell has one when not given.
+        photo: Raster of red, green and blue. If empty, cells have the colours of their
+            classes.
+        classes: Raster of terrain classes. If empty, all cells are unlabelled.
         class_ids: Class names by value of that raster, such as '{1: gravel, 9: null}',
-            null for no label; else indices.
+            null for no label. If not given, values are class indices.
         layer: Optional fields as [NAME=RASTER, NAME=RASTER:UNIT], such as
             [vegetation_m=canopy.tif].
-        least_speed: Least commanded speed, forward or backward, of rows that are used,
-            m/s.
-        speed: Source of the speed over ground: positions, or measured as logged,
-            whatever positions say. If empty, measured speed that agrees with positions.
-        splits: Splits and their shares of the maps; no two of them touch, and each
+        least_speed: Minimum commanded speed of used rows, forward or backward [m/s].
+        speed: Source of the speed over ground: positions, or measured as logged. If
+            empty, measured speed, which must agree with positions.
+        splits: Splits and their fractions of the maps; no two of them touch, and each
             drive belongs to one.
     """
     from benchnav.datagen.dem.drive_log import Drives
@@ -152,16 +151,15 @@ def import_drives(
     sources = {
         split: entry["parts"][0]["source"] for split, entry in dataset.splits.items()
     }
-    about = next(iter(sources.values()))["drives"]
-    print(_sum_up(about))
+    entry = next(iter(sources.values()))["drives"]
+    print(_sum_up(entry))
     for split, source in sources.items():
-        print(
-            f"  {split}: {about['used'][split]} rows of {_few(about['drives'][split])}"
-        )
+        n_rows = entry["used"][split]
+        print(f"  {split}: {n_rows} rows of {_few(entry['drives'][split])}")
         counts = source["left_out"]
         reasons = [
-            f"{counts[reason]} maps {why}"
-            for reason, why in REASONS.items()
+            f"{counts[reason]} maps {text}"
+            for reason, text in REASONS.items()
             if counts.get(reason)
         ]
         if reasons:
@@ -171,85 +169,80 @@ def import_drives(
         _tell_groups(dataset, split)
 
 
-def _sum_up(about: Mapping[str, Any]) -> str:
-    """What was used of a log and what was not, in sentences."""
+def _sum_up(entry: Mapping[str, Any]) -> str:
+    """Return a summary of the used and unused rows of a log, in sentences."""
     from benchnav.datagen.dem.drive_log import REASONS
 
     lines = [
-        f"{sum(about['used'].values())} of {about['rows']} rows of {about['file']} "
+        f"{sum(entry['used'].values())} of {entry['rows']} rows of {entry['file']} "
         "were used"
     ]
     lines += [
         f"{count} rows are left out: they {REASONS[reason]}"
-        for reason, count in about["left_out"].items()
+        for reason, count in entry["left_out"].items()
         if count
     ]
-    lines.append(_say_motion(about))
-    beyond = about["beyond"]
+    lines.append(_say_motion(entry))
+    beyond = entry["beyond"]
     if any(beyond.values()):
         lines.append(
             f"{beyond['below_0']} rows have λ below 0 (sliding back, or noise) and "
-            f"{beyond['above_1']} above 1 (faster "
-            "than the command); they are stored as 0 and 1"
+            f"{beyond['above_1']} above 1 (faster than the command); they are stored "
+            "as 0 and 1"
         )
     if over := beyond["above_1.2"]:
         lines.append(
             f"{over} rows exceed 1.2 times the command: if steady driving on flat, "
-            "firm terrain does, scale "
-            "`commanded_m_s`"
+            "firm terrain does, scale `commanded_m_s`"
         )
-    if about["standing"]:
+    if entry["standing"]:
         lines.append(
-            f"{about['standing']} rows have a position that stays the same under "
-            "command, and no measured speed; the "
-            "robot counts as immobilised there"
+            f"{entry['standing']} rows have a position that stays the same under "
+            "command, and no measured speed; the robot counts as immobilised there"
         )
-    return "\n  ".join([*lines, *_doubts(about)])
+    return "\n  ".join([*lines, *_doubts(entry)])
 
 
-def _doubts(about: Mapping[str, Any]) -> list[str]:
-    """Say what of a log's positions may be wrong, in sentences."""
+def _doubts(entry: Mapping[str, Any]) -> list[str]:
+    """Return possible faults of a log's positions, in sentences."""
     from benchnav.datagen.dem.drive_tracks import MAX_PERIOD_S
 
-    doubts, by_positions = [], about["speed"] == "positions"
-    below, period_s = about["beyond"]["below_0"], about["period_s"] or 0
-    if by_positions and below > _MOST_BACK * sum(about["used"].values()):
+    doubts = []
+    by_positions = entry["speed"] == "positions"
+    below = entry["beyond"]["below_0"]
+    period_s = entry["period_s"] or 0
+    n_used = sum(entry["used"].values())
+    if by_positions and below > _MAX_BACKWARD * n_used:
         doubts.append(
-            f"more than {_MOST_BACK:.0%} of rows slide back by their positions, which "
-            "looks wrong: a robot that "
-            "turned on the spot under its command looks the same. Log a command of 0 "
-            "there"
+            f"more than {_MAX_BACKWARD:.0%} of rows slide back by their positions, "
+            "which looks wrong: a robot that turned in place under its command looks "
+            "the same. Log a command of 0 there"
         )
     if by_positions and period_s > MAX_PERIOD_S:
         doubts.append(
             f"positions come every {period_s:g} s, too seldom to distinguish sliding "
-            "back from turning, so that "
-            "rows that slide back have λ above 0"
+            "back from turning, so that rows that slide back have λ above 0"
         )
-    if not by_positions and about["reverses"] > _FEW_REVERSES * sum(
-        about["used"].values()
-    ):
+    if not by_positions and entry["reverses"] > _FEW_REVERSES * n_used:
         doubts.append(
-            f"positions reverse in {about['reverses']} rows, measured_m_s never does: "
-            "where the robot did not turn "
-            "round, it slid back, and speed has to be negative"
+            f"positions reverse in {entry['reverses']} rows, measured_m_s never does: "
+            "where the robot did not turn round, it slid back, and speed must be "
+            "negative"
         )
-    if about["resolution_m"] > _COARSE_M:
+    if entry["resolution_m"] > _COARSE_M:
         doubts.append(
-            f"positions are multiples of {about['resolution_m']:g} m: log more decimals"
+            f"positions are multiples of {entry['resolution_m']:g} m: log more decimals"
         )
     return doubts
 
 
-def _say_motion(about: Mapping[str, Any]) -> str:
-    """Compare positions with both speeds, in a sentence."""
+def _say_motion(entry: Mapping[str, Any]) -> str:
+    """Return a comparison of positions with both speeds, in a sentence."""
+    columns = {"pace": "measured_m_s", "commanded_pace": "commanded_m_s"}
     ratios = (
-        f"{about[name]:g} times as far as {column} says"
-        for name, column in (
-            ("pace", "measured_m_s"),
-            ("commanded_pace", "commanded_m_s"),
-        )
-        if about[name] is not None
+        f"{entry[name]:g} times as far as {column} says"
+        for name, column in columns.items()
+        if entry[name] is not None
     )
     compared = " and ".join(ratios) or "too little to be compared with speeds"
     source = {
@@ -257,12 +250,12 @@ def _say_motion(about: Mapping[str, Any]) -> str:
         "positions": "; speeds are those of positions",
         "measured": "; speeds are as logged",
     }
-    return f"positions move {compared}{source[about['speed']]}"
+    return f"positions move {compared}{source[entry['speed']]}"
 
 
 def _few(names: Sequence[str]) -> str:
-    some = ", ".join(names[:5]) + (", …" if len(names) > 5 else "")
-    return f"{len(names)} drive{'s' * (len(names) > 1)} ({some})"
+    shown = [*names[:5], "…"] if len(names) > 5 else names
+    return f"{len(names)} drive{'s' * (len(names) > 1)} ({', '.join(shown)})"
 
 
 def _import(
@@ -273,7 +266,7 @@ def _import(
     scenario: str = "std",
     **settings: Any,
 ) -> "datagen.TerrainDataset":
-    """Imports under the id that is asked for, or that the output names."""
+    """Import under the requested id, or the name of the output; return the dataset."""
     from benchnav.datagen.dem.extent import GroundError
     from benchnav.datagen.dem.importer import import_dem as import_maps
     from benchnav.datagen.dem.tiling import read_shares
@@ -282,13 +275,14 @@ def _import(
 
     path = Path(options.out)
     name = options.id or name_of(path)
-    # so that others need not fit the maps
-    used = f"splits={{imported: {{scenario: {scenario}, maps: 1}}}}"
-    chosen = datagen.load_recipe(
-        options.recipe, [f"id={name}", used, *overrides] if overrides else []
-    )
+    changes = []
+    if overrides:
+        # Only the used scenario must fit the maps.
+        splits_key = f"splits={{imported: {{scenario: {scenario}, maps: 1}}}}"
+        changes = [f"id={name}", splits_key, *overrides]
+    recipe = datagen.load_recipe(options.recipe, changes)
     if options.id or not overrides:
-        chosen = replace(chosen, id=name)
+        recipe = replace(recipe, id=name)
     cut = Cut(
         shares=read_shares(splits),
         scenario=scenario,
@@ -298,7 +292,7 @@ def _import(
     )
     steps = import_maps(
         out=path,
-        recipe=chosen,
+        recipe=recipe,
         cut=cut,
         overwrite=options.overwrite,
         announce=print,
@@ -312,15 +306,14 @@ def _import(
 
 
 def _with_command(error: "GroundError", overrides: Sequence[str]) -> ConfigError:
-    """Return an error whose message ends in the user's command with settings that fit
-    the ground.
-    """
+    """Return an error with the user's command, changed to settings that fit."""
     if not error.settings and error.stride_m is None:
         return ConfigError(f"{error.problem} Or take a larger raster.")
     unchanged = [
         text for text in overrides if text.partition("=")[0] not in error.changes
     ]
-    words, remaining = [], [word for word in sys.argv[1:] if word not in overrides]
+    words = []
+    remaining = [word for word in sys.argv[1:] if word not in overrides]
     while remaining:
         word = remaining.pop(0)
         if word == "--stride":
@@ -328,33 +321,32 @@ def _with_command(error: "GroundError", overrides: Sequence[str]) -> ConfigError
         elif not word.startswith("--stride="):
             words.append(word)
     stride = [] if error.stride_m is None else ["--stride", f"{error.stride_m:.10g}"]
-    command = shlex.join(
-        [Path(sys.argv[0]).name, *words, *unchanged, *error.settings, *stride]
-    )
-    return ConfigError(error.advise(command))
+    program = Path(sys.argv[0]).name
+    command = [program, *words, *unchanged, *error.settings, *stride]
+    return ConfigError(error.advise(shlex.join(command)))
 
 
 def _tell_unlabelled(dataset: "datagen.TerrainDataset", split: str) -> None:
-    """Print how many cells of maps have no class."""
-    entry, grid = dataset.splits[split], dataset.grid
-    counts = [
-        count for part in entry["parts"] for count in part["source"]["unlabelled"]
-    ]
+    """Print the number of unlabelled cells of a split."""
+    grid = dataset.grid
+    counts: list[int] = []
+    for part in dataset.splits[split]["parts"]:
+        counts += part["source"]["unlabelled"]
     if any(counts):
-        maps = sum(count > 0 for count in counts)
-        cells = len(counts) * grid.height * grid.width
+        n_maps = sum(count > 0 for count in counts)
+        n_cells = len(counts) * grid.height * grid.width
         print(
-            f"  unlabelled in {split}: {sum(counts)} of {cells} cells, on {maps} of "
-            f"{len(counts)} maps"
+            f"  unlabelled in {split}: {sum(counts)} of {n_cells} cells, on {n_maps} "
+            f"of {len(counts)} maps"
         )
 
 
 def _tell_groups(dataset: "datagen.TerrainDataset", split: str) -> None:
-    """Says how many units of statistics there are where maps overlap."""
+    """Print the number of statistical units of a split if its maps overlap."""
     if "group" in dataset.fields:
         groups = len(set(dataset.read(split, fields=["group"])["group"].tolist()))
         print(
             f"  {dataset.map_count(split)} maps of {split} overlap and form {groups} "
-            "group(s), the statistical unit. "
-            "Leave --stride out of test splits, so that their maps do not overlap"
+            "group(s), the statistical unit. Leave --stride out of test splits, so "
+            "that their maps do not overlap"
         )

@@ -1,7 +1,7 @@
-"""Smooth noise of named random streams, which classes and layers are laid out by.
+"""Smooth noise from named random streams, for the layout of classes and layers.
 
-Batched NumPy in float64, the same on every machine. Letters in shapes: B maps, H×W
-cells.
+Batched NumPy in float64; results are the same on every machine. Letters in shapes: B
+maps, H×W cells.
 
 Source: Perlin (2002), "Improving noise".
 """
@@ -21,13 +21,14 @@ def fractal_perlin(
     shape: tuple[int, int],
     periods: Sequence[float],
 ) -> ndarray:
-    """Sums octaves of Perlin noise, each weighted by its period, so that large shapes
-    dominate.
+    """Return the sum of octaves of Perlin noise, each weighted by its period.
+
+    Large shapes therefore dominate.
 
     Args:
-        seed: root of the random streams, one an octave.
-        names: of the streams.
-        indices: elements of each stream, shape [B].
+        seed: root of the random streams, one per octave.
+        names: names of the streams.
+        indices: elements of each stream, one per map, shape [B].
         shape: (H, W).
         periods: lattice spacing of each octave in cells.
 
@@ -37,38 +38,35 @@ def fractal_perlin(
     height, width = shape
     octaves = []
     for octave, period in enumerate(periods):
-        lattice = (int(np.ceil(height / period)) + 2, int(np.ceil(width / period)) + 2)
+        n_rows = int(np.ceil(height / period)) + 2
+        n_columns = int(np.ceil(width / period)) + 2
         key = rng.stream_key(seed, *names, octave)
-        draws = rng.uniform(key, indices, (lattice[0] * lattice[1] + 2,))
-        angle = 2 * np.pi * draws[:, 2:].reshape(-1, *lattice)
-        # A random phase, so that the lattice does not stand at the same place in every
-        # map.
+        draws = rng.uniform(key, indices, (n_rows * n_columns + 2,))
+        angle = 2 * np.pi * draws[:, 2:].reshape(-1, n_rows, n_columns)
+        # Random phases, so that the lattice has another position in each map.
         rows = (np.arange(height) + 0.5) / period + draws[:, 0, None]
         columns = (np.arange(width) + 0.5) / period + draws[:, 1, None]
         # Σ over a cell's four corners of fade_y·fade_x·(g_y·Δy + g_x·Δx) is separable:
-        # the weights of rows and of columns are matrices around the lattice's
-        # gradients.
-        weight_y, offset_y = _corner_weights(rows, lattice[0])
+        # the lattice's gradients are multiplied by weight matrices of rows and columns.
+        weight_y, offset_y = _corner_weights(rows, n_rows)
         weight_x, offset_x = (
-            np.swapaxes(w, 1, 2) for w in _corner_weights(columns, lattice[1])
+            np.swapaxes(w, 1, 2) for w in _corner_weights(columns, n_columns)
         )
-        noise = offset_y @ (np.sin(angle) @ weight_x) + weight_y @ (
-            np.cos(angle) @ offset_x
-        )
-        octaves.append(period * noise)
+        noise_y = offset_y @ (np.sin(angle) @ weight_x)
+        noise_x = weight_y @ (np.cos(angle) @ offset_x)
+        octaves.append(period * (noise_y + noise_x))
     return sum(octaves[1:], octaves[0]) / sum(periods)
 
 
 def _corner_weights(position: ndarray, lattice: int) -> tuple[ndarray, ndarray]:
-    """Fade weights of the lattice points next to each position, alone and times the
-    signed distance.
+    """Return fade weights of lattice points, and weights times signed distance.
 
     Args:
-        position: in lattice spacings, shape [B, N].
-        lattice: lattice points L.
+        position: positions in lattice spacings, shape [B, N].
+        lattice: L, number of lattice points.
 
     Returns:
-        Two arrays of shape [B, N, L], zero but at the two neighbours of each position.
+        Two arrays of shape [B, N, L], zero except at the two neighbours of a position.
     """
     distance = position[..., None] - np.arange(lattice)
     fade = np.maximum(1 - np.abs(distance), 0)

@@ -1,11 +1,9 @@
-"""Pictures of maps: a sheet for a paper, a row a map, and a contact sheet of a whole
-split.
+"""Figures of maps: a sheet with a row for each map, and a contact sheet of a split.
 
-Lengths are in inches from the upper left corner and text is in points, as printed over
-the two columns of a page. A class has one colour in every map and figure, its own of
-the class table; of classes that look alike all but the first are drawn lighter or
-darker. Where the classes have soft spots, the ground that may hide them is hatched and
-outlined.
+Lengths are in inches from the upper left corner; text is in points, as printed over the
+two columns of a page. A class has the same colour in all maps and figures, that of the
+class table; among look-alike classes, all except the first are lighter or darker. If
+classes have soft spots, terrain that may hide them is hatched and outlined.
 """
 
 import textwrap
@@ -23,7 +21,7 @@ from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.classes import TerrainClass, look_alike_classes
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.datagen.synth.appearance import light_direction, shade
-from benchnav.datagen.synth.elevation import framed, horn_gradient
+from benchnav.datagen.synth.elevation import horn_gradient, pad_missing
 from benchnav.viz.maps import (
     draw_lines,
     hatching,
@@ -56,25 +54,26 @@ _MARK_SIZE = 0.75
 def preview_figure(
     dataset: TerrainDataset, split: str, indices: Sequence[int]
 ) -> Figure:
-    """Draws maps of a split, a row each, layers to the right; the panel of a field has
-    the label `FIELD ROW`.
+    """Return a figure of maps of a split, with a row for each map.
+
+    Layers are to the right. The panel of a field has the label `FIELD ROW`.
 
     Args:
-        dataset: where the maps are.
+        dataset: dataset of the maps.
         split: name of a split.
-        indices: which maps.
+        indices: indices of the maps.
 
     Returns:
-        A figure as wide as a page; narrower where panels shrink to fit a page.
+        A figure as wide as a page; narrower if panels shrink to fit a page.
 
     Raises:
-        DatasetError: there is no such split or map, or its data are damaged.
+        DatasetError: If there is no such split or map, or its data are damaged.
     """
     layers = dataset.layer_names
     maps = dataset.read(split, indices, (*FIELDS, *layers, "start_m", "goal_m"))
     maps["rgb"] = np.moveaxis(maps["rgb"], 1, -1)
-    # Heights over each map's lowest point compare between maps; heights over a datum
-    # seldom do.
+    # Heights above each map's lowest point are comparable between maps; heights above a
+    # datum often are not.
     maps["elevation_m"] -= maps["elevation_m"].min((1, 2), keepdims=True)
     classes, grid = dataset.recipe.classes, dataset.grid
     unlabelled = maps["class_id"] == UNLABELLED
@@ -172,34 +171,37 @@ def preview_figure(
 
 
 def contact_sheet_figure(dataset: TerrainDataset, split: str) -> Figure:
-    """Draws a thumbnail of the colour image of every map of a split, of its first
-    hundred, in order, row by row.
+    """Return a figure of thumbnails of up to 100 maps of a split, in order.
 
-    Where the classes have soft spots, the ground that may hide them is outlined, and
-    the stored λ stands to the right of each image.
+    If classes have soft spots, terrain that may hide them is outlined, and the stored λ
+    is drawn to the right of each image.
 
     Args:
-        dataset: where the maps are.
+        dataset: dataset of the maps.
         split: name of a split.
 
     Returns:
-        A figure about as wide as high; the thumbnails are the images of its one axes.
+        A figure about as wide as high; the thumbnails are the images of its only axes.
 
     Raises:
-        DatasetError: there is no such split, or its data are damaged.
+        DatasetError: If there is no such split, or its data are damaged.
     """
-    held, grid, classes = dataset.map_count(split), dataset.grid, dataset.recipe.classes
+    n_maps = dataset.map_count(split)
+    grid = dataset.grid
+    classes = dataset.recipe.classes
     fields = (
         ("rgb", "class_id", "traversability")
         if any(item.soft for item in classes)
         else ("rgb",)
     )
     across = grid.width * (2 if len(fields) > 1 else 1)
-    count, ratio, gap = min(held, _MAX_THUMBNAILS), grid.height / across, 0.05
+    count = min(n_maps, _MAX_THUMBNAILS)
+    ratio = grid.height / across
+    gap = 0.05
     columns = contact_columns(count, ratio)
     wide = min(max((TWO_COLUMNS_IN - gap) / columns, 0.5 / min(1, ratio)), 2.4) - gap
     high, width = wide * ratio, columns * (wide + gap) + gap
-    number = f"{held} maps" if count == held else f"first {count} of {held} maps"
+    number = f"{n_maps} maps" if count == n_maps else f"first {count} of {n_maps} maps"
     title = (
         f"{dataset.id}, split {split} (scenario "
         f"{dataset.splits[split]['scenario']}): {number}"
@@ -207,8 +209,8 @@ def contact_sheet_figure(dataset: TerrainDataset, split: str) -> Figure:
     lines = textwrap.wrap(title, int(width / LETTER / 1.25))
     top = 0.1 + LINE * len(lines)
     height = top + -(-count // columns) * (high + gap)
-    # A whole number of dots a cell keeps all cells of one size, unless that takes too
-    # many dots.
+    # With an integer number of dots per cell, all cells have one size. It is not used
+    # if it requires too many dots.
     dots = max(1, round(_DPI * wide / across)) * across / wide
     figure = Figure(figsize=(width, height), dpi=dots if dots <= 2 * _DPI else _DPI)
     figure.text(
@@ -240,7 +242,7 @@ def contact_sheet_figure(dataset: TerrainDataset, split: str) -> Figure:
             edges = outline(
                 soft_ground(stored["class_id"], classes), high / grid.height
             )
-            # The page counts inches downward.
+            # Inches of the page increase downward.
             draw_lines(sheet, edges * (1, -1) + (x, y + high), "black", 0.2, "white")
         box = (x, x + wide, y + high, y)
         sheet.imshow(
@@ -254,27 +256,26 @@ def contact_sheet_figure(dataset: TerrainDataset, split: str) -> Figure:
 
 
 def soft_ground(class_id: np.ndarray, classes: Sequence[TerrainClass]) -> np.ndarray:
-    """Cells whose class has soft spots, bool, shape of `class_id`."""
-    return np.isin(
-        class_id, [number for number, item in enumerate(classes) if item.soft]
-    )
+    """Return a mask of cells whose class has soft spots, shape of `class_id`."""
+    soft_ids = [index for index, item in enumerate(classes) if item.soft]
+    return np.isin(class_id, soft_ids)
 
 
 def class_colours(classes: Sequence[TerrainClass]) -> np.ndarray:
-    """Colours to draw classes in, those of the table but for look-alikes: RGB in [0,
-    1], shape [C, 3].
+    """Return the colours in which classes are drawn, RGB in [0, 1], shape [C, 3].
+
+    They are those of the class table, except for look-alike classes.
     """
     colours = np.array([item.colour for item in classes]) / 255
     for alike in set(look_alike_classes(tuple(classes))):
-        away = 0.0 if colours[alike[0]].mean() > 0.5 else 1.0
-        for place, member in enumerate(alike):
-            colours[member] += (away - colours[member]) * 0.7 * place / len(alike)
+        contrast = 0.0 if colours[alike[0]].mean() > 0.5 else 1.0
+        for rank, member in enumerate(alike):
+            colours[member] += (contrast - colours[member]) * 0.7 * rank / len(alike)
     return colours
 
 
 def contact_columns(count: int, ratio: float) -> int:
-    """Number of columns that makes a grid about as wide as high, with few places left
-    empty.
+    """Return the number of columns of a grid about as wide as high with few gaps.
 
     Args:
         count: number of thumbnails.
@@ -289,16 +290,16 @@ def contact_columns(count: int, ratio: float) -> int:
 def _hillshade(
     elevation_m: np.ndarray, slope_deg: np.ndarray, resolution_m: float
 ) -> np.ndarray:
-    """White and black veils for a light in the north-west, RGBA, shape [B, H, W, 4].
+    """Return white and black overlays for a light in the north-west, [B, H, W, 4].
 
-    Level ground gets none, so that it has the colours of the bar. Heights are
-    exaggerated by how steep the maps are, all by the same.
+    Level terrain has no overlay, and shows the colours of the bar. Heights are
+    exaggerated by one factor, which depends on the steepness of the maps.
     """
     lift = np.clip(
         0.8 / np.tan(np.radians(np.percentile(slope_deg, 95) + 1e-3)), 0.1, 30
     )
     light = light_direction(np.array([0.75 * np.pi]), np.array([0.7]))
-    ground_m = framed(lift * elevation_m.astype(np.float64))
+    ground_m = pad_missing(lift * elevation_m.astype(np.float64))
     lit = shade(*horn_gradient(ground_m, resolution_m), light, 0.0) - light[0, 2]
     white = lit > 0
     return np.stack([white, white, white, 0.7 * np.abs(lit)], axis=-1)

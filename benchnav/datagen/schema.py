@@ -1,12 +1,11 @@
-"""Dataset formats 1.0 to 1.4: fields, manifest and content digests;
-`docs/reference/format.md` is for readers.
+"""Dataset formats 1.0 to 1.4: fields, manifest and content digests.
 
-One HDF5 file is one dataset. Groups are splits; each holds the fields that the manifest
-lists, those of `FIELDS` and perhaps others, and the SHA-256 of every entry. The
-manifest is a JSON text in the dataset `manifest`. A folder of such files, with a
-manifest of its own that says which maps lie in which, is one dataset too. Digests cover
-logical arrays, not the file's bytes, so they are the same whatever compression, machine
-or number of workers wrote it.
+One HDF5 file is one dataset. Its groups are splits. Each contains the fields that the
+manifest lists (those of `FIELDS`, and optional ones), and the SHA-256 of each entry.
+The manifest is a JSON text in the dataset `manifest`. A folder of such files is one
+dataset too; its own manifest lists the maps of each file. Digests cover logical arrays
+instead of the file's bytes, so they do not depend on compression, machine or number of
+workers. For readers of files, see `docs/reference/format.md`.
 """
 
 import hashlib
@@ -22,45 +21,45 @@ from numpy import ndarray
 from benchnav.core.errors import expect
 
 FORMAT = "benchnav-dataset"
-FORMAT_VERSION = (1, 4)  # the newest that is read
+FORMAT_VERSION = (1, 4)  # the newest that can be read
 MANIFEST = "manifest"
 ENTRY_DIGESTS = "entry_digests"
 DIGEST_BYTES = 32
-UNLABELLED = 255  # `class_id` of a cell whose class is not known, as on real ground
+UNLABELLED = 255  # `class_id` of a cell without a class, as in real data
 
-Json = dict[str, Any]  # a manifest, or what is in it
+Json = dict[str, Any]  # a manifest, or a part of it
 Maps = dict[str, ndarray]  # some maps: arrays by field, each of shape [B, *entry shape]
 
 
 @dataclass(frozen=True)
 class Field:
-    """What one array of a split holds.
+    """Description of one array of a split.
 
     Args:
         dtype: NumPy dtype in little-endian order.
-        shape: shape of one map's entry; "H" and "W" stand for the grid.
+        shape: shape of one map's entry; "H" and "W" are rows and columns of the grid.
         unit: SI unit, or "1".
-        least: smallest value allowed.
-        most: largest value allowed.
+        minimum: smallest valid value.
+        maximum: largest valid value.
         meaning: one line for readers.
     """
 
     dtype: str
     shape: tuple[str | int, ...]
     unit: str
-    least: float
-    most: float
+    minimum: float
+    maximum: float
     meaning: str
 
     def entry_shape(self, height: int, width: int) -> tuple[int, ...]:
-        """Shape of one map's entry on a grid."""
+        """Return the shape of one map's entry on a grid."""
         sizes = {"H": height, "W": width}
         return tuple(sizes[n] if isinstance(n, str) else n for n in self.shape)
 
 
 Fields = Mapping[str, Field]  # by name, in the order of being stored
 
-# What every dataset has.
+# Fields of every dataset. The texts are stored in manifests and never change.
 FIELDS: dict[str, Field] = {
     "rgb": Field("|u1", (3, "H", "W"), "1", 0, 255, "top-down colour image, shaded"),
     "class_id": Field("|u1", ("H", "W"), "1", 0, 255, "index into the class table"),
@@ -87,7 +86,7 @@ FIELDS: dict[str, Field] = {
 }
 
 
-# What a dataset may have beside.
+# Fields that a dataset may have in addition.
 OPTIONAL: dict[str, Field] = {
     "group": Field(
         "<i8",
@@ -97,7 +96,7 @@ OPTIONAL: dict[str, Field] = {
         2**53,
         "maps of one number overlap, directly or by others between them",
     ),
-    # Of the measured λ, so no model may see them.
+    # They describe measured λ, so no model may use them.
     "drive_count": Field(
         "<i4",
         ("H", "W"),
@@ -116,15 +115,15 @@ OPTIONAL: dict[str, Field] = {
     ),
 }
 
-# The true distribution of λ where layers of the recipe change it; no model may see it.
+# The true distribution of λ, if layers of the recipe change it; no model may use it.
 TRUTH = ("truth_mean", "truth_std")
 
 KNOWN = FIELDS | OPTIONAL
 MAP_FIELDS = tuple(name for name, field in FIELDS.items() if "H" in field.shape)
 
-# Names that no layer has: of other arrays of a split, and of what models and
-# environments are given next to layers.
-_TAKEN = (
+# Names that no layer may have: other arrays of a split, and other inputs of models and
+# observations of environments.
+_RESERVED = (
     *KNOWN,
     *TRUTH,
     ENTRY_DIGESTS,
@@ -139,7 +138,7 @@ _TAKEN = (
 
 
 def truth_fields(components: int) -> dict[str, Field]:
-    """Describe the fields of `TRUTH` for a number of components of λ's distribution, K."""
+    """Return the fields of `TRUTH` for K components of the distribution of λ."""
     mean, std = TRUTH
     shape = (components, "H", "W")
     return {
@@ -163,10 +162,9 @@ def truth_fields(components: int) -> dict[str, Field]:
 
 
 def layer_names(fields: Fields) -> tuple[str, ...]:
-    """Names of the layers among fields: float32 maps that are no other field, which a
-    model may see.
+    """Return the names of the layers among fields, which a model may use.
 
-    NaN is where nothing is known.
+    Layers are all float32 maps that are not in `FIELDS` or `OPTIONAL`. NaN is missing.
     """
     return tuple(
         name
@@ -176,30 +174,35 @@ def layer_names(fields: Fields) -> tuple[str, ...]:
 
 
 def check_layer_name(what: str, name: str) -> None:
-    """Check a name for a layer.
+    """Check the name of a layer.
+
+    Args:
+        what: argument that names the layer, for the message.
+        name: the name.
 
     Raises:
-        ConfigError: If it is no identifier or that of something else, with `what` in
-            its message.
+        ConfigError: If the name is not an ASCII identifier, or is reserved.
     """
     expect(
         name.isidentifier() and name.isascii(),
         f"{what} of letters, digits and '_', not beginning with a digit, got {name!r}.",
     )
     expect(
-        name not in _TAKEN, f"{what} to be none of {', '.join(_TAKEN)}, got {name!r}."
+        name not in _RESERVED,
+        f"{what} that is not reserved ({', '.join(_RESERVED)}), got {name!r}.",
     )
 
 
 def quantise(values: ndarray, bits: int) -> ndarray:
-    """Rounds to multiples of 2^−bits, so that the last bits of a machine's arithmetic
-    do not show.
+    """Return values rounded to multiples of 2^−bits.
+
+    Rounding hides differences in the last bits of different machines' arithmetic.
     """
     return np.rint(values * 2.0**bits) * 2.0**-bits
 
 
 def join_maps(parts: Sequence[Maps]) -> Maps:
-    """Joins parts of a split, of which there is at least one, end to end."""
+    """Return the maps of one or more parts of a split, concatenated."""
     if len(parts) == 1:
         return parts[0]
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
@@ -208,9 +211,7 @@ def join_maps(parts: Sequence[Maps]) -> Maps:
 def stored_arrays(
     fields: Fields, height: int, width: int
 ) -> dict[str, tuple[str, tuple[int, ...]]]:
-    """Dtype and shape of a map's entry in each array that is stored of a split: its
-    fields', and of their digests.
-    """
+    """Return dtype and entry shape of each array of a split: fields, and digests."""
     arrays = {
         name: (field.dtype, field.entry_shape(height, width))
         for name, field in fields.items()
@@ -219,7 +220,7 @@ def stored_arrays(
 
 
 def entry_digests(maps: Maps, fields: Fields) -> ndarray:
-    """Digests each map's entry of each field: the SHA-256 of its little-endian bytes.
+    """Return the SHA-256 of the little-endian bytes of each map's entry of each field.
 
     Args:
         maps: arrays by field, each of shape [B, *entry shape].
@@ -228,23 +229,19 @@ def entry_digests(maps: Maps, fields: Fields) -> ndarray:
     Returns:
         uint8, shape [B, F, 32].
     """
-    digests = [
-        hashlib.sha256(entry.tobytes()).digest()
-        for name, field in fields.items()
-        for entry in np.ascontiguousarray(maps[name], dtype=field.dtype)
-    ]
-    by_field = np.frombuffer(b"".join(digests), np.uint8).reshape(
-        len(fields), -1, DIGEST_BYTES
-    )
-    return by_field.swapaxes(0, 1)
+    digests = []
+    for name, field in fields.items():
+        entries = np.ascontiguousarray(maps[name], dtype=field.dtype)
+        digests += [hashlib.sha256(entry.tobytes()).digest() for entry in entries]
+    joined = np.frombuffer(b"".join(digests), np.uint8)
+    return joined.reshape(len(fields), -1, DIGEST_BYTES).swapaxes(0, 1)
 
 
 def split_digest(digests: ndarray, height: int, width: int, fields: Fields) -> str:
-    """The digest of a split: SHA-256 over its field table and its entries' digests, map
-    by map.
+    """Return the SHA-256 over the field table and the entries' digests, map by map.
 
     Args:
-        digests: of all maps' entries, from `entry_digests`, shape [N, F, 32].
+        digests: digests of all entries, from `entry_digests`, shape [N, F, 32].
         height: rows of a map.
         width: columns of a map.
         fields: the F fields.
@@ -258,27 +255,25 @@ def split_digest(digests: ndarray, height: int, width: int, fields: Fields) -> s
 
 
 def version_of(recipes: Sequence[Json], splits: Iterable[Json], fields: Fields) -> str:
-    """The format version of a file: the least that its recipes, its splits' entries and
-    its fields need.
-    """
+    """Return the lowest format version that fits recipes, splits and fields."""
     if any("layers" in recipe for recipe in recipes):
         return "1.4"
     if set(fields) - set(FIELDS):
         return "1.3"
     if any(has_unlabelled(entry) for entry in splits):
         return "1.2"
-    return "1.1" if max(recipe.get("synthesis", 1) for recipe in recipes) > 1 else "1.0"
+    synthesis = max(recipe.get("synthesis", 1) for recipe in recipes)
+    return "1.1" if synthesis > 1 else "1.0"
 
 
 def has_unlabelled(entry: Json) -> bool:
-    """Tells by a split's entry in the manifest whether some of its cells have no class."""
-    return any(
-        sum(part.get("source", {}).get("unlabelled", ())) > 0 for part in entry["parts"]
-    )
+    """Return whether a split has unlabelled cells, by its entry in the manifest."""
+    sources = [part.get("source", {}) for part in entry["parts"]]
+    return any(sum(source.get("unlabelled", ())) > 0 for source in sources)
 
 
 def field_table(height: int, width: int, fields: Fields) -> Json:
-    """Describes fields for the manifest."""
+    """Return the description of fields for the manifest."""
     return {
         name: {
             "dtype": field.dtype,
@@ -293,35 +288,36 @@ def field_table(height: int, width: int, fields: Fields) -> Json:
 def read_field_table(
     table: Json, layers: Fields = MappingProxyType({})
 ) -> dict[str, Field]:
-    """Gives the fields that a manifest describes, in its order; of those that are not
-    ours any value is allowed.
+    """Return the fields that a manifest describes, in its order.
+
+    Fields that this package does not define may have any values.
 
     Args:
-        table: fields by name, as of a manifest.
-        layers: layers whose range is known.
+        table: fields by name, as in a manifest.
+        layers: layers, with their ranges.
 
     Raises:
-        KeyError, TypeError, ValueError: one of `FIELDS` is not among them, or one is
-            not as it should be.
+        KeyError, TypeError, ValueError: If one of `FIELDS` is missing, or a field is
+            invalid.
     """
     height, width = table["class_id"]["shape"]
     for name in FIELDS:
         if name not in table:
             raise ValueError(f"field {name!r} is not listed")
-    fields, known = {}, {**layers, **KNOWN}
-    for name, about in table.items():
-        dtype, shape = np.dtype(about["dtype"]).str, tuple(about["shape"])
+    fields = {}
+    defined = {**layers, **KNOWN}
+    for name, row in table.items():
+        dtype = np.dtype(row["dtype"]).str
+        shape = tuple(row["shape"])
         symbols = (*shape[:-2], "H", "W") if shape[-2:] == (height, width) else shape
-        foreign = Field(
-            dtype, symbols, about["unit"], -np.inf, np.inf, about["meaning"]
-        )
+        foreign = Field(dtype, symbols, row["unit"], -np.inf, np.inf, row["meaning"])
         if name in TRUTH and len(shape) == 3:
-            known |= truth_fields(shape[0])
-        fields[name] = known.get(name, foreign)
+            defined |= truth_fields(shape[0])
+        fields[name] = defined.get(name, foreign)
     return fields
 
 
-# What readers need: keys and the types of their values.
+# Keys that readers need, with the types of their values.
 _MANIFEST = {
     "id": str,
     "generator": {"package": str, "version": str},
@@ -336,10 +332,10 @@ _RECIPE = {"id": str, "seed": int, "scenarios": dict, "splits": dict}
 
 
 def check(manifest: Json) -> None:
-    """Refuses a manifest that does not say what a reader needs.
+    """Check that a manifest contains what readers need.
 
     Raises:
-        AttributeError, KeyError, TypeError, ValueError: it does not.
+        AttributeError, KeyError, TypeError, ValueError: If it does not.
     """
     _check_kinds(manifest, _MANIFEST)
     read_field_table(manifest["fields"])
@@ -353,20 +349,21 @@ def check(manifest: Json) -> None:
             _check_kinds(part, _IMPORTED if "source" in part else _GENERATED)
             if "recipe" in part:
                 recipe = manifest["recipes"][part["recipe"]]
-                recipe["scenarios"][recipe["splits"][part["split"]]["scenario"]]
+                scenario = recipe["splits"][part["split"]]["scenario"]
+                recipe["scenarios"][scenario]  # raises KeyError if it is missing
         shards = manifest["shards"][name] if "shards" in manifest else entry["parts"]
         for parts in (entry["parts"], shards):
             if not 0 < sum(part["maps"] for part in parts) == entry["maps"]:
                 raise ValueError(
-                    f"the maps of split {name!r} are not as many as those of its parts"
+                    f"the number of maps of split {name!r} is not that of its parts"
                 )
         if any("/" in shard.get("file", "") for shard in shards):
             raise ValueError(f"a file of split {name!r} is not in the folder")
 
 
-def _check_kinds(given: Any, kinds: Json) -> None:
+def _check_kinds(mapping: Any, kinds: Json) -> None:
     for name, kind in kinds.items():
-        value = given.get(name)
+        value = mapping.get(name)
         if isinstance(kind, dict):
             _check_kinds(value, kind)
         elif type(value) is not kind:

@@ -1,5 +1,4 @@
-"""Sub-environments stepped as one batch: maps, noise, rewards and observations of
-`benchnav/OffRoad-v0`.
+"""Sub-environments of `benchnav/OffRoad-v0`, stepped as one batch.
 
 Letters in shapes: B sub-environments, H×W cells, S state and A action dimensions.
 """
@@ -38,18 +37,20 @@ AnyPart = str | Mapping[str, Any] | registry.Part
 
 
 class EnvBatch:
-    """B sub-environments as one batch, a stateful shell over the Simulation; see
-    `OffRoadEnv` for what they are.
+    """B sub-environments as one batch; a stateful shell over `Simulation`.
+
+    See `OffRoadEnv` for actions, observations and rewards.
 
     Args:
         size: B.
         data: path or id of a dataset.
-        split: which of its splits; empty for `train`, else the first.
-        robot: name or mapping of a registered robot, or one itself.
-        objective: likewise of an objective; empty for the shaped reward.
-        world: what λ does: a preset by name, a mapping of changes to one, or a world
-            itself; if empty, the paper's, with a warning.
-        goal_radius_m: a robot this near to its goal has arrived.
+        split: split of the dataset. If empty, `train`; without it, the first.
+        robot: name or mapping of a registered robot, or a robot.
+        objective: name or mapping of an objective, or an objective. If empty, the
+            shaped reward.
+        world: name of a preset, a mapping of changes to one, or a world. If empty, the
+            preset `paper`, with a warning.
+        goal_radius_m: distance within which the goal is reached, in metres.
     """
 
     def __init__(
@@ -62,56 +63,62 @@ class EnvBatch:
         world: str | Mapping[str, Any] | World = "",
         goal_radius_m: float = 1.0,
     ) -> None:
-        """Loads the maps of the split."""
+        """Load the maps of the split.
+
+        Raises:
+            ConfigError: If a layer of the dataset has the name of another observation,
+                or the maps have no time budget or noise as `world` needs them.
+        """
         guard.limit_threads()
         guard.warn_of_default_world(world)
-        self._world = (
-            world if isinstance(world, World) else read_world(world or "paper")[0]
-        )
-        made: Any = registry.take("robot", robot)
+        if not isinstance(world, World):
+            world = read_world(world or "paper")[0]
+        self._world = world
+        robot_model: Any = registry.take("robot", robot)
         self._objective: Any = None
         if objective:
             self._objective = registry.take(
-                "objective", objective, robot=made, goal_radius_m=goal_radius_m
+                "objective", objective, robot=robot_model, goal_radius_m=goal_radius_m
             )
-        rules = Rules(goal_radius_m=goal_radius_m)
         self._task = Task(
-            robot=made, objective=self._objective or GoalDistance(), rules=rules
+            robot=robot_model,
+            objective=self._objective or GoalDistance(),
+            rules=Rules(goal_radius_m=goal_radius_m),
         )
-        dataset = self._dataset = TerrainDataset(find_dataset(data))
+        dataset = TerrainDataset(find_dataset(data))
+        self._dataset = dataset
         if not split:
             split = "train" if "train" in dataset.splits else next(iter(dataset.splits))
             if split != "train":
                 guard.warn(
-                    f"{dataset.path} has no split 'train'; its split {split!r} is "
-                    "taken."
+                    f"{dataset.path} has no split 'train'; its split {split!r} is used."
                 )
         self._maps = dataset.terrain(split)
-        taken = {"state", "goal"} & set(self._maps.layers)
+        clashes = {"state", "goal"} & set(self._maps.layers)
         expect(
-            not taken,
-            f"layers that are not called 'state' or 'goal', got {sorted(taken)} in "
+            not clashes,
+            f"layers that are not named 'state' or 'goal', got {sorted(clashes)} in "
             f"{dataset.path}.",
         )
         places = dataset.read(split, fields=["start_m", "goal_m", "reference_time_s"])
         self._places = Endpoints(
             **{name: torch.from_numpy(values) for name, values in places.items()}
         )
-        # To be refused at once.
-        self._world.budget_s(self._places.reference_time_s, made.top_speed_mps)
+        # Raise here rather than in the first reset.
+        self._world.budget_s(self._places.reference_time_s, robot_model.top_speed_mps)
         check_known(self._maps, self._world)
         self._map = np.zeros(size, dtype=np.int64)
         self._noise_seed = np.zeros(size, dtype=np.int64)
         self._simulation: Simulation | None = None
         self._now: SimulationState | None = None
         self.action_space = spaces.Box(
-            np.float32(made.action_low), np.float32(made.action_high)
+            np.float32(robot_model.action_low), np.float32(robot_model.action_high)
         )
         self.observation_space = self._observation_space()
 
     @property
     def maps(self) -> int:
-        """How many maps the split has."""
+        """Number of maps of the split."""
         return len(self._maps)
 
     def reset(
@@ -120,21 +127,25 @@ class EnvBatch:
         chosen: np.ndarray,
         map_index: int | None,
     ) -> None:
-        """Starts new episodes in the chosen sub-environments, bool, shape [B]; maps are
-        drawn if not given.
+        """Start new episodes in some sub-environments.
+
+        Args:
+            generators: random generators of the sub-environments, length B.
+            chosen: sub-environments that start, bool, shape [B].
+            map_index: map of all of them; if None, each map is drawn.
         """
         guard.limit_threads()
         members = np.flatnonzero(chosen)
         for i in members.tolist():
-            # Both are drawn always, so that naming the map changes nothing else.
+            # Always draw both: then a given map changes nothing else.
             drawn = generators[i].integers(len(self._maps))
             self._map[i] = drawn if map_index is None else map_index
             self._noise_seed[i] = generators[i].integers(2**48)
         maps = torch.from_numpy(self._map[members])
-        # What is made under inference mode could not be changed in place outside of it.
+        # Tensors of inference mode cannot be changed in place outside of it.
         with torch.inference_mode(False):
             places = self._places.select(maps)
-            fresh = Simulation(
+            new_simulation = Simulation(
                 self._maps.select(maps),
                 self._task,
                 self._world,
@@ -143,54 +154,56 @@ class EnvBatch:
                 self._noise_seed[members].tolist(),
             )
             pose = heading_to(places.start_m, places.goal_m)
-            start = fresh.init(self._task.robot.initial_state(pose))
+            start = new_simulation.init(self._task.robot.initial_state(pose))
         if self._simulation is None or self._now is None or len(members) == len(chosen):
-            self._simulation, self._now = fresh, start
+            self._simulation = new_simulation
+            self._now = start
             return
         # Only new episodes are built: the others keep their maps and noise.
-        index = torch.from_numpy(members)
-        self._simulation.exchange_(index, fresh)
+        indices = torch.from_numpy(members)
+        self._simulation.exchange_(indices, new_simulation)
         self._now = map_tensors(
-            self._now, lambda now, new: now.index_copy(0, index, new), start
+            self._now, lambda now, new: now.index_copy(0, indices, new), start
         )
 
     def read_actions(
         self, actions: np.ndarray, hold: np.ndarray | None = None
     ) -> np.ndarray:
-        """Return actions as float32, clipped to the bounds; nothing else is changed.
+        """Return actions as float32, clipped to the bounds, without side effects.
 
         Args:
-            actions: shape [B, A].
-            hold: sub-environments whose actions are not used, bool, shape [B]; none
-                when not given.
+            actions: actions of the sub-environments, shape [B, A].
+            hold: sub-environments whose actions are not used, bool, shape [B]; by
+                default, all actions are used.
 
         Raises:
             ConfigError: If the actions are of another type or shape, or not finite.
             ResetNeeded: If no episode has begun.
         """
         self._current()
-        read, space = guard.read_numbers(actions), self.action_space
-        expected = (len(self._map), *space.shape)
+        numbers = guard.read_numbers(actions)
+        space = self.action_space
+        expected_shape = (len(self._map), *space.shape)
         expect(
-            read.shape == expected,
-            f"actions of shape {list(expected)}, got {list(read.shape)}.",
+            numbers.shape == expected_shape,
+            f"actions of shape {list(expected_shape)}, got {list(numbers.shape)}.",
         )
-        guard.check_actions(
-            read, np.ones(len(read), dtype=bool) if hold is None else ~hold
-        )
-        return read.clip(space.low, space.high)
+        acting = np.ones(len(numbers), dtype=bool) if hold is None else ~hold
+        guard.check_actions(numbers, acting)
+        return numbers.clip(space.low, space.high)
 
     def step(
         self, actions: np.ndarray, hold: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Takes a time step in all sub-environments but those on hold.
+        """Take a time step in all sub-environments except those in `hold`.
 
         Args:
-            actions: shape [B, A], see `read_actions`.
-            hold: bool, shape [B]; none when not given.
+            actions: actions of the sub-environments, shape [B, A]; see `read_actions`.
+            hold: sub-environments that wait, bool, shape [B]; by default, none waits.
 
         Returns:
-            Reward, terminated, truncated, and observed λ, each of shape [B].
+            Reward (float64), terminated (bool), truncated (bool), and observed λ
+            (float32), each of shape [B].
 
         Raises:
             ConfigError: If the actions are of another shape, or not finite.
@@ -207,99 +220,97 @@ class EnvBatch:
                 "The episode has ended. Call reset() before the next step()."
             )
         action = self._command(torch.from_numpy(commanded))
-        moved, met = simulation.step(now, action)
-        self._now = map_tensors(
-            now,
-            lambda old, new: torch.where(
-                waits[:, None] if new.ndim > 1 else waits, old, new
-            ),
-            moved,
-        )
+        after, traversability = simulation.step(now, action)
+
+        def merge(old: Tensor, new: Tensor) -> Tensor:
+            mask = waits[:, None] if new.ndim > 1 else waits
+            return torch.where(mask, old, new)
+
+        self._now = map_tensors(now, merge, after)
+        reward = self._reward(now, self._now, action, traversability)
         outcome = self._now.outcome
+        terminated = (outcome == Outcome.SUCCESS) | _is_lost(outcome)
         return (
-            torch.where(waits, 0.0, self._reward(now, self._now, action, met))
-            .double()
-            .numpy(),
-            ((outcome == Outcome.SUCCESS) | _lost(outcome)).numpy(),
+            torch.where(waits, 0.0, reward).double().numpy(),
+            terminated.numpy(),
             (outcome == Outcome.TIMEOUT).numpy(),
-            torch.where(waits, 1.0, met).numpy(),
+            torch.where(waits, 1.0, traversability).numpy(),
         )
 
     def observe(
-        self, met: np.ndarray | None = None
+        self, traversability: np.ndarray | None = None
     ) -> tuple[Observations, Observations]:
-        """What the robots see, and diagnostics with the observed λ, 1 if not given;
-        each array begins with B.
+        """Return observations and diagnostics of all sub-environments.
+
+        Args:
+            traversability: λ observed in the last step, shape [B]; 1 if not given.
+
+        Returns:
+            Two dictionaries of arrays, whose first dimension is B.
         """
         _, now = self._current()
-        seen = {
+        observations = {
             "state": now.state.numpy().copy(),
             "goal": self._goal_m().numpy(),
             "rgb": self._maps.rgb[self._map].numpy(),
             "elevation_m": self._maps.elevation_m[self._map].numpy(),
             "slope_deg": self._maps.slope_deg[self._map].numpy(),
-            **{
-                name: layer[self._map].nan_to_num().numpy()
-                for name, layer in self._maps.layers.items()
-            },
         }
-        return seen, self._diagnose(met)
+        for name, layer in self._maps.layers.items():
+            observations[name] = layer[self._map].nan_to_num().numpy()
+        return observations, self._diagnose(traversability)
 
-    def _diagnose(self, met: np.ndarray | None) -> Observations:
-        """Diagnostics with the observed λ, 1 if not given."""
+    def _diagnose(self, traversability: np.ndarray | None) -> Observations:
+        """Return diagnostics with the observed λ, 1 if not given."""
         _, now = self._current()
+        if traversability is None:
+            traversability = np.ones(len(self._map), np.float32)
         return {
             "map": self._map.copy(),
             "outcome": now.outcome.numpy().copy(),
             "is_success": (now.outcome == Outcome.SUCCESS).numpy(),
-            "traversability": np.ones(len(self._map), np.float32)
-            if met is None
-            else met,
+            "traversability": traversability,
             "distance_m": self._distance_m(now).numpy(),
         }
 
     def _command(self, action: Tensor) -> Tensor:
-        """What the robots are commanded by actions within the bounds, both of shape [B,
-        A].
-        """
+        """Return the robots' commands for actions within the bounds, shape [B, A]."""
         return action
 
     def _reward(
-        self, before: SimulationState, now: SimulationState, action: Tensor, met: Tensor
+        self,
+        before: SimulationState,
+        now: SimulationState,
+        action: Tensor,
+        traversability: Tensor,
     ) -> Tensor:
-        """Progress less time, and a prize or fine at the end; or minus J's stage cost;
-        shape [B].
-        """
+        """Return the shaped reward, or minus the stage cost of J, shape [B]."""
         simulation, _ = self._current()
-        lost = _lost(now.outcome)
+        is_lost = _is_lost(now.outcome)
         if self._objective is None:
-            gained_m = self._distance_m(before) - self._distance_m(now)
-            driven = gained_m + TIME_REWARD_PER_S * self._task.robot.dt_s
-            return (
-                driven
-                + SUCCESS_REWARD * (now.outcome == Outcome.SUCCESS)
-                + LOST_REWARD * lost
-            )
-        cost: Tensor = self._objective.stage(before.state, action, met, self._goal_m())
-        # Else to be lost would be the cheapest way to end a costly episode.
-        return -cost * (1 + (simulation.steps - now.step) * lost)
+            progress_m = self._distance_m(before) - self._distance_m(now)
+            reward = progress_m + TIME_REWARD_PER_S * self._task.robot.dt_s
+            is_success = now.outcome == Outcome.SUCCESS
+            return reward + SUCCESS_REWARD * is_success + LOST_REWARD * is_lost
+        cost: Tensor = self._objective.stage(
+            before.state, action, traversability, self._goal_m()
+        )
+        # Without this factor, losing the robot would end a costly episode most cheaply.
+        return -cost * (1 + (simulation.steps - now.step) * is_lost)
 
     def _observation_space(self) -> spaces.Dict:
-        height, width = self._maps.grid.shape
+        shape = self._maps.grid.shape
         states = self._task.robot.initial_state(torch.zeros(1, 3)).shape[1]
-        return spaces.Dict(
-            {
-                "state": spaces.Box(-np.inf, np.inf, (states,), np.float32),
-                "goal": spaces.Box(-np.inf, np.inf, (2,), np.float32),
-                "rgb": spaces.Box(0, 255, (3, height, width), np.uint8),
-                "elevation_m": spaces.Box(-np.inf, np.inf, (height, width), np.float32),
-                "slope_deg": spaces.Box(0, 90, (height, width), np.float32),
-                **{
-                    name: spaces.Box(-np.inf, np.inf, (height, width), np.float32)
-                    for name in self._maps.layers
-                },
-            }
-        )
+        boxes: dict[str, spaces.Space[Any]] = {
+            "state": _unbounded((states,)),
+            "goal": _unbounded((2,)),
+            "rgb": spaces.Box(0, 255, (3, *shape), np.uint8),
+            "elevation_m": _unbounded(shape),
+            "slope_deg": spaces.Box(0, 90, shape, np.float32),
+        }
+        for name in self._maps.layers:
+            boxes[name] = _unbounded(shape)
+        return spaces.Dict(boxes)
 
     def _current(self) -> tuple[Simulation, SimulationState]:
         if self._simulation is None or self._now is None:
@@ -313,6 +324,10 @@ class EnvBatch:
         return distance(now.state, self._goal_m())
 
 
-def _lost(outcome: Tensor) -> Tensor:
-    """Off the map, or immobilised for good: no later step could mend it."""
+def _unbounded(shape: tuple[int, ...]) -> spaces.Box:
+    return spaces.Box(-np.inf, np.inf, shape, np.float32)
+
+
+def _is_lost(outcome: Tensor) -> Tensor:
+    """Return whether robots left the map or are immobilised for good."""
     return (outcome == Outcome.OUT_OF_BOUNDS) | (outcome == Outcome.IMMOBILISED)

@@ -1,10 +1,8 @@
-"""The Gymnasium environment `benchnav/OffRoad-v0`, single and vectorised, and what all
-versions share.
+"""Gymnasium environment `benchnav/OffRoad-v0`, single and vectorised.
 
-Observations hold what a robot may know: where it is, its goal, and the paper's
-    Observation of the map;
-never the truth. Letters in shapes: B sub-environments, H×W cells, S state and A action
-    dimensions.
+It is the base of all later versions. Observations contain the robot's state, its goal
+and the paper's Observation of the map; never the truth. Letters in shapes: B
+sub-environments, H×W cells, S state and A action dimensions.
 """
 
 from typing import Any
@@ -25,17 +23,17 @@ class OffRoadEnv(gymnasium.Env[Any, np.ndarray]):
     """Drive to the goal over terrain of uncertain traversability λ; partially observed.
 
     ## Arguments
-    Of `gymnasium.make("benchnav/OffRoad-v0", …)`; `make_vec` takes the same, and
-    `num_envs`.
+    Arguments of `gymnasium.make("benchnav/OffRoad-v0", …)`. `make_vec` takes the same
+    arguments, and `num_envs`.
 
-    | argument        | default       | meaning                                                              |
-    |-----------------|---------------|----------------------------------------------------------------------|
-    | `data`          | `"paper-v1"`  | path or id of a dataset                                              |
-    | `split`         | `""`          | which of its splits; empty for `train`, else its first, with a warning |
-    | `robot`         | `"unicycle"`  | F: a name, `file.py:Name`, `{"part": NAME, "options": {…}}`, or a robot |
-    | `objective`     | `""`          | J, likewise; empty for the shaped reward                             |
-    | `world`         | `""`          | what λ does: `"paper"` (default, warns), `"stakes"`, or changes to one |
-    | `goal_radius_m` | `1.0`         | a robot this near to its goal has arrived                            |
+    | argument        | default      | meaning                                                                 |
+    |-----------------|--------------|-------------------------------------------------------------------------|
+    | `data`          | `"paper-v1"` | path or id of a dataset                                                 |
+    | `split`         | `""`         | split; if empty, `train`, or else the first split, with a warning       |
+    | `robot`         | `"unicycle"` | F: a name, `file.py:Name`, `{"part": NAME, "options": {…}}`, or a robot |
+    | `objective`     | `""`         | J, likewise; if empty, the shaped reward                                |
+    | `world`         | `""`         | dynamics of λ: `"paper"` (default, warns), `"stakes"`, or changes       |
+    | `goal_radius_m` | `1.0`        | distance within which the goal is reached [m]                           |
 
     ## Action space
     A `Box` of the robot's bounds, float32. The unicycle's is `Box([0, -1], [1, 1],
@@ -55,52 +53,52 @@ class OffRoadEnv(gymnasium.Env[Any, np.ndarray]):
     | `elevation_m` | float32 | (H, W)    | elevation                                                     |
     | `slope_deg`   | float32 | (H, W)    | slope by Horn's method                                        |
 
-    and, where the dataset has layers, one key a layer by its name, such as
-    `vegetation_m`: float32, (H, W), 0 where nothing is known.
+    and, if the dataset has layers, one key per layer by its name, such as
+    `vegetation_m`: float32, (H, W), 0 where the layer is missing.
 
-    S is 3 for the unicycle and the bicycle, 5 for the differential drive, whose
-    velocities v and ω follow.
+    S is 3 for the unicycle and the bicycle, and 5 for the differential drive, which
+    adds its velocities v and ω.
 
-    The episode is partially observed. Hidden are λ of all cells and the λ met in the
-    last step, the class of terrain and the true distribution of λ, the dwell time on
-    immobilising terrain, the time since the start, and T.
+    The episode is partially observed. The following are hidden: λ of all cells, λ
+    observed in the last step, the terrain class, the true distribution of λ, the dwell
+    time on immobilising terrain, the time since the start, and T.
 
     ## Reward
-    Without `objective`: metres gained toward the goal, −0.1 a second, +10 on arrival
-    and −10 off the map or where the ground immobilises the robot for good. With one:
-    minus its stage cost, read at the state before the step and the observed λ there. A
-    step that loses the robot in one of these ways costs as much again for each step
-    that is left, as if the robot stood there until T.
+    Without `objective`: the progress toward the goal in metres, −0.1 per second, +10 at
+    the goal, and −10 if the robot leaves the map or is immobilised for good. With
+    `objective`: minus its stage cost at the state before the step and the λ observed
+    there. A step that loses the robot costs the same again for each remaining step, as
+    if the robot stood there until T.
 
     ## World
-    `"paper"`: λ is drawn anew at each step, low λ ends nothing, T = 100 s. `"stakes"`:
-    λ is drawn once an episode as a correlated field; 2 s on λ under 0.1 end it; T is 3
-    × the map's reference time at top speed. Changes are given as a mapping, such as
-    `{"preset": "stakes", "correlation_m": 2.0}`, `{"noise": "stored", "time_budget_s":
-    60.0}` or `{"preset": "stakes", "immobile": None}`; see
+    `"paper"`: λ is resampled at each step, low λ ends no episode, T = 100 s.
+    `"stakes"`: λ is drawn once per episode as a correlated field; 2 s on λ below 0.1
+    end the episode; T is 3 × the map's reference time at top speed. Pass changes as a
+    mapping, such as `{"preset": "stakes", "correlation_m": 2.0}`, `{"noise": "stored",
+    "time_budget_s": 60.0}` or `{"preset": "stakes", "immobile": None}`; see
     `benchnav.planning.world.world.World`.
 
     ## Start and end
-    An episode starts at the start of a map of the split, drawn at random or given by
-    `options={"map": i}`, heading at the goal. It terminates at the goal, off the map,
-    or where the world says that the ground immobilises the robot for good; and is
-    truncated after T. A step after the end raises `gymnasium.error.ResetNeeded`. Other
-    options and other types of `map` raise `ConfigError`.
+    An episode begins at the start of a map of the split, facing the goal. The map is
+    drawn at random, or given by `options={"map": i}`. The episode terminates at the
+    goal, off the map, or when the robot is immobilised for good; it is truncated after
+    T. A step after the end raises `gymnasium.error.ResetNeeded`. Other options and
+    other types of `map` raise `ConfigError`.
 
     ## Info
 
     | key              | type  | meaning                                                           |
     |------------------|-------|-------------------------------------------------------------------|
-    | `map`            | int   | number of the map in its split                                    |
+    | `map`            | int   | index of the map in its split                                     |
     | `outcome`        | str   | `running`, `success`, `timeout`, `immobilised` or `out_of_bounds` |
     | `is_success`     | bool  | the goal was reached                                              |
     | `traversability` | float | observed λ in the step; 1 after a reset                           |
-    | `distance_m`     | float | to the goal                                                       |
+    | `distance_m`     | float | distance to the goal                                              |
 
     ## Version history
     * v0 of benchnav 0.9: layers of the dataset.
-    * v0 of benchnav 0.3: `world` in place of `noise` and `time_budget_s`.
-    * v0 of benchnav 0.2: `robot` in place of `dynamics`; `objective`, `goal_radius_m`
+    * v0 of benchnav 0.3: `world` instead of `noise` and `time_budget_s`.
+    * v0 of benchnav 0.2: `robot` instead of `dynamics`; `objective`, `goal_radius_m`
       and `is_success` are new; `split` is `train` by default, was `test/std`; `noise`
       "stored", was "frozen".
     * v0 of benchnav 0.1: first version.
@@ -110,7 +108,7 @@ class OffRoadEnv(gymnasium.Env[Any, np.ndarray]):
     _batch: "EnvBatch"
 
     def __init__(self, render_mode: str | None = None, **arguments: Any) -> None:
-        """Loads the maps of the split; see the class."""
+        """Load the maps of the split; see the class."""
         guard.check_render_mode(render_mode, self.metadata["render_modes"])
         self._batch = self._make_batch(1, **arguments)
         self.observation_space = self._batch.observation_space
@@ -123,7 +121,7 @@ class OffRoadEnv(gymnasium.Env[Any, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Starts an episode; see the class."""
+        """Start an episode; see the class."""
         map_index = guard.read_options(options, ("map",), self._batch.maps).get("map")
         super().reset(seed=seed)
         self._batch.reset([self.np_random], np.array([True]), map_index)
@@ -132,25 +130,24 @@ class OffRoadEnv(gymnasium.Env[Any, np.ndarray]):
     def step(
         self, action: np.ndarray
     ) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
-        """Takes one time step; see the class."""
-        reward, terminated, truncated, met = self._batch.step(
-            guard.read_numbers(action, self.action_space.shape)[None]
-        )
-        observation, info = _only(*self._batch.observe(met))
+        """Take one time step; see the class."""
+        numbers = guard.read_numbers(action, self.action_space.shape)
+        reward, terminated, truncated, traversability = self._batch.step(numbers[None])
+        observation, info = _only(*self._batch.observe(traversability))
         return observation, reward.item(), terminated.item(), truncated.item(), info
 
 
 class OffRoadVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
-    """Many `OffRoadEnv` stepped as one batch, with next-step autoreset.
+    """Batch of `OffRoadEnv`, with next-step autoreset.
 
-    Sub-environment i seeded with s is the single environment seeded with s + i. `info`
-    holds arrays; its `outcome` is a number, see
-    `benchnav.planning.world.outcome.Outcome`. Arguments, spaces and rewards are those
-    of `OffRoadEnv`.
+    Sub-environment i seeded with s equals the single environment seeded with s + i.
+    `info` contains arrays; its `outcome` is an integer, see
+    `benchnav.planning.world.outcome.Outcome`. Arguments, spaces and rewards are as in
+    `OffRoadEnv`.
 
     Args:
-        num_envs: how many.
-        arguments: those of `OffRoadEnv`.
+        num_envs: number of sub-environments.
+        arguments: arguments of `OffRoadEnv`.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012
@@ -162,7 +159,7 @@ class OffRoadVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
     def __init__(
         self, num_envs: int = 1, render_mode: str | None = None, **arguments: Any
     ) -> None:
-        """Loads the maps of the split; see the class."""
+        """Load the maps of the split; see the class."""
         guard.check_render_mode(render_mode, self.metadata["render_modes"])
         self.num_envs = num_envs
         self._batch = self._make_batch(num_envs, **arguments)
@@ -180,55 +177,65 @@ class OffRoadVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Starts an episode in each sub-environment, or in those of
-        `options={"reset_mask": …}`, bool [B].
+        """Start an episode in all sub-environments, or in some.
+
+        Args:
+            seed: seed of all sub-environments; if None, their generators continue.
+            options: `map`, and `reset_mask`: the sub-environments that start, bool,
+                shape [B].
+
+        Raises:
+            ConfigError: If an option is unknown or invalid.
+            ResetNeeded: If the first reset does not include all sub-environments.
         """
-        given = guard.read_options(options, ("map", "reset_mask"), self._batch.maps)
-        every = np.ones(self.num_envs, dtype=bool)
-        chosen = np.asarray(given.get("reset_mask", every))
-        fits = chosen.shape == every.shape and chosen.dtype == bool and chosen.any()
+        options = guard.read_options(options, ("map", "reset_mask"), self._batch.maps)
+        default = np.ones(self.num_envs, dtype=bool)
+        chosen = np.asarray(options.get("reset_mask", default))
+        is_mask = chosen.shape == default.shape and chosen.dtype == bool
         expect(
-            fits,
-            f"option `reset_mask` as bool of shape [{len(every)}], at least one true, "
-            f"got {chosen}.",
+            is_mask and chosen.any(),
+            f"option `reset_mask` as bool of shape [{self.num_envs}], at least one "
+            f"true, got {chosen}.",
         )
         if not self._generators and not chosen.all():
             raise gymnasium.error.ResetNeeded(
-                "Call reset() of all sub-environments before that of some."
+                "Call reset() without `reset_mask` first."
             )
         if seed is not None or not self._generators:
             _, root = seeding.np_random(seed)
-            fresh = [seeding.np_random(root + i)[0] for i in range(self.num_envs)]
-            self._generators = [
-                new if anew else old
-                for new, old, anew in zip(
-                    fresh, self._generators or fresh, chosen, strict=True
-                )
-            ]
-        self._batch.reset(self._generators, chosen, given.get("map"))
+            generators = [seeding.np_random(root + i)[0] for i in range(self.num_envs)]
+            for i in np.flatnonzero(~chosen).tolist():
+                generators[i] = self._generators[i]
+            self._generators = generators
+        self._batch.reset(self._generators, chosen, options.get("map"))
         self._ended = self._ended & ~chosen
         return self._batch.observe()
 
     def step(
         self, actions: np.ndarray
     ) -> tuple[Observations, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Take one time step, or reset where the last one ended an episode; raise
-        before anything is reset.
+        """Take one time step, or reset where the last step ended an episode.
+
+        Raises:
+            ConfigError: If the actions are invalid. Then nothing is reset.
+            ResetNeeded: If no episode has begun.
         """
         ended = self._ended
         actions = self._batch.read_actions(actions, ended)
         if ended.any():
             self._batch.reset(self._generators, ended, None)
-        reward, terminated, truncated, met = self._batch.step(actions, hold=ended)
+        reward, terminated, truncated, traversability = self._batch.step(
+            actions, hold=ended
+        )
         self._ended = terminated | truncated
-        observations, info = self._batch.observe(met)
+        observations, info = self._batch.observe(traversability)
         return observations, reward, terminated, truncated, info
 
 
 def _only(
     observations: Observations, info: Observations
 ) -> tuple[Observations, dict[str, Any]]:
-    """What there is of the one sub-environment of a batch; its outcome by name."""
+    """Return observation and info of a batch of one; the outcome by its name."""
     diagnostics = {name: values[0].item() for name, values in info.items()}
     diagnostics["outcome"] = Outcome(diagnostics["outcome"]).name.lower()
     return {name: values[0] for name, values in observations.items()}, diagnostics

@@ -1,11 +1,9 @@
-"""What the robots of an environment know of the ground, and how they learn on their
-way.
+"""Knowledge of the robots of an environment, updated during their episodes.
 
-A shell over `benchnav.planning.sensing.learner`, by which robots learn in evaluations
-too: λ is sensed at each step, and what is known is updated every `replan_every_s` of an
-    episode. Here episodes begin at different times. Letters
-in shapes: B episodes, M of them, S state dimensions, H×W cells, N cells of all maps
-    together.
+A stateful shell over `benchnav.planning.sensing.learner`, which evaluations use too.
+λ is sensed at each step; the knowledge is updated every `replan_every_s` of an episode.
+Here episodes begin at different times. Letters in shapes: B episodes, M of them, S
+state dimensions, H×W cells.
 """
 
 from collections import OrderedDict
@@ -17,18 +15,21 @@ from torch import Tensor
 
 from benchnav.core.batch import Batch, map_tensors
 from benchnav.core.distribution import TraversabilityDistribution
-from benchnav.env.view import Known
+from benchnav.env.view import MapKnowledge
 from benchnav.planning.sensing.knowledge import Knowledge, Truth
 from benchnav.planning.sensing.learner import Learner
 from benchnav.planning.sensing.sensor import Measurement
 
-_MOST_KEPT = 256  # maps, of up to a megabyte each
+_MAX_CACHED = 256  # maps, of up to a megabyte each
 
 
 @dataclass(frozen=True, kw_only=True)
 class _First(Batch):
-    """What is known of whole maps before a robot set out: the prediction, and all but
-    the belief.
+    """Knowledge of whole maps at the start of an episode.
+
+    Args:
+        prior: predicted distribution of λ.
+        knowledge: everything except the belief state, which follows from `prior`.
     """
 
     prior: TraversabilityDistribution
@@ -36,30 +37,31 @@ class _First(Batch):
 
 
 class Experience:
-    """What the robots of B sub-environments know, from their first step to their last;
-    a stateful shell.
+    """Knowledge of the robots of B sub-environments during their episodes.
 
     Args:
-        learner: how they learn.
-        every: steps between two updates of what is known.
-        alike: the prediction of a whole map is the same in each of its episodes.
+        learner: senses, predicts and updates the belief.
+        update_steps: steps between two updates of the knowledge.
+        is_cacheable: whether the prediction of a whole map is the same in each of its
+            episodes.
     """
 
-    def __init__(self, learner: Learner, every: int, alike: bool) -> None:
-        """Knows nothing of any episode."""
-        self._learner, self._every = learner, every
+    def __init__(self, learner: Learner, update_steps: int, is_cacheable: bool) -> None:
+        """Start without any episode."""
+        self._learner = learner
+        self._update_steps = update_steps
         self._senses = learner.belief.learns or not learner.sensor.sees_all
-        self._alike = alike and learner.sensor.sees_all
-        self._kept: OrderedDict[int, _First] = OrderedDict()
+        self._is_cacheable = is_cacheable and learner.sensor.sees_all
+        self._cache: OrderedDict[int, _First] = OrderedDict()
         self._knowledge: Knowledge | None = None
         self._truth: Truth | None = None
 
     @property
-    def known(self) -> Known:
-        """What all robots know now, as policies are told it."""
+    def map_knowledge(self) -> MapKnowledge:
+        """Current knowledge of all robots, as policies receive it."""
         knowledge = self._current()
         assert knowledge.spread is not None
-        return Known(
+        return MapKnowledge(
             risk_map=knowledge.risk_map,
             spread=knowledge.spread,
             elevation_m=knowledge.observation.elevation_m,
@@ -69,94 +71,95 @@ class Experience:
     def begin(
         self, members: Tensor, maps: Sequence[int], truth: Truth, state: Tensor
     ) -> None:
-        """Begins new episodes in some sub-environments; in all of them at first.
+        """Begin new episodes in some sub-environments; the first call covers all.
 
         Args:
-            members: which, int64, shape [M].
-            maps: numbers of their maps.
-            truth: of these episodes.
-            state: where the robots are, shape [M, S].
+            members: indices of the sub-environments, int64, shape [M].
+            maps: indices of their maps, length M.
+            truth: terrain, λ and sensor keys of these episodes.
+            state: initial states of the robots, shape [M, S].
         """
         knowledge = (
-            self._begun_on(maps, truth, state)
-            if self._alike
-            else self._begun(truth, state)
+            self._cached_start(maps, truth, state)
+            if self._is_cacheable
+            else self._start(truth, state)
         )
         if self._knowledge is None or len(members) == len(self._knowledge.free):
-            self._knowledge, self._truth = knowledge, truth
+            self._knowledge = knowledge
+            self._truth = truth
             return
         self._knowledge = self._learner.put(self._knowledge, members, knowledge)
         if self._senses and self._truth is not None:
             self._truth = self._truth.put(members, truth)
 
-    def learn(self, step: Tensor, state: Tensor, field: Tensor, which: Tensor) -> None:
-        """Senses in some sub-environments, and updates what is known in those of them
-        where that is due.
+    def learn(
+        self, step: Tensor, state: Tensor, field: Tensor, is_sensing: Tensor
+    ) -> None:
+        """Sense in some sub-environments, and update their knowledge where it is due.
 
         Args:
             step: steps that each episode has taken, int64, shape [B].
-            state: where the robots are, shape [B, S].
+            state: states of the robots, shape [B, S].
             field: λ of every cell, shape [B, H, W].
-            which: bool, shape [B].
+            is_sensing: sub-environments that sense, bool, shape [B].
         """
         if not self._senses or self._truth is None:
             return
         truth = replace(self._truth, field=field)
-        due = which & (step % self._every == 0)
+        due = is_sensing & (step % self._update_steps == 0)
         self._knowledge = self._learner.sense(
-            self._current(), truth, state, step.tolist(), due, which
+            self._current(), truth, state, step.tolist(), due, is_sensing
         )
         if bool(due.any()):
             self._update(due, truth)
 
     def _update(self, due: Tensor, truth: Truth) -> None:
-        """Updates what is known in some episodes, bool [B]."""
-        learner, now = self._learner, self._current()
-        news = now.has_news & due
-        if bool(news.any()):
-            # Taken apart, since a prediction costs more than that.
-            members = news.nonzero()[:, 0]
-            part, _ = learner.update(
-                learner.select(now, members), truth.select(members)
-            )
-            now = learner.put(now, members, part)
-        told = (due & ~news)[:, None, None]
-        sensed, news = now.sensed, now.has_news
-        if bool((sensed.mask & told).any()):
-            # As a whole, since to take it apart costs more than the update.
-            now = replace(
-                now, sensed=_only(sensed, told), has_news=torch.zeros_like(news)
-            )
+        """Update the knowledge of the episodes where it is due, bool, shape [B]."""
+        learner = self._learner
+        now = self._current()
+        needs_prediction = now.has_news & due
+        if bool(needs_prediction.any()):
+            # Episodes are selected, since a prediction costs more than selecting.
+            members = needs_prediction.nonzero()[:, 0]
+            selected = learner.select(now, members)
+            updated, _ = learner.update(selected, truth.select(members))
+            now = learner.put(now, members, updated)
+        needs_update = (due & ~needs_prediction)[:, None, None]
+        sensed = now.sensed
+        news = now.has_news
+        if bool((sensed.mask & needs_update).any()):
+            # The whole batch is updated, since selecting costs more than the update.
+            no_news = torch.zeros_like(news)
+            now = replace(now, sensed=_only(sensed, needs_update), has_news=no_news)
             now, _ = learner.update(now, truth)
-            now = replace(now, sensed=_only(sensed, ~told), has_news=news)
+            now = replace(now, sensed=_only(sensed, ~needs_update), has_news=news)
         self._knowledge = now
 
-    def _begun_on(self, maps: Sequence[int], truth: Truth, state: Tensor) -> Knowledge:
-        """What is known at the start of maps that are seen as a whole; kept, since no
-        episode changes it.
-        """
-        every = []
-        for place, number in enumerate(maps):
-            if number not in self._kept:
-                own = torch.tensor([place])
-                knowledge = self._begun(truth.select(own), state[own])
+    def _cached_start(
+        self, maps: Sequence[int], truth: Truth, state: Tensor
+    ) -> Knowledge:
+        """Return the initial knowledge of fully observed maps, through a cache."""
+        starts = []
+        for index, map_index in enumerate(maps):
+            if map_index not in self._cache:
+                member = torch.tensor([index])
+                knowledge = self._start(truth.select(member), state[member])
                 prior = self._learner.distribution(knowledge)
-                self._kept[number] = _First(
-                    prior=prior, knowledge=replace(knowledge, belief_state=None)
-                )
-            self._kept.move_to_end(number)
-            every.append(self._kept[number])
-        while len(self._kept) > _MOST_KEPT:
-            self._kept.popitem(last=False)
-        first, *rest = every
-        joined = map_tensors(first, lambda *values: torch.cat(values), *rest)
+                knowledge = replace(knowledge, belief_state=None)
+                self._cache[map_index] = _First(prior=prior, knowledge=knowledge)
+            self._cache.move_to_end(map_index)
+            starts.append(self._cache[map_index])
+        while len(self._cache) > _MAX_CACHED:
+            self._cache.popitem(last=False)
+        joined = map_tensors(starts[0], lambda *values: torch.cat(values), *starts[1:])
         return replace(
             joined.knowledge, belief_state=self._learner.believe(joined.prior)
         )
 
-    def _begun(self, truth: Truth, state: Tensor) -> Knowledge:
-        """What is known at the start."""
-        learner, prediction = self._learner, None
+    def _start(self, truth: Truth, state: Tensor) -> Knowledge:
+        """Return the initial knowledge of some episodes."""
+        learner = self._learner
+        prediction = None
         if learner.sensor.sees_all:
             terrain = replace(truth.terrain, traversability=truth.field)
             prediction = learner.predict(terrain, terrain.observe())
@@ -167,10 +170,7 @@ class Experience:
         return self._knowledge
 
 
-def _only(sensed: Measurement, which: Tensor) -> Measurement:
-    """What was sensed in some episodes, bool, shape [B, 1, 1], and nothing in the
-    others.
-    """
-    return replace(
-        sensed, traversability=sensed.traversability.masked_fill(~which, torch.nan)
-    )
+def _only(sensed: Measurement, is_selected: Tensor) -> Measurement:
+    """Return measurements of the selected episodes only, bool, shape [B, 1, 1]."""
+    traversability = sensed.traversability.masked_fill(~is_selected, torch.nan)
+    return replace(sensed, traversability=traversability)

@@ -1,6 +1,4 @@
-"""Checks of what a user passes to an environment, and the threads of the process that
-it runs in.
-"""
+"""Checks of a user's arguments to an environment, and limits on its threads."""
 
 import multiprocessing
 import os
@@ -23,11 +21,10 @@ _MAIN_PROCESS = 0 if multiprocessing.parent_process() else os.getpid()
 
 
 def limit_threads() -> None:
-    """Limit PyTorch to one thread in a worker process, once; a program may then set
-    another number.
+    """Limit PyTorch to one thread in a worker process.
 
-    Threads do not survive a fork: an operation that waits for those of the parent never
-        ends.
+    The limit is set once, so a program may then set another number. Threads do not
+    survive a fork: an operation that waits for threads of the parent never ends.
     """
     _limit_threads(os.getpid())
 
@@ -44,48 +41,42 @@ def warn(text: str) -> None:
 
 
 def check_render_mode(render_mode: str | None, modes: Collection[str]) -> None:
-    """Raise where an environment does not have a render mode.
+    """Check that an environment has a render mode.
 
     Args:
         render_mode: as passed by the user.
-        modes: those of the environment; empty for version 0.
+        modes: modes of the environment; empty for version 0.
 
     Raises:
-        ConfigError: If it is none of them.
+        ConfigError: If the mode is not in `modes`.
     """
     if render_mode is None or render_mode in modes:
         return
     if modes:
-        raise ConfigError(
-            f"Expected `render_mode` {' or '.join(map(repr, modes))}, got "
-            f"{render_mode!r}."
-        )
+        expected = " or ".join(map(repr, modes))
+        raise ConfigError(f"Expected `render_mode` {expected}, got {render_mode!r}.")
     raise ConfigError(
-        "Expected no `render_mode` of benchnav/OffRoad-v0, which draws nothing, got "
-        f"{render_mode!r}. "
-        "Take benchnav/OffRoad-v1."
+        "Expected no `render_mode` for benchnav/OffRoad-v0, which draws nothing, got "
+        f"{render_mode!r}. Use benchnav/OffRoad-v1."
     )
 
 
 def has_display() -> bool:
-    """Return whether Matplotlib may find a display, or `MPLBACKEND` names a backend
-    that needs none.
-    """
-    return sys.platform != "linux" or any(
-        os.environ.get(name) for name in ("MPLBACKEND", "DISPLAY", "WAYLAND_DISPLAY")
-    )
+    """Return whether Matplotlib may draw: to a display, or by `MPLBACKEND`."""
+    names = ("MPLBACKEND", "DISPLAY", "WAYLAND_DISPLAY")
+    return sys.platform != "linux" or any(os.environ.get(name) for name in names)
 
 
-def read_options(options: Any, known: Collection[str], maps: int) -> dict[str, Any]:
-    """Check the options of a reset.
+def read_options(options: Any, names: Collection[str], maps: int) -> dict[str, Any]:
+    """Return the checked options of a reset.
 
     Args:
         options: as passed by the user.
-        known: names that the environment has.
-        maps: how many maps it has.
+        names: options of the environment.
+        maps: number of its maps.
 
     Returns:
-        The options, with `map` as a Python integer where it is named.
+        The options; `map`, if given, as a Python integer.
 
     Raises:
         ConfigError: If a name is unknown, or `map` is not the index of a map.
@@ -96,14 +87,11 @@ def read_options(options: Any, known: Collection[str], maps: int) -> dict[str, A
     )
     checked = dict(options or {})
     for name in checked:
-        check_known("an option of `reset`", name, known)
+        check_known("an option of `reset`", name, names)
     index = checked.get("map")
     if index is not None:
-        is_index = (
-            isinstance(index, int | np.integer)
-            and not isinstance(index, bool)
-            and 0 <= index < maps
-        )
+        is_integer = isinstance(index, int | np.integer)
+        is_index = is_integer and not isinstance(index, bool) and 0 <= index < maps
         expect(
             is_index, f"option `map` as a whole number in 0–{maps - 1}, got {index!r}."
         )
@@ -117,13 +105,12 @@ def read_numbers(
     """Return actions as float32.
 
     Args:
-        actions: of a policy.
-        single_shape: of the action of a single environment, which is checked; None for
-            several.
+        actions: actions of a policy.
+        single_shape: expected shape of the action of a single environment; None for
+            several environments, whose shape is not checked here.
 
     Raises:
-        ConfigError: If the actions are no real numbers, or the one action is of another
-            shape.
+        ConfigError: If the actions are not real numbers, or have another shape.
     """
     try:
         array = np.asarray(actions)
@@ -144,11 +131,11 @@ def read_numbers(
 
 
 def check_actions(actions: np.ndarray, acting: np.ndarray) -> None:
-    """Raise where an action is NaN or infinite.
+    """Check that all actions in use are finite.
 
     Args:
-        actions: shape [B, A].
-        acting: sub-environments that use theirs, bool, shape [B].
+        actions: actions of B sub-environments, shape [B, A].
+        acting: sub-environments that use their action, bool, shape [B].
 
     Raises:
         ConfigError: If an action that is used is not finite.
@@ -156,39 +143,34 @@ def check_actions(actions: np.ndarray, acting: np.ndarray) -> None:
     faulty = np.flatnonzero(acting & ~np.isfinite(actions).all(axis=1))
     if len(faulty):
         index = int(faulty[0])
-        where = f" for sub-environment {index}" if len(actions) > 1 else ""
+        suffix = f" for sub-environment {index}" if len(actions) > 1 else ""
         raise ConfigError(
-            f"Expected finite actions, got {actions[index].tolist()}{where}. See "
-            "whether the policy's weights or "
-            "its observations are NaN."
+            f"Expected finite actions, got {actions[index].tolist()}{suffix}. Check "
+            "whether the policy's weights or its observations are NaN."
         )
 
 
 def warn_of_default_world(world: str | Mapping[str, Any] | World) -> None:
-    """Warn of a world without stakes that was not chosen.
+    """Warn if a user did not choose a world, since by default it is without stakes.
 
-    A user who names the preset `paper`, sets `immobile` or passes a `World` has chosen
-    it, and is not warned. A mapping of other changes leaves the default preset
-    unchosen, and warns.
+    A user chooses a world by the preset `paper`, by `immobile` or by a `World`. A
+    mapping of other changes does not choose the preset, so it warns.
     """
-    is_chosen = (
-        not {"preset", "immobile"}.isdisjoint(world)
-        if isinstance(world, Mapping)
-        else world != ""
-    )
-    if not is_chosen:
+    is_default = world == ""
+    if isinstance(world, Mapping):
+        is_default = {"preset", "immobile"}.isdisjoint(world)
+    if is_default:
         warn(
             "`world` is 'paper' by default, where low λ ends no episode. Pass "
-            "world='stakes' for one in which "
-            "terrain immobilises the robot, or name preset 'paper' to choose it."
+            "world='stakes' for a world in which terrain immobilises the robot, or "
+            "pass preset 'paper' to choose it."
         )
 
 
 def warn_of_default_model() -> None:
-    """Warn of a privileged model that was not chosen."""
+    """Warn that the model is privileged by default."""
     warn(
         "`model` is 'oracle' by default, a privileged model: it is given the true "
-        "distribution of λ. Pass a "
-        "checkpoint, such as model='stakes-v1', for results that a robot could have, "
-        "or model='oracle' to choose it."
+        "distribution of λ. Pass a checkpoint, such as model='stakes-v1', for results "
+        "that a robot can reach, or pass model='oracle' to choose it."
     )

@@ -22,30 +22,30 @@ from benchnav.viz import maps
 
 SIZE = (640, 480)  # width and height in pixels
 _DPI = 100
-# Squares: the map's and, at its right, two for what the policy is given.
+# Squares: the map, and to its right two channels of the policy's observation.
 _PANELS = {
     **{"width_ratios": (424, 176), "wspace": 16 / 300, "hspace": 48 / 176},
     **{"left": 16 / 640, "right": 632 / 640, "bottom": 16 / 480, "top": 440 / 480},
 }
-_UNSEEN = 0.35  # of the brightness of ground that was seen
+_UNSEEN = 0.35  # brightness of unobserved terrain, relative to observed terrain
 _TEXT = 8.5  # points
-_MARKS = 1.3
+_MARKS = 1.3  # scale of the markers
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """What is drawn.
+    """Contents of a picture.
 
     Args:
         rgb: colours of the map, uint8, shape [3, H, W].
-        seen: which cells were seen, bool, shape [H, W].
-        crop: what the policy is given, shape [4, N, N].
-        corners_m: of the crop on the map, shape [4, 2].
-        behind: share of the crop that is behind the robot.
-        state: beginning with (x, y, θ), shape [S].
-        goal_m: (x, y), shape [2].
-        track: where the robot drove, shape [P, 2].
-        time_s: since the episode began.
+        seen: mask of observed cells, bool, shape [H, W].
+        crop: crop that the policy observes, shape [4, N, N].
+        corners_m: corners of the crop on the map, in metres, shape [4, 2].
+        behind: fraction of the crop's length that is behind the robot.
+        state: state of the robot, beginning with (x, y, θ), shape [S].
+        goal_m: (x, y) in metres, shape [2].
+        track: positions of the robot up to now, in metres, shape [P, 2].
+        time_s: time since the start of the episode, in seconds.
         observed: λ of the last step.
         outcome: `running`, or how the episode ended.
     """
@@ -64,10 +64,10 @@ class Scene:
 
 
 class Picture:
-    """Draws scenes on maps of one grid.
+    """Renderer of scenes on maps of one grid.
 
     Args:
-        grid: of the maps.
+        grid: grid of the maps.
     """
 
     def __init__(self, grid: Grid) -> None:
@@ -77,7 +77,7 @@ class Picture:
         self._canvas = FigureCanvasAgg(self._figure)
 
     def draw(self, scene: Scene) -> np.ndarray:
-        """Draw the image, uint8, shape [480, 640, 3]."""
+        """Return the image of a scene, uint8, shape [480, 640, 3]."""
         self._figure.clear()
         panels = self._figure.subplot_mosaic(
             [["map", "risk"], ["map", "spread"]], gridspec_kw=_PANELS
@@ -96,8 +96,8 @@ class Picture:
 
     def _draw_map(self, panel: Axes, scene: Scene) -> None:
         light = np.where(scene.seen, 1.0, _UNSEEN)[..., None]
-        shown = (scene.rgb.transpose(1, 2, 0) * light).astype(np.uint8)
-        maps.show_map(panel, shown, self._grid.extent_m)
+        image = (scene.rgb.transpose(1, 2, 0) * light).astype(np.uint8)
+        maps.show_map(panel, image, self._grid.extent_m)
         for colour, line in (("black", 2.4), ("white", 1.2)):
             panel.add_patch(
                 Polygon(scene.corners_m, closed=True, fill=False, ec=colour, lw=line)
@@ -111,32 +111,26 @@ class Picture:
             heading_rad=scene.state[2],
         )
         maps.draw_drive(panel, drive, 1.6, _MARKS)
-        words = (
-            f"t = {scene.time_s:.1f} s    λ = {scene.observed:.2f}    "
-            f"{outcome.replace('_', ' ')}"
-        )
-        panel.set_title(words, fontsize=_TEXT + 1, loc="left", pad=5)
+        title = f"t = {scene.time_s:.1f} s    λ = {scene.observed:.2f}    "
+        title += outcome.replace("_", " ")
+        panel.set_title(title, fontsize=_TEXT + 1, loc="left", pad=5)
 
     def _draw_crop(
         self, panel: Axes, scene: Scene, channel: str, title: str, colours: str
     ) -> None:
-        values, known, spread = (
-            scene.crop[CHANNELS.index(name)] for name in (channel, "known", "spread")
-        )
-        shown = (
-            matplotlib.colormaps[colours](values)[..., :3]
-            * np.where(known > 0, 1.0, _UNSEEN)[..., None]
-        )
-        shown[(known <= 0) & (spread == 0) & (scene.crop[0] == 0)] = to_rgb(
-            maps.LACKING
-        )
+        values = scene.crop[CHANNELS.index(channel)]
+        seen = scene.crop[CHANNELS.index("known")]
+        spread = scene.crop[CHANNELS.index("spread")]
+        light = np.where(seen > 0, 1.0, _UNSEEN)[..., None]
+        image = matplotlib.colormaps[colours](values)[..., :3] * light
+        is_off_map = (seen <= 0) & (spread == 0) & (scene.crop[0] == 0)
+        image[is_off_map] = to_rgb(maps.LACKING)
         cells = len(values)
         # Ahead is up, and the robot's left is left.
-        maps.show_map(panel, shown.transpose(1, 0, 2)[:, ::-1], (cells, cells))
+        maps.show_map(panel, image.transpose(1, 0, 2)[:, ::-1], (cells, cells))
         ahead = maps.robot_marker(np.pi / 2)
-        maps.mark(
-            panel, "robot", (cells / 2, scene.behind * cells), _MARKS, marker=ahead
-        )
+        robot = (cells / 2, scene.behind * cells)
+        maps.mark(panel, "robot", robot, _MARKS, marker=ahead)
         panel.set_title(title, fontsize=_TEXT, loc="left", pad=4)
         bar = panel.inset_axes((0.72, 1.03, 0.2, 0.06), xticks=[], yticks=[])
         bar.imshow(np.linspace(0, 1, 32)[None], cmap=colours, aspect="auto")
@@ -147,25 +141,24 @@ class Picture:
 
 
 class Window:
-    """Shows images, one after the other."""
+    """Window that shows images of the size `SIZE`."""
 
     def __init__(self) -> None:
-        """Opens the window.
+        """Open the window.
 
         Raises:
-            ConfigError: there is no display, and `MPLBACKEND` names no backend that
-                does without.
+            ConfigError: If there is no display, and `MPLBACKEND` names no backend that
+                works without one.
         """
-        # Imported here, since it looks for a display.
+        # Imported here, since the import searches for a display.
         from matplotlib import pyplot
 
         self._pyplot: Any = pyplot
         if pyplot.get_backend().lower() == "agg" and not os.environ.get("MPLBACKEND"):
             raise ConfigError(
-                'Expected a display for `render_mode` "human", got none that '
-                'Matplotlib can use. Take "rgb_array", or '
-                "install a toolkit of Matplotlib's, such as PyQt6, where there is a "
-                "display."
+                'Expected a display for `render_mode` "human", got no display that '
+                'Matplotlib can use. Pass "rgb_array". If there is a display, install '
+                "a GUI toolkit that Matplotlib supports, such as PyQt6."
             )
         self._figure = pyplot.figure(
             "benchnav", figsize=(SIZE[0] / _DPI, SIZE[1] / _DPI), dpi=_DPI
@@ -175,7 +168,7 @@ class Window:
         self._image = panel.imshow(np.full((SIZE[1], SIZE[0], 3), 255, np.uint8))
 
     def show(self, image: np.ndarray) -> None:
-        """Shows an image of the size `SIZE` in place of the last one."""
+        """Show an image, uint8, shape [480, 640, 3], instead of the last one."""
         self._image.set_data(image)
         if self._pyplot.get_backend().lower() != "agg":
             self._figure.show()
@@ -183,5 +176,5 @@ class Window:
         self._figure.canvas.flush_events()
 
     def close(self) -> None:
-        """Closes the window; may be called again."""
+        """Close the window; may be called again."""
         self._pyplot.close(self._figure)

@@ -1,5 +1,7 @@
-"""Policies as planners: what was trained in `benchnav/OffRoad-v1` meets the same
-episodes as any planner.
+"""Policies as planners.
+
+A policy that was trained in `benchnav/OffRoad-v1` is evaluated on the same episodes as
+any planner.
 """
 
 from collections.abc import Callable
@@ -12,7 +14,7 @@ from torch import Tensor
 from benchnav.core.batch import Batch
 from benchnav.core.errors import expect
 from benchnav.core.ground import SEEN
-from benchnav.env.view import Known, View
+from benchnav.env.view import MapKnowledge, View
 from benchnav.planning.planners.planner import Plan, Planner
 from benchnav.planning.problem import Problem, Task
 from benchnav.planning.sensing.sensor import Step
@@ -22,33 +24,33 @@ Policy = Callable[[dict[str, np.ndarray]], np.ndarray]
 
 @dataclass(frozen=True, kw_only=True)
 class PolicyState(Batch):
-    """What a policy's planner keeps.
+    """Plan state of a policy.
 
     Args:
         problem: B problems.
-        known: of the ground.
+        knowledge: knowledge of the terrain in each of them.
     """
 
     problem: Problem
-    known: Known
+    knowledge: MapKnowledge
 
 
 class PolicyPlanner(Planner[PolicyState]):
-    """Drives as a policy says that is given the observations of `benchnav/OffRoad-v1`.
+    """Planner that follows a policy of `benchnav/OffRoad-v1`.
 
-    A policy in a file is named on the command line through a subclass, whose
-    constructor's parameters are its options:
+    On the command line, name a policy in a file through a subclass. The parameters of
+    its constructor are its options:
 
         class Mine(PolicyPlanner):
             def __init__(self, path: str = "policy.zip"):
                 super().__init__(load(path), normalised_actions=True)
 
     Args:
-        policy: gives actions, shape [B, A], from a batch of observations; each is for
-            its own observation alone.
-        crop_cells: as the environment had in training.
-        crop_behind: likewise.
-        normalised_actions: likewise.
+        policy: returns actions, shape [B, A], for a batch of observations; each action
+            depends only on its own observation.
+        crop_cells: rows and columns of the crop, as in training.
+        crop_behind: fraction of the crop behind the robot, as in training.
+        normalised_actions: whether actions are in [−1, 1], as in training.
     """
 
     def __init__(
@@ -58,74 +60,82 @@ class PolicyPlanner(Planner[PolicyState]):
         crop_behind: float = 1 / 3,
         normalised_actions: bool = False,
     ) -> None:
-        """Keeps the policy."""
-        self.policy, self.normalised_actions = policy, normalised_actions
+        """Create the planner of a policy; nothing is called yet."""
+        self.policy = policy
+        self.normalised_actions = normalised_actions
         self.view = View(cells=crop_cells, behind=crop_behind)
 
     def follows(self, task: Task) -> str:
-        """That it minimises nothing; see `Planner`."""
+        """Return the objective: none; see `Planner`."""
         return "none (a policy, which does what it was trained for)"
 
     def init(self, problem: Problem, generator: torch.Generator) -> PolicyState:
-        """Keeps what is predicted; draws nothing. See `Planner`."""
-        return PolicyState(problem=problem, known=_known_of(problem))
+        """Return the plan state of the predicted λ; see `Planner`. Draws nothing."""
+        return PolicyState(problem=problem, knowledge=_knowledge_of(problem))
 
     def plan(
         self, step: Step, plan_state: PolicyState
     ) -> tuple[Tensor, PolicyState, Plan]:
-        """Asks the policy; see `Planner`."""
+        """Return the actions of the policy; see `Planner`.
+
+        Raises:
+            ConfigError: If the policy returns actions of another shape.
+        """
         problem = plan_state.problem
-        given = self.observe(step, plan_state)
-        answer = np.asarray(self.policy(given), np.float32)
+        observations = self.observe(step, plan_state)
+        array = np.asarray(self.policy(observations), np.float32)
         low, high = problem.action_bounds
-        expected = [len(problem), len(low)]
+        shape = list(array.shape)
+        expected_shape = [len(problem), len(low)]
         expect(
-            list(answer.shape) == expected,
-            f"actions of shape {expected} from the policy, got {list(answer.shape)}.",
+            shape == expected_shape,
+            f"actions of shape {expected_shape} from the policy, got {shape}.",
         )
-        action = torch.from_numpy(answer).to(step.state)
+        action = torch.from_numpy(array).to(step.state)
         if self.normalised_actions:
             action = low + (action + 1) / 2 * (high - low)
-        return (
-            action.clamp(low, high),
-            plan_state,
-            Plan.empty(len(problem), action.device),
-        )
+        plan = Plan.empty(len(problem), action.device)
+        return action.clamp(low, high), plan_state, plan
 
     def observe(self, step: Step, plan_state: PolicyState) -> dict[str, np.ndarray]:
-        """The observations of `benchnav/OffRoad-v1`, of B episodes.
+        """Return the observations of `benchnav/OffRoad-v1` for B episodes.
 
         Args:
-            step: where the robots are.
-            plan_state: what is known.
+            step: states of the robots, and the λ that they observed.
+            plan_state: problems, and knowledge of the terrain.
+
+        Returns:
+            `crop`, shape [B, 4, N, N], and `state`, shape [B, 5 + S − 3], both float32;
+            see `benchnav.env.view.View.observe`.
         """
         problem = plan_state.problem
         time_left = 1 - step.time_s / problem.time_budget_s
-        seen = self.view.observe(
+        observations = self.view.observe(
             problem.grid,
-            plan_state.known,
+            plan_state.knowledge,
             step.state,
             problem.goal_m,
             step.traversability,
             time_left,
         )
-        return {name: values.cpu().numpy() for name, values in seen.items()}
+        return {name: values.cpu().numpy() for name, values in observations.items()}
 
     def revise(self, plan_state: PolicyState, problem: Problem) -> PolicyState:
-        """Goes on under what is known now; see `Planner`."""
-        return PolicyState(problem=problem, known=_known_of(problem))
+        """Return the plan state of the updated λ; see `Planner`."""
+        return PolicyState(problem=problem, knowledge=_knowledge_of(problem))
 
     def select(self, plan_state: PolicyState, members: Tensor) -> PolicyState:
-        """Keeps some episodes; see `Planner`."""
+        """Return the plan state of some episodes; see `Planner`."""
         return plan_state.select(members)
 
 
-def _known_of(problem: Problem) -> Known:
-    """What is known of the ground in a batch of problems."""
-    seen = problem.observation.layers.get(SEEN)
-    return Known(
+def _knowledge_of(problem: Problem) -> MapKnowledge:
+    """Return the knowledge of the terrain in a batch of problems."""
+    layer = problem.observation.layers.get(SEEN)
+    seen = torch.ones_like(problem.free) if layer is None else layer > 0
+    return MapKnowledge(
         risk_map=problem.risk_map,
         spread=problem.distribution.spread(),
         elevation_m=problem.elevation_m,
-        seen=torch.ones_like(problem.free) if seen is None else seen > 0,
+        seen=seen,
     )

@@ -1,11 +1,10 @@
-"""What a policy is given: a crop of what is known, which turns with the robot, and
-numbers of robot and goal.
+"""Observations of a policy: a crop that turns with the robot, and a state vector.
 
-The same function makes the observations of `benchnav/OffRoad-v1` and those of a
-`PolicyPlanner`, so that a policy meets in an evaluation what it was trained on. The
-robot's frame has x ahead and y to its left; a crop is indexed as maps are, [row = y,
-column = x]. Letters in shapes: B episodes, H×W cells of the map, N×N cells of the crop,
-S state dimensions.
+`benchnav/OffRoad-v1` and `PolicyPlanner` compute observations by the same function.
+A policy therefore observes in an evaluation what it observed in training. The robot's
+frame has x ahead and y to its left. A crop is indexed as maps are, [row = y, column =
+x]. Letters in shapes: B episodes, H×W cells of the map, N×N cells of the crop, S state
+dimensions.
 """
 
 from dataclasses import dataclass
@@ -31,15 +30,15 @@ _POSE = 3  # dimensions of a state that every robot has: x, y, θ
 
 
 @dataclass(frozen=True, kw_only=True)
-class Known(Batch):
-    """What is known of the ground.
+class MapKnowledge(Batch):
+    """Knowledge of the terrain of B maps.
 
     Args:
-        risk_map: λ̂ as the risk setting gives it, in [0, 1], shape [B, H, W].
+        risk_map: λ̂ under the risk setting, in [0, 1], shape [B, H, W].
         spread: half of the range from the 16 % to the 84 % quantile of λ, in [0, 0.5],
             shape [B, H, W].
-        elevation_m: of what was seen; of other cells it is not used, shape [B, H, W].
-        seen: which cells were seen, bool, shape [B, H, W].
+        elevation_m: elevation in metres, used in observed cells only, shape [B, H, W].
+        seen: mask of observed cells, bool, shape [B, H, W].
     """
 
     risk_map: Tensor
@@ -50,22 +49,22 @@ class Known(Batch):
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """Which part of the map a policy sees.
+    """Part of the map that a policy observes.
 
     Args:
-        cells: N, rows and columns of the crop; its cells have the size of the map's.
-        behind: share of the crop's length that is behind the robot: 0.5 has the robot
-            in the middle.
+        cells: N, rows and columns of the crop, at least 2; its cells have the size of
+            the map's.
+        behind: fraction of the crop's length that is behind the robot, in [0, 1); at
+            0.5 the robot is in the middle.
     """
 
     cells: int = 32
     behind: float = 1 / 3
 
     def __post_init__(self) -> None:
-        """Refuses crops that hold nothing, or not the robot."""
-        is_count = isinstance(self.cells, int | np.integer) and not isinstance(
-            self.cells, bool
-        )
+        """Reject crops that are too small, or do not contain the robot."""
+        is_integer = isinstance(self.cells, int | np.integer)
+        is_count = is_integer and not isinstance(self.cells, bool)
         expect(
             is_count and self.cells >= 2,
             f"`crop_cells` as a whole number of at least 2, got {self.cells!r}.",
@@ -73,39 +72,43 @@ class View:
         expect(0 <= self.behind < 1, f"`crop_behind` in [0, 1), got {self.behind}.")
 
     def reach_m(self, grid: Grid) -> float:
-        """Half of the crop's length, by which lengths are scaled."""
+        """Return half of the crop's length in metres, by which lengths are scaled."""
         return self.cells * grid.resolution_m / 2
 
     def corners_m(self, grid: Grid, state: Tensor) -> Tensor:
-        """Corners (x, y) of the crop on the map, in a circle, shape [B, 4, 2]."""
-        length = 2 * self.reach_m(grid)
-        ahead = torch.tensor([0.0, 1.0, 1.0, 0.0], dtype=state.dtype) - self.behind
-        left = torch.tensor([-0.5, -0.5, 0.5, 0.5], dtype=state.dtype)
-        return torch.stack(
-            _to_map(state, length * ahead[None], length * left[None]), dim=-1
-        )
-
-    def crop(self, grid: Grid, known: Known, state: Tensor) -> Tensor:
-        """Reads what is known at the centre of each cell of the crop, in the map's cell
-        that it lies in.
+        """Return the corners (x, y) of the crop on the map, in order around it.
 
         Args:
-            grid: of the maps.
-            known: of B episodes.
-            state: beginning with (x, y, θ), shape [B, S].
+            grid: grid of the maps.
+            state: states of the robots, beginning with (x, y, θ), shape [B, S].
+
+        Returns:
+            Positions in metres, shape [B, 4, 2].
+        """
+        length = 2 * self.reach_m(grid)
+        ahead = torch.tensor([0.0, 1.0, 1.0, 0.0], dtype=state.dtype) - self.behind
+        to_left = torch.tensor([-0.5, -0.5, 0.5, 0.5], dtype=state.dtype)
+        positions = _to_map(state, length * ahead[None], length * to_left[None])
+        return torch.stack(positions, dim=-1)
+
+    def crop(self, grid: Grid, knowledge: MapKnowledge, state: Tensor) -> Tensor:
+        """Return the map cell at the centre of each cell of the crop, in all channels.
+
+        Args:
+            grid: grid of the maps.
+            knowledge: knowledge of the terrain in B episodes.
+            state: states of the robots, beginning with (x, y, θ), shape [B, S].
 
         Returns:
             `CHANNELS`, float32, shape [B, 4, N, N]; all 0 off the map.
         """
-        length = 2 * self.reach_m(grid)
-        along = (
-            torch.arange(self.cells, dtype=state.dtype, device=state.device) + 0.5
-        ) / self.cells
-        x, y = _to_map(
-            state[:, None],
-            length * (along - self.behind)[None, None],
-            length * (along - 0.5)[None, :, None],
-        )
+        reach_m = self.reach_m(grid)
+        length = 2 * reach_m
+        indices = torch.arange(self.cells, dtype=state.dtype, device=state.device)
+        fraction = (indices + 0.5) / self.cells
+        ahead = length * (fraction - self.behind)[None, None]
+        to_left = length * (fraction - 0.5)[None, :, None]
+        x, y = _to_map(state[:, None], ahead, to_left)
         inside = grid.contains(x, y)
         row, column = grid.cell_of(x, y)
         cell = (row * grid.width + column).flatten(1)
@@ -113,17 +116,15 @@ class View:
         def read(values: Tensor) -> Tensor:
             return values.flatten(1).gather(1, cell).view(x.shape).float()
 
-        own = (
-            torch.arange(len(state), device=state.device),
-            *grid.cell_of(state[:, 0], state[:, 1]),
-        )
-        rise = (
-            read(known.elevation_m) - known.elevation_m[own][:, None, None]
-        ) / self.reach_m(grid)
-        seen = inside & (read(known.seen) > 0)
+        episode = torch.arange(len(state), device=state.device)
+        robot_row, robot_column = grid.cell_of(state[:, 0], state[:, 1])
+        robot_elevation_m = knowledge.elevation_m[episode, robot_row, robot_column]
+        rise_m = read(knowledge.elevation_m) - robot_elevation_m[:, None, None]
+        rise = rise_m / reach_m
+        seen = inside & (read(knowledge.seen) > 0)
         channels = [
-            torch.where(inside, read(known.risk_map), 0.0),
-            torch.where(inside, 2 * read(known.spread), 0.0),
+            torch.where(inside, read(knowledge.risk_map), 0.0),
+            torch.where(inside, 2 * read(knowledge.spread), 0.0),
             torch.where(seen, rise.clamp(-1, 1), 0.0),
             seen.float(),
         ]
@@ -132,22 +133,22 @@ class View:
     def observe(
         self,
         grid: Grid,
-        known: Known,
+        knowledge: MapKnowledge,
         state: Tensor,
         goal_m: Tensor,
         observed: Tensor,
         time_left: Tensor,
     ) -> dict[str, Tensor]:
-        """Makes the observations of B episodes.
+        """Return the observations of B episodes.
 
         Args:
-            grid: of the maps.
-            known: of the ground.
-            state: where the robots are, shape [B, S].
-            goal_m: (x, y) of the goals, shape [B, 2].
-            observed: λ that each robot met in the last step, NaN where there was none,
+            grid: grid of the maps.
+            knowledge: knowledge of the terrain.
+            state: states of the robots, beginning with (x, y, θ), shape [B, S].
+            goal_m: (x, y) of the goals in metres, shape [B, 2].
+            observed: λ under each robot in the last step, NaN before the first step,
                 shape [B].
-            time_left: share of the time budget that is left, shape [B].
+            time_left: remaining fraction of the time budget, shape [B].
 
         Returns:
             `crop`, shape [B, 4, N, N], and `state`, shape [B, 5 + S − 3], both float32.
@@ -162,30 +163,45 @@ class View:
             time_left.clamp(0, 1),
         ]
         numbers = [number.float() for number in numbers]
-        own = _squash(state[:, _POSE:]).float()
+        # Velocities, and whatever else the state of this robot has beyond its pose.
+        extra = _squash(state[:, _POSE:]).float()
         return {
-            "crop": self.crop(grid, known, state),
-            "state": torch.cat((torch.stack(numbers, dim=1), own), dim=1),
+            "crop": self.crop(grid, knowledge, state),
+            "state": torch.cat((torch.stack(numbers, dim=1), extra), dim=1),
         }
 
 
 def bounds(states: int) -> tuple[list[float], list[float]]:
-    """Least and greatest values of the numbers of a robot whose state has so many
-    dimensions.
+    """Return minimum and maximum of the observed state vector.
+
+    Args:
+        states: S, dimensions of the robot's state.
+
+    Returns:
+        Two lists of length 5 + S − 3.
     """
-    more = states - _POSE
-    return [0.0, -1.0, -1.0, 0.0, 0.0, *[-1.0] * more], [1.0] * (len(NUMBERS) + more)
+    n_extra = states - _POSE
+    minimum = [0.0, -1.0, -1.0, 0.0, 0.0] + [-1.0] * n_extra
+    maximum = [1.0] * (len(NUMBERS) + n_extra)
+    return minimum, maximum
 
 
-def _to_map(state: Tensor, ahead: Tensor, left: Tensor) -> tuple[Tensor, Tensor]:
-    """Positions (x, y) on the map of places in the robots' frames; they broadcast to
-    [B, *K].
+def _to_map(state: Tensor, ahead: Tensor, to_left: Tensor) -> tuple[Tensor, Tensor]:
+    """Return positions (x, y) on the map of positions in the robots' frames.
+
+    Args:
+        state: states of the robots, shape [B, …, S].
+        ahead: distance ahead of the robot; broadcasts to [B, *K].
+        to_left: distance to the left of the robot; likewise.
     """
     x, y, heading = (state[..., i, None] for i in range(_POSE))
-    cos, sin = heading.cos(), heading.sin()
-    return x + cos * ahead - sin * left, y + sin * ahead + cos * left
+    cos = heading.cos()
+    sin = heading.sin()
+    x = x + cos * ahead - sin * to_left
+    y = y + sin * ahead + cos * to_left
+    return x, y
 
 
 def _squash(value: Tensor) -> Tensor:
-    """Maps all numbers to (−1, 1), those of at least 0 to [0, 1)."""
+    """Return x / (1 + |x|), which maps all numbers to (−1, 1)."""
     return value / (1 + value.abs())

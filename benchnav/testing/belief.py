@@ -280,7 +280,7 @@ class _BeliefCheck:
         """Expect measurements sampled from the prediction to reduce the variance.
 
         With p = P(λ ≤ value), the variance of the event is p (1 − p). Its mean over
-        possible measurements cannot rise (covariance of total variance), although that of a
+        possible measurements cannot rise (law of total variance), although that of a
         single update may.
         """
         if not self.belief.learns:

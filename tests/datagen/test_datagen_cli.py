@@ -156,7 +156,7 @@ def test_shards_made_apart_are_one_dataset(datagen: Call, capsys) -> None:  # ty
     shard.unlink()
     assert datagen("validate", "big") == 1
     assert (
-        f"remove {shard.name} in big and give the command that made it again"
+        f"remove {shard.name} in big and run the command that made it again"
         in capsys.readouterr().out
     )
     assert datagen("create", "tiny-v1", *SMALL, "--out", "big") == 0
@@ -188,7 +188,7 @@ def test_options_of_create_reach_it(
 def test_a_large_dataset_is_a_folder(
     datagen: Call, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cli, "_MOST_CELLS_OF_A_FILE", 32 * 32 * 4)
+    monkeypatch.setattr(cli, "_MAX_CELLS_PER_FILE", 32 * 32 * 4)
     Path("datasets").mkdir()
     assert (
         datagen("create", "tiny-v1", "--first", "2", "--splits", "[train,valid]") == 0
@@ -384,7 +384,7 @@ def test_faults_of_consecutive_maps_are_one_line(datagen: Call, capsys) -> None:
     assert capsys.readouterr().out.splitlines() == [
         "train: maps 0–2: field 'start_m' does not match its digest",
         "d.h5: 3 fault(s)",
-        "To mend it, make the file again with --overwrite. The same recipe and version give the same digests.",
+        "To repair it, make the file again with --overwrite. The same recipe and version give the same digests.",
     ]
 
 
@@ -429,7 +429,7 @@ def test_faults_of_consecutive_maps_are_one_line(datagen: Call, capsys) -> None:
             "class_periods_m",
         ),
         ("  train:", "  1:", "Quote numbers"),
-        ("  train:", "  test:", "side by side"),
+        ("  train:", "  test:", "not nested"),
         ("classes: default", "classes: []", "`classes`"),
         ("goal_m: [12, 12]", "goal_m: [4.1, 4.1]", "another cell"),
         ("stuck_threshold: 0.3", "stuck_threshold: 0.999", "goal can be reached"),
@@ -640,7 +640,7 @@ def test_an_interrupted_create_goes_on_and_says_what_was_there(
     datagen: Call, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = ("create", "tiny-v1", "--splits", "[test/std,valid]", "--out", "d.h5")
-    make = create.make
+    make = create.make_shard
 
     def interrupted(
         recipe: Recipe, shard: ShardFile, version: str
@@ -650,14 +650,14 @@ def test_an_interrupted_create_goes_on_and_says_what_was_there(
         return make(recipe, shard, version)
 
     with monkeypatch.context() as patched:
-        patched.setattr(create, "make", interrupted)
+        patched.setattr(create, "make_shard", interrupted)
         assert datagen(*asked) == 130
     assert (
         capsys.readouterr().err.splitlines()[-1]
-        == "benchnav-datagen: finished maps are kept; to go on, give the same command again"
+        == "benchnav-datagen: finished maps are kept; to resume, run the same command again"
     )
     assert datagen(*asked) == 0
-    assert capsys.readouterr().err.splitlines()[0] == "10 of 14 maps were there already"
+    assert capsys.readouterr().err.splitlines()[0] == "10 of 14 maps exist already"
     assert datagen(*asked, "--overwrite") == 0
     assert "already" not in capsys.readouterr().err
 

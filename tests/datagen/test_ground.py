@@ -210,7 +210,7 @@ def test_a_dataset_without_observed_traversability_has_no_statistics(
         return maps | {"traversability": np.full_like(maps["traversability"], np.nan)}
 
     monkeypatch.setattr(TerrainDataset, "read", blind)
-    with pytest.raises(DatasetError, match="known traversability"):
+    with pytest.raises(DatasetError, match="cells with traversability"):
         fit_ground(stakes)
 
 

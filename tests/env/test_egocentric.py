@@ -13,7 +13,7 @@ from torch import Tensor
 import benchnav  # noqa: F401 - registers the environment
 from benchnav.core.batch import map_tensors
 from benchnav.core.errors import BenchnavError, ConfigError
-from benchnav.env.egocentric import EgocentricBatch
+from benchnav.env.egocentric_batch import EgocentricBatch
 from benchnav.env.view import CHANNELS, View
 from benchnav.eval.run.knowledge import Knowing, Learning
 from benchnav.models import TraversabilityModel
@@ -175,7 +175,7 @@ def test_what_is_known_is_what_robots_of_an_evaluation_know(
         before = knowing.known.risk_map
         knowing.learn(step, batch._current()[1].state.clone(), running)
         changed += not torch.equal(before, knowing.known.risk_map)
-        known = batch._experience.known
+        known = batch._experience.map_knowledge
         assert torch.equal(known.risk_map, knowing.known.risk_map)
         assert torch.equal(known.seen, knowing.known.seen)
         env.step(np.array([1.0, 0.4], np.float32))
@@ -193,7 +193,7 @@ def test_the_crop_shows_what_is_believed(
     knowledge, learner = batch._experience._current(), batch._experience._learner
     believed = learner.distribution(knowledge)
     known = replace(
-        batch._experience.known,
+        batch._experience.map_knowledge,
         risk_map=believed.cvar(0.8).float(),
         spread=(believed.quantile(0.84) - believed.quantile(0.16)).float() / 2,
     )
@@ -270,10 +270,10 @@ def changes_at(path: Path, **settings: Any) -> list[int]:
     """Steps after which λ̂ somewhere is another than before."""
     env = make(path, **settings)
     env.reset(seed=0)
-    found, before = [], batch_of(env)._experience.known.risk_map
+    found, before = [], batch_of(env)._experience.map_knowledge.risk_map
     for step in range(1, 21):
         *_, truncated, _ = env.step(AHEAD)
-        after = batch_of(env)._experience.known.risk_map
+        after = batch_of(env)._experience.map_knowledge.risk_map
         if not torch.equal(before, after):
             found.append(step)
         before = after
@@ -530,7 +530,7 @@ def test_the_clairvoyant_is_given_the_λ_of_the_episode(dataset_path: Path) -> N
         batch = batch_of(env)
         field = batch._current()[0].field
         assert field is not None
-        torch.testing.assert_close(batch._experience.known.risk_map, field)
+        torch.testing.assert_close(batch._experience.map_knowledge.risk_map, field)
 
 
 def test_predictions_of_maps_are_made_once(

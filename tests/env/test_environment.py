@@ -285,7 +285,7 @@ def test_a_dataset_without_train_gives_its_first_split_and_says_so(
 ) -> None:
     path = dataset_of(tmp_path / "tests.h5", "test/hs", "test/std")
     with pytest.warns(
-        UserWarning, match="no split 'train'; its split 'test/hs' is taken"
+        UserWarning, match="no split 'train'; its split 'test/hs' is used"
     ):
         env = make(path)
     stored = TerrainDataset(path).read("test/hs", [1], ["rgb"])["rgb"][0]
@@ -506,6 +506,6 @@ def test_a_layer_may_not_take_the_name_of_what_is_seen(
     monkeypatch.setattr(TerrainDataset, "terrain", terrain)
     with pytest.raises(
         ConfigError,
-        match=f"layers that are not called 'state' or 'goal', got \\['{name}'\\]",
+        match=f"layers that are not named 'state' or 'goal', got \\['{name}'\\]",
     ):
         make(dataset_path)

@@ -8,7 +8,7 @@ import torch
 
 from benchnav.core.errors import ConfigError
 from benchnav.env import PolicyPlanner
-from benchnav.env.egocentric import EgocentricBatch
+from benchnav.env.egocentric_batch import EgocentricBatch
 from benchnav.env.view import CHANNELS
 from benchnav.eval.run.rollout import run_episodes
 from benchnav.planning.problem import Prediction, Problem, pose_problem

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from benchnav.core.errors import ConfigError
 from benchnav.core.grid import Grid
-from benchnav.env.view import CHANNELS, Known, View, bounds
+from benchnav.env.view import CHANNELS, MapKnowledge, View, bounds
 
 GRID = Grid(13, 17, 0.5)
 RISK, SPREAD, RISE, KNOWN = (
@@ -16,11 +16,11 @@ RISK, SPREAD, RISE, KNOWN = (
 )
 
 
-def known(batch: int = 1, seed: int = 0) -> Known:
+def known(batch: int = 1, seed: int = 0) -> MapKnowledge:
     generator = torch.Generator().manual_seed(seed)
     maps = torch.rand(3, batch, *GRID.shape, generator=generator)
     seen = torch.rand(batch, *GRID.shape, generator=generator) > 0.3
-    return Known(
+    return MapKnowledge(
         risk_map=maps[0], spread=maps[1] / 2, elevation_m=4 * maps[2], seen=seen
     )
 

@@ -1,11 +1,9 @@
-"""Traversability of the cells that drives cross, and the split that each drive belongs
-to.
+"""Traversability of driven cells, and the split of each drive.
 
-Splits have strips of the ground, with ground between them that no map shows (`tiling`).
-A drive belongs to the split on whose strip most of its rows lie, and its rows on the
-strip of another are left out. So no cell and no drive tells two
-splits anything. Letters in shapes: N rows, D drives, S splits, M cells that were driven
-    over.
+Splits have strips of the terrain; terrain between them is in no map (`tiling`). A drive
+belongs to the split whose strip contains most of its rows. Its rows on other strips are
+left out, so no cell and no drive occurs in two splits. Letters in shapes: N rows, D
+drives, S splits, M driven cells.
 """
 
 from collections.abc import Sequence
@@ -32,13 +30,13 @@ _PROJECT = "Give x_m and y_m in that CRS, or longitude_deg and latitude_deg."
 
 @dataclass(frozen=True)
 class DrivenCells:
-    """Cells that were driven over.
+    """Driven cells.
 
     Args:
-        cells: number of each, row · width + column, ascending, int64, shape [M].
-        values: of each of `BANDS`: mean of λ, number of rows, standard deviation of λ
-            (NaN of one row), shape [3, M].
-        width: cells of the ground eastward.
+        cells: index of each, row · width + column, ascending, int64, shape [M].
+        values: values of `BANDS`: mean of λ, number of rows, standard deviation of λ
+            (NaN for one row), shape [3, M].
+        width: number of columns of the terrain.
     """
 
     cells: ndarray
@@ -46,46 +44,44 @@ class DrivenCells:
     width: int
 
     def read(self, rows: range, columns: range) -> ndarray:
-        """Read cells.
+        """Return the values of cells.
 
         Args:
-            rows: counted northward.
-            columns: counted eastward.
+            rows: rows, counted northward.
+            columns: columns, counted eastward.
 
         Returns:
-            `BANDS`, float64, shape [3, len(rows), len(columns)]; NaN, 0 and NaN where
-            no one drove.
+            `BANDS`, float64, shape [3, len(rows), len(columns)]; NaN, 0 and NaN in
+            cells that were not driven.
         """
-        read = np.full((3, len(rows), len(columns)), np.nan)
-        read[1] = 0
-        in_rows = slice(
-            *np.searchsorted(
-                self.cells, [rows.start * self.width, rows.stop * self.width]
-            )
-        )
+        bands = np.full((3, len(rows), len(columns)), np.nan)
+        bands[1] = 0
+        ends = [rows.start * self.width, rows.stop * self.width]
+        in_rows = slice(*np.searchsorted(self.cells, ends))
         row, column = np.divmod(self.cells[in_rows], self.width)
-        is_read = (column >= columns.start) & (column < columns.stop)
-        read[:, row[is_read] - rows.start, column[is_read] - columns.start] = (
-            self.values[:, in_rows][:, is_read]
-        )
-        return read
+        is_inside = (column >= columns.start) & (column < columns.stop)
+        row = row[is_inside] - rows.start
+        column = column[is_inside] - columns.start
+        bands[:, row, column] = self.values[:, in_rows][:, is_inside]
+        return bands
 
 
 def lay_out(log: DriveLog, ground: Raster, crs: Any, bounds: Any) -> DriveLog:
-    """Move positions into the CRS of the maps, as metres from the south-west corner of
-    the elevation model.
+    """Return a log with positions in the CRS of the maps.
+
+    They are metres from the south-west corner of the elevation model.
 
     Args:
-        log: with positions as they were logged.
+        log: log with positions as logged.
         ground: the elevation model.
-        crs: of the maps.
-        bounds: of the elevation model in that.
+        crs: CRS of the maps.
+        bounds: bounds of the elevation model in `crs`.
 
     Returns:
-        The log with the rows that lie on it.
+        The log with the rows on the elevation model.
 
     Raises:
-        DatasetError: If none does, or the log is in a CRS that is not in metres.
+        DatasetError: If no row is on it, or the CRS of the log is not in metres.
     """
     ground_crs, path = ground.file.crs, log.settings.file
     if not log.is_geographic and not (
@@ -104,7 +100,7 @@ def lay_out(log: DriveLog, ground: Raster, crs: Any, bounds: Any) -> DriveLog:
     )
     off = ~_is_within(positions, bounds)
     if off.all():
-        left, bottom, right, top = ground.file.bounds
+        covered = ground.file.bounds
         (west, east), (south, north) = (
             log.rows[name].agg(["min", "max"]) for name in ("x", "y")
         )
@@ -119,25 +115,22 @@ def lay_out(log: DriveLog, ground: Raster, crs: Any, bounds: Any) -> DriveLog:
         if _is_within(swapped, bounds).any():
             remedy = f"Swap {columns}."
         raise DatasetError(
-            f"Expected positions on {ground.name}, which covers x {left:.9g} to "
-            f"{right:.9g} and y {bottom:.9g} to "
-            f"{top:.9g} of {ground_crs.to_string()[:80]}, got {names[0]} {west:.9g} "
-            f"to {east:.9g} and {names[1]} "
-            f"{south:.9g} to {north:.9g} in {path}. {remedy}"
+            f"Expected positions on {ground.name}, which covers x {covered.left:.9g} to "
+            f"{covered.right:.9g} and y {covered.bottom:.9g} to {covered.top:.9g} of "
+            f"{ground_crs.to_string()[:80]}, got {names[0]} {west:.9g} to {east:.9g} "
+            f"and {names[1]} {south:.9g} to {north:.9g} in {path}. {remedy}"
         )
     return replace(log, rows=log.rows.assign(x=x, y=y)).without("off_dem", off)
 
 
 def _is_within(positions_m: ndarray, bounds: Any) -> ndarray:
-    """Return whether positions from the south-west corner lie on the elevation model,
-    bool, shape [N].
-    """
+    """Return whether positions lie on the elevation model, bool, shape [N]."""
     size = np.array([[bounds.right - bounds.left], [bounds.top - bounds.bottom]])
     return np.all((positions_m >= 0) & (positions_m < size), axis=0)
 
 
 def check_enough(log: DriveLog, splits: Sequence[str]) -> None:
-    """Require a drive for each split.
+    """Check that there is a drive for each split.
 
     Raises:
         DatasetError: If the log has fewer drives.
@@ -155,17 +148,17 @@ def check_enough(log: DriveLog, splits: Sequence[str]) -> None:
 def elevation_under(
     log: DriveLog, layer: Layer, row: ndarray, column: ndarray
 ) -> ndarray:
-    """Interpolate elevation between the cells of the maps and the one around them.
+    """Return the elevation at each row of a log, interpolated between cells.
 
     Args:
         log: the drives.
-        layer: elevation, in metres.
-        row: of each row of the log, counted northward from the middle of the first
+        layer: elevation in metres.
+        row: row coordinate of each position, northward from the centre of the first
             cell, float64, shape [N].
-        column: counted eastward.
+        column: column coordinate, eastward.
 
     Returns:
-        float64, NaN off the cells, shape [N].
+        Metres, float64, NaN off the cells, shape [N].
     """
     height, width = layer.warped.height - 2, layer.warped.width - 2
     elevation_m = np.full(len(row), np.nan)
@@ -188,20 +181,19 @@ def elevation_under(
 def drive_over(
     log: DriveLog, tiling: Tiling, row: ndarray, column: ndarray
 ) -> tuple[DriveLog, DrivenCells]:
-    """Assign each drive to a split and take the mean of λ over the rows on each cell.
+    """Assign drives to splits, and aggregate λ over the rows on each cell.
 
     Args:
         log: the drives.
-        tiling: how the ground is cut into maps and splits.
-        row: of the cell that each row of the log lies on, counted northward, int64,
-            shape [N].
-        column: counted eastward, int64, shape [N].
+        tiling: tiling of the terrain into maps and splits.
+        row: row of the cell of each position, counted northward, int64, shape [N].
+        column: column of the cell, counted eastward, int64, shape [N].
 
     Returns:
-        The log with the rows that are used, and what they say of the cells.
+        The log with the used rows, and the driven cells.
 
     Raises:
-        DatasetError: If no drive is left for a split.
+        DatasetError: If a split gets no drive.
     """
     rows = log.rows.assign(row=row, column=column, split=tiling.split_of(row, column))
     log = replace(log, rows=rows)
@@ -213,8 +205,7 @@ def drive_over(
     )
     width = tiling.cells[1]
     cell = log.rows["row"] * width + log.rows["column"]
-    # A row that slides back or exceeds its command stays as it is in the log; what is
-    # stored is a fraction.
+    # Ratios below 0 or above 1 remain in the log, but stored λ is in [0, 1].
     stored = log.rows["traversability"].clip(*RATIO_LIMITS)
     driven = stored.groupby(cell).agg(["mean", "count", "std"])
     return log, DrivenCells(
@@ -223,9 +214,7 @@ def drive_over(
 
 
 def describe_drives(log: DriveLog, splits: Sequence[str]) -> Json:
-    """Return the manifest's entry on a log from `drive_over`: what was used and what
-    was left out.
-    """
+    """Return the manifest entry of a log from `drive_over`: used and unused rows."""
     by_split = {
         split: log.rows[log.rows["split"] == index]
         for index, split in enumerate(splits)
@@ -262,8 +251,8 @@ def describe_drives(log: DriveLog, splits: Sequence[str]) -> Json:
 def _owners(log: DriveLog, splits: Sequence[str]) -> ndarray:
     """Return the split of each drive, index into the splits, shape [D].
 
-    Every split gets a drive for which the fewest rows are lost by that; the others go
-    where most of their rows lie.
+    Each split gets one drive, so that the fewest rows are lost. Other drives belong to
+    the split with most of their rows.
     """
     counts = np.zeros((len(splits), len(log.names)))
     np.add.at(counts, (log.rows["split"], log.rows["drive"]), 1)

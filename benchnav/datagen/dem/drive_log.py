@@ -1,5 +1,4 @@
-"""The log of a robot's drives: positions, commanded and measured speed, and the λ that
-follows.
+"""Log of a robot's drives: positions, speeds, and the resulting λ.
 
 A row is a moment of a drive. Columns: `time_s`; the position, `x_m` and `y_m` in the
 coordinate reference system of the elevation model or `longitude_deg` and `latitude_deg`
@@ -59,12 +58,12 @@ REASONS = {
 
 @dataclass(frozen=True, kw_only=True)
 class Drives:
-    """A log of drives, and what of it is used.
+    """Log of drives, and its use.
 
     Args:
         file: Table, CSV, TSV, one of these with .gz, or Parquet.
-        least_speed: Least commanded speed of a row, forward or backward, m/s.
-        speed: Where speed over ground comes from: `positions`, or `measured` as logged,
+        least_speed: Minimum commanded speed of used rows, forward or backward [m/s].
+        speed: Source of the speed over ground: `positions`, or `measured` as logged,
             without comparison. If empty, measured speed, which must agree with the
             positions.
     """
@@ -92,20 +91,20 @@ class Drives:
 
 @dataclass(frozen=True, kw_only=True)
 class DriveLog:
-    """The used rows of a log.
+    """Used rows of a log.
 
     Args:
-        settings: the file, and which rows of it are used.
-        sha256: of the file.
-        names: of its drives.
+        settings: the file, and the selection of its rows.
+        sha256: digest of the file.
+        names: names of its drives.
         is_geographic: whether positions are longitude and latitude; else they are in
             the elevation model's CRS.
         rows: a table of N rows: `x`, `y`, `time_s`, `commanded` and `speed` (m/s,
             signed), `drive` (index into `names`) and, once speeds are compared with
             positions, `traversability` (speed over commanded).
-        left_out: rows that are not, by reason.
-        motion: what the comparison of positions with speeds gave, and the resolution of
-            positions, 0 if it is fine.
+        left_out: number of unused rows by reason.
+        motion: results of the comparison of positions with speeds, and the resolution
+            of positions, 0 if it is fine.
     """
 
     settings: Drives
@@ -121,18 +120,18 @@ class DriveLog:
         """Positions northward and eastward, float64, shape [N, 2]."""
         return self.rows[["y", "x"]].to_numpy()
 
-    def without(self, reason: str, which: ndarray) -> "DriveLog":
-        """Leave rows out.
+    def without(self, reason: str, mask: ndarray) -> "DriveLog":
+        """Return the log without some rows.
 
         Args:
-            reason: why, one of `REASONS`.
-            which: bool, shape [N].
+            reason: reason, one of `REASONS`.
+            mask: rows to leave out, bool, shape [N].
 
         Raises:
-            DatasetError: If no row is left.
+            DatasetError: If no row remains.
         """
-        left_out = {**self.left_out, reason: int(which.sum())}
-        if which.all():
+        left_out = {**self.left_out, reason: int(mask.sum())}
+        if mask.all():
             several = [
                 f"{count} {REASONS[name]}" for name, count in left_out.items() if count
             ]
@@ -148,21 +147,20 @@ class DriveLog:
             )
             raise DatasetError(
                 f"Expected rows of drives to learn from in {self.settings.file}, got "
-                f"none{why}. Log time, position and "
-                f"{speeds} on the move."
+                f"none{why}. Log time, position and {speeds} on the move."
             )
-        rows = self.rows[~which].reset_index(drop=True)
+        rows = self.rows[~mask].reset_index(drop=True)
         return replace(self, rows=rows, left_out=left_out)
 
 
 def read_drives(drives: Drives) -> DriveLog:
-    """Read a log of drives, without rows that lack a value.
+    """Return a log of drives, without rows that lack a value.
 
-    With `speed` of `positions` the log needs no measured speed.
+    If `speed` is `positions`, the log needs no measured speed.
 
     Raises:
         DatasetError: If the file is missing, cannot be read, lacks a column, contains
-            what is no number, has speeds in another unit, or no row is left.
+            values that are not numbers, has speeds in another unit, or no row remains.
     """
     path = Path(drives.file)
     rows = read_log(path)
@@ -233,11 +231,9 @@ def read_drives(drives: Drives) -> DriveLog:
 
 
 def _resolution_m(x: ndarray, y: ndarray, *, is_geographic: bool) -> float:
-    """Return the largest step that divides all positions, to three digits; 0 below some
-    centimetres.
-    """
-    most = 6 if is_geographic else 2
-    for decimals in range(most):
+    """Return the largest step that divides all positions; 0 below some centimetres."""
+    max_decimals = 6 if is_geographic else 2
+    for decimals in range(max_decimals):
         scaled = np.stack([x, y]) * 10.0**decimals
         scaled = scaled[:, np.isfinite(scaled).all(axis=0)]
         if scaled.size and (np.abs(scaled - np.rint(scaled)) < 1e-3).all():

@@ -1,11 +1,10 @@
-"""The comparison of a drive log's positions with its speeds, and the faults that it
-shows.
+"""Comparison of a drive log's positions with its speeds, and detection of faults.
 
-Measured speed makes λ, so it must be the speed over ground. Positions are its witness:
-over spans of two seconds they must move as far as the measured speed says. Their
-distance over that of the command is λ and no fault. Rows whose time or position cannot
-be right are left out by kind. A log with many of them is rejected, since the rest is
-suspect too.
+λ follows from measured speed, so this must be the speed over ground. Positions confirm
+it: over spans of two seconds, they must move as far as the measured speed implies. The
+ratio of their distance to that of the command is λ, and not a fault. Rows with an
+impossible time or position are left out by kind. A log with many of them is rejected,
+since its other rows are unreliable too.
 """
 
 import math
@@ -75,11 +74,10 @@ _REMEDIES = {
 
 
 def compare_motion(log: DriveLog) -> DriveLog:
-    """Compare positions with speeds and return the log without faulty rows, with the
-    ratio of each row.
+    """Return a log without faulty rows, and with the ratio of speeds of each row.
 
     Args:
-        log: with positions in metres.
+        log: log with positions in metres.
 
     Raises:
         DatasetError: If positions and measured speed disagree, measured speed has no
@@ -168,15 +166,14 @@ def compare_motion(log: DriveLog) -> DriveLog:
 
 
 def compare_slopes(log: DriveLog, elevation_m: ndarray) -> DriveLog:
-    """Compare the ratio of speeds with slopes along the track, and take speeds of
-    positions along the slope.
+    """Return a log with speeds of positions along the slope, after a check for wheels.
 
-    Measured speed that follows the command up and down alike, or that equals it where
-    positions do not, is of wheels.
+    Measured speed is that of wheels if its ratio to the command does not depend on the
+    slope, or if it equals the command where positions do not.
 
     Args:
-        log: from `compare_motion`.
-        elevation_m: at each row, NaN where it is unknown, shape [N].
+        log: log from `compare_motion`.
+        elevation_m: elevation at each row, NaN if unknown, shape [N].
 
     Raises:
         DatasetError: If measured speed is that of wheels.
@@ -202,7 +199,9 @@ def _leave_out(
     masks: Mapping[str, ndarray],
     remedies: Mapping[str, str] = MappingProxyType({}),
 ) -> DriveLog:
-    """Leave rows out, each by its first reason, and reject a log with too many of them.
+    """Return a log without faulty rows; reject a log with too many of them.
+
+    A row counts for its first reason.
 
     Args:
         log: the log.
@@ -227,9 +226,7 @@ def _leave_out(
 
 
 def _check_rest(log: DriveLog, unknown: ndarray) -> None:
-    """Reject a log with many rows at rest if nothing shows whether the robot or the
-    receiver stopped.
-    """
+    """Reject a log with many rows at rest, in which the receiver may have stopped."""
     if unknown.mean() > MAX_FAULTY:
         raise DatasetError(
             "Expected positions that change to the end of the drives of "
@@ -242,9 +239,7 @@ def _check_rest(log: DriveLog, unknown: ndarray) -> None:
 
 
 def _remedies_of_scale(log: DriveLog) -> dict[str, str]:
-    """Return what to do about speeds above the top command where positions exceed the
-    command, by reason.
-    """
+    """Return remedies by reason if positions exceed the command."""
     ratio = log.motion["commanded_pace"]
     if ratio is None or ratio <= OVER_SPEED:
         return {}
@@ -257,9 +252,7 @@ def _remedies_of_scale(log: DriveLog) -> dict[str, str]:
 
 
 def _sum_up(spans: pd.DataFrame) -> dict[str, float | None]:
-    """Return the ratios of positions to both speeds, to three digits; None where they
-    are unknown.
-    """
+    """Return ratios of positions to both speeds, to three digits; None if unknown."""
     ratios = {
         "pace": median_ratio(spans, "measured"),
         "commanded_pace": median_ratio(spans, "commanded"),
@@ -277,14 +270,14 @@ def _resolution_m(log: DriveLog) -> float:
 def _check_pace(
     log: DriveLog, rows: pd.DataFrame, spans: pd.DataFrame, *, is_jumpy: bool
 ) -> None:
-    """Reject a log whose positions and measured speed disagree, and name the unit that
-    explains it.
+    """Reject a log whose positions and measured speed disagree.
 
     Args:
         log: the log.
-        rows: of it, without faulty ones.
-        spans: of them.
-        is_jumpy: whether positions jump so often that only the ratio of a unit is sure.
+        rows: its rows, without faulty ones.
+        spans: spans of these rows.
+        is_jumpy: whether positions jump so often that only the ratio of a unit is
+            certain.
     """
     path, speed = log.settings.file, log.settings.speed
     if spans.empty and speed == "":
@@ -347,9 +340,7 @@ def _unit_of(
 
 
 def _check_command(log: DriveLog, rows: pd.DataFrame, spans: pd.DataFrame) -> None:
-    """Reject positions that move by a fraction of the command that no λ is, where
-    nothing was measured.
-    """
+    """Reject positions whose ratio to the command is an implausible λ."""
     of_command = unit_of_command(
         rows, spans, log.settings.least_speed, is_geographic=log.is_geographic
     )
@@ -391,10 +382,10 @@ def _check_sign(log: DriveLog, is_driven: ndarray) -> None:
 
 
 def _off_pace(log: DriveLog, spans: pd.DataFrame) -> tuple[ndarray, str]:
-    """Find rows of drives whose positions and measured speed disagree.
+    """Return a mask of rows of drives whose positions and measured speed disagree.
 
     Returns:
-        bool, shape [N], and what to do about these drives, a sentence.
+        bool, shape [N], and a remedy, a sentence.
     """
     is_off = np.zeros(len(log.names), dtype=bool)
     for drive, of_drive in spans.groupby("drive"):
@@ -420,11 +411,9 @@ def _off_pace(log: DriveLog, spans: pd.DataFrame) -> tuple[ndarray, str]:
 
 
 def _wheel_ratios(spans: pd.DataFrame) -> tuple[bool, bool]:
-    """Return whether measured over commanded speed stays the same, and whether it stays
-    1.
+    """Return whether measured over commanded speed is constant, and whether it is 1.
 
-    Returns:
-        Both; false where spans are too few.
+    Both are false if there are too few spans.
     """
     spans = spans[spans["is_moving"]]
     steady = spans[spans["is_steady"]]
@@ -439,8 +428,7 @@ def _wheel_ratios(spans: pd.DataFrame) -> tuple[bool, bool]:
 
 
 def _check_wheels(log: DriveLog, track: pd.DataFrame) -> None:
-    """Reject a measured speed that is that of wheels, in the whole log or in stretches
-    of it.
+    """Reject a measured speed of wheels, in the whole log or in stretches of it.
 
     Shorter spans follow curves that alternate, and noise only adds to the distance of
     positions.
@@ -482,9 +470,7 @@ def _check_wheels(log: DriveLog, track: pd.DataFrame) -> None:
 
 
 def _off_stretches(moving: pd.DataFrame) -> float:
-    """Return the fraction of spans in stretches whose measured speed equals the command
-    and is too high.
-    """
+    """Return the fraction of spans in stretches with the speed of slipping wheels."""
     number = moving.groupby("drive").cumcount() // _MIN_WHEEL_SPANS
     off = 0
     for _, stretch in moving.groupby([moving["drive"], number]):

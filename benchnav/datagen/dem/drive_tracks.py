@@ -38,10 +38,10 @@ _ROWS_AT_ONCE = 4096
 
 
 def find_restarted(rows: pd.DataFrame) -> ndarray:
-    """Find rows whose time is before that of an earlier row of their drive.
+    """Return a mask of rows whose time is before that of an earlier row of their drive.
 
-    Rows that are only out of order are no restart: by time they are a shorter track
-    than in the order of the file.
+    Rows that are only out of order are not a restart: sorted by time, their track is
+    shorter than in the order of the file.
 
     Returns:
         bool, shape [N].
@@ -93,9 +93,7 @@ def _fixes(track: pd.DataFrame) -> pd.DataFrame:
 
 
 def _period_s(fixes: pd.DataFrame) -> pd.Series:
-    """Return the usual time between fixes of the drive of each fix, 0 for a drive of
-    one fix.
-    """
+    """Return the median time between fixes of each fix's drive; 0 for one fix."""
     drive = fixes["drive"]
     return (
         fixes.groupby("drive")["time_s"]
@@ -107,15 +105,12 @@ def _period_s(fixes: pd.DataFrame) -> pd.Series:
 
 
 def period_of(track: pd.DataFrame) -> float:
-    """Return the usual time between fixes of all drives, in seconds to three digits, 0
-    for single fixes.
-    """
+    """Return the median time between fixes of all drives in seconds; 0 for one fix."""
     return float(f"{_period_s(_fixes(track)).median():.3g}")
 
 
 def _knots(track: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows at which a position is measured: the first of each fix and
-    segment, and repeats of a long fix.
+    """Return the rows with a measured position: starts of fixes, and long repeats.
 
     A position that stays the same for more than three fixes is that of a robot at rest,
     measured once a period.
@@ -135,12 +130,11 @@ def _knots(track: pd.DataFrame) -> pd.DataFrame:
 def find_standing(
     track: pd.DataFrame, least_speed: float, *, by_positions: bool
 ) -> pd.DataFrame:
-    """Find rows of a position that stays the same for more than three fixes under a
-    command.
+    """Return masks of rows whose position does not change for more than three fixes.
 
-    The receiver is frozen if the robot moves on. Measured speed says so, and so does a
-    next position that is far away. A robot that stands still under its command is
-    immobilised, which is no fault.
+    Only rows under a command count. If the robot moves, the receiver is frozen: either
+    measured speed or a distant next position shows this. A robot that stands still
+    under its command is immobilised, which is not a fault.
 
     Args:
         track: from `track_of`; `speed` is NaN where it was not measured.
@@ -180,11 +174,11 @@ def find_standing(
 
 
 def find_jumped(track: pd.DataFrame, limit_m_s: float) -> pd.Index:
-    """Find rows whose position is out of reach of the others of their drive.
+    """Return rows whose position is out of reach of the others of their drive.
 
-    The longest stretch without a jump is right. From there, forward and backward, a
-    position is right that is in reach of the last right one. Over less than a second
-    noise may exceed the reach, so that a second counts.
+    The longest stretch without a jump is correct. From there, forward and backward, a
+    position is correct if it is in reach of the last correct one. Within less than a
+    second, noise may exceed the reach, so times count as at least a second.
 
     Args:
         track: from `track_of`.
@@ -223,8 +217,7 @@ def find_jumped(track: pd.DataFrame, limit_m_s: float) -> pd.Index:
 def spans_of(
     track: pd.DataFrame, least_speed: float, span_s: float = WINDOW_S
 ) -> pd.DataFrame:
-    """Sum up motion under command over spans of a time, or from fix to fix where those
-    are more seldom.
+    """Return motion under command, summed over spans of a time, or from fix to fix.
 
     Args:
         track: from `track_of`; with `z`, elevation in metres, too for slopes.
@@ -282,9 +275,7 @@ def spans_of(
 
 
 def _angle_between(vectors: pd.DataFrame, others: pd.DataFrame) -> pd.Series:
-    """Return the signed angle from vectors to others, in (-π, π], from their columns
-    `x` and `y`.
-    """
+    """Return signed angles in (-π, π] from vectors to others, in columns `x`, `y`."""
     cross = vectors["x"] * others["y"] - vectors["y"] * others["x"]
     dot = vectors["x"] * others["x"] + vectors["y"] * others["y"]
     return np.arctan2(
@@ -293,10 +284,10 @@ def _angle_between(vectors: pd.DataFrame, others: pd.DataFrame) -> pd.Series:
 
 
 def velocity_of(track: pd.DataFrame, columns: list[str]) -> pd.DataFrame:
-    """Fit a line through the fixes within a second of each row, or within 1.5 periods
-    of fixes where they are seldom.
+    """Return derivatives of a line fit through the fixes around each row.
 
-    On fixes of equal steps it is the derivative of Savitzky and Golay (1964),
+    The fit uses fixes within a second, or within 1.5 periods of fixes if these are
+    longer. For fixes of equal steps it is the derivative of Savitzky and Golay (1964),
     "Smoothing and differentiation of data by simplified least squares procedures".
 
     Args:
@@ -437,8 +428,7 @@ def speed_of_positions(track: pd.DataFrame, least_speed: float) -> pd.Series:
 def _arc_over_fit(
     track: pd.DataFrame, reach_s: pd.Series, heading: pd.DataFrame
 ) -> pd.Series:
-    """Return the speed on an arc over that of a line fitted to it, 1 where the heading
-    is unknown.
+    """Return the ratio of the speed on an arc to that of a fitted line; 1 by default.
 
     On an arc of rate ω, fixes within ±T give a line of 3 (sin a - a cos a) / a³ of the
     speed, a = ω T.

@@ -37,8 +37,9 @@ _METRES = "Bring speeds to m/s, times to s and positions to m"
 
 
 def median_ratio(spans: pd.DataFrame, of: str) -> float:
-    """Return the median of the distance of positions over that by a speed, in straight
-    spans where they suffice.
+    """Return the median ratio of distances by positions and by a speed.
+
+    Only straight spans count, if they suffice.
     """
     spans = spans[spans["is_moving"] & spans[of].notna()]
     straight = spans[spans["is_straight"]]
@@ -47,7 +48,7 @@ def median_ratio(spans: pd.DataFrame, of: str) -> float:
 
 
 def no_unit(spans: pd.DataFrame, resolution_m: float) -> str:
-    """Return the words of messages where no unit is named."""
+    """Return the text of messages if no unit fits, with the reason."""
     why = ""
     if _is_winding(spans):
         why = ", since the track winds between positions"
@@ -61,9 +62,7 @@ def _n_straight(spans: pd.DataFrame) -> int:
 
 
 def _is_winding(spans: pd.DataFrame) -> bool:
-    """Return whether positions move less far than measured because the track winds
-    between them.
-    """
+    """Return whether the track winds between positions, which shortens distances."""
     return (
         _n_straight(spans) < min(MIN_SPANS, len(spans))
         and median_ratio(spans, "measured") < 1
@@ -71,9 +70,7 @@ def _is_winding(spans: pd.DataFrame) -> bool:
 
 
 def is_coarse(spans: pd.DataFrame, resolution_m: float) -> bool:
-    """Return whether positions have too few decimals to say how far the robot moved in
-    a span.
-    """
+    """Return whether positions have too few decimals to measure a span's distance."""
     return bool(resolution_m > _COARSE * spans["commanded"].median())
 
 
@@ -85,15 +82,14 @@ def unit_of(
     is_geographic: bool,
     resolution_m: float,
 ) -> tuple[str, str, bool]:
-    """Name the unit that the ratio of positions to measured speed looks like, and the
-    remedy.
+    """Return the unit that explains the ratio of positions to measured speed.
 
     Args:
-        rows: of a log.
-        spans: of them.
-        least_speed: m/s, of the command of spans that count.
+        rows: rows of a log.
+        spans: spans of these rows.
+        least_speed: minimum command of spans that count, in m/s.
         is_geographic: whether positions are angles, which have no other unit.
-        resolution_m: of positions.
+        resolution_m: resolution of positions in metres.
 
     Returns:
         The unit, empty if none fits; the remedy without a full stop; whether it is a
@@ -132,26 +128,25 @@ def unit_of(
 
 
 def _in_seconds(rows: pd.DataFrame, value: float, least_speed: float) -> pd.DataFrame:
-    """Return the spans of rows whose times are in a unit of so many seconds."""
+    """Return the spans of rows whose times are in a unit of `value` seconds."""
     return spans_of(track_of(rows.assign(time_s=rows["time_s"] * value)), least_speed)
 
 
 def unit_of_command(
     rows: pd.DataFrame, spans: pd.DataFrame, least_speed: float, *, is_geographic: bool
 ) -> tuple[float, str, str] | None:
-    """Name the unit that the ratio of positions to the command looks like, where
-    measured speed does not agree.
+    """Return the unit that explains the ratio of positions to the command.
 
-    The ratio is λ, so that only one that no drive has is of a unit.
+    The ratio is λ. Only an implausible λ indicates another unit.
 
     Args:
-        rows: of a log.
-        spans: of them.
-        least_speed: m/s, of the command of spans that count.
+        rows: rows of a log.
+        spans: spans of these rows.
+        least_speed: minimum command of spans that count, in m/s.
         is_geographic: whether positions are angles, which have no other unit.
 
     Returns:
-        The ratio, the units that give it, and the remedy; None where the ratio may be
+        The ratio, the units that explain it, and the remedy; None if the ratio may be
         λ.
     """
     ratios = spans["moved"] / spans["commanded"]

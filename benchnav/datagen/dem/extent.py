@@ -1,8 +1,8 @@
-"""How the ground is cut into maps, described and checked before anything is read.
+"""Layout of maps on an elevation model, described and checked before it is read.
 
-The maps start at the south-west corner of the elevation model, around the drives, or
-where the user sets their origin. Pairs of metres here are northward and eastward, shape
-[2], from the south-west corner of the elevation model, unless they are called (x, y).
+The maps start at the south-west corner of the elevation model, around the drives, or at
+the origin that the user sets. Pairs of metres are northward and eastward, shape [2],
+from the south-west corner of the elevation model, unless they are named (x, y).
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -28,24 +28,23 @@ from benchnav.datagen.layers.spec import overrides_of
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.datagen.schema import Fields
 
-# of a raster's cell to a map's, from which on maps show interpolation rather than
-# ground
+# Width of a raster's cell over that of a map's. Beyond it, maps show interpolation
+# rather than terrain.
 MAX_RATIO = 3.0
-MAX_RELIEF_M = (
-    2048.0  # of a map; float32 holds the schema's steps of 2^-13 m up to here
-)
-_KERNEL_CELLS = 2.0  # that cubic convolution reaches to either side
-_MIN_SIDE = 8  # cells of a map that a correction may come down to
+# Of a map: up to here, float32 represents the schema's steps of 2^-13 m.
+MAX_RELIEF_M = 2048.0
+_KERNEL_CELLS = 2.0  # half width of cubic convolution
+_MIN_SIDE = 8  # minimum cells of a map's side in a suggested correction
 
 
 class GroundError(ConfigError):
-    """Ground that makes too many or too smooth maps.
+    """Error of terrain that gives too many or too smooth maps.
 
     Args:
-        problem: What does not fit, in a sentence, with the option that allows it.
-        changes: Recipe settings by key that mend it; empty where only `stride_m` or
+        problem: The problem in a sentence, with the option that allows it.
+        changes: Recipe settings by key that correct it; empty if only `stride_m` or
             nothing does.
-        stride_m: From one map to the next, where that has to change too.
+        stride_m: Distance from one map to the next, if it must change too; else None.
     """
 
     def __init__(
@@ -66,7 +65,7 @@ class GroundError(ConfigError):
         return [f"{key}={_text(value)}" for key, value in self.changes.items()]
 
     def advise(self, remedy: str) -> str:
-        """Return the problem with settings or a command that mend it."""
+        """Return the problem with settings or a command that correct it."""
         return f"{self.problem} Or fit the maps to the raster: {remedy}"
 
 
@@ -74,9 +73,9 @@ class Laid(NamedTuple):
     """Maps laid on an elevation model.
 
     Args:
-        tiling: How the ground is cut into maps.
+        tiling: Tiling of the terrain into maps.
         offset_m: South-west corner of the first map.
-        how: How elevation is resampled, in GDAL's words.
+        how: Resampling of elevation, in GDAL's terms.
     """
 
     tiling: Tiling
@@ -86,19 +85,19 @@ class Laid(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Extent:
-    """The ground that maps can lie on.
+    """Terrain on which maps can lie.
 
     Args:
         raster: The elevation model.
-        unit: Its unit of elevation, and where that comes from, in words.
-        crs: Of the maps, in metres.
-        bounds: Of the elevation model in `crs`.
-        cell_m: Size of its cells there.
-        shares: Of the maps, by split.
+        unit: Its unit of elevation, and the unit's source, as text.
+        crs: CRS of the maps, in metres.
+        bounds: Bounds of the elevation model in `crs`.
+        cell_m: Size of its cells in `crs`.
+        shares: Fraction of the maps of each split.
         origin_m: (x, y) of the south-west corner of the first map in `crs`; None for
             the default.
-        places_m: Where drives went, around which the ground is cut, shape [N, 2]; None
-            for all of it.
+        places_m: Positions of drives, around which maps are cut, shape [N, 2]; None for
+            all of the elevation model.
     """
 
     raster: Raster
@@ -220,9 +219,7 @@ class Extent:
                     )
 
     def _resample(self, step: float, start_m: ndarray) -> tuple[str, float]:
-        """Return how elevation is resampled on cells of a width, and how far that
-        reaches.
-        """
+        """Return the resampling of elevation on cells of a width, and its reach."""
         offset = start_m / self.cell_m
         is_same = (
             np.allclose(self.cell_m, step, rtol=1e-9)
@@ -256,7 +253,7 @@ class Extent:
         }[laid.how]
         gigabytes = f"{n_bytes / 1e9:,.2f}" if n_bytes >= 1e7 else "under 0.01"
         maps = f"{tiling.maps:,} map{'s' * (tiling.maps > 1)}"
-        place = "set by `origin`" if self.origin_m else "set it by `origin`"
+        origin_hint = "set by `origin`" if self.origin_m else "set it by `origin`"
         return (
             f"{self.raster.name}: {file.height} × {file.width} cells of {wide} m × "
             f"{high} m on the ground, elevations "
@@ -264,14 +261,13 @@ class Extent:
             "of "
             f"{grid.resolution_m:g} m, one every "
             f"{tiling.stride[1] * grid.resolution_m:g} m from the south-west corner "
-            f"{_origin(self.corner_m + laid.offset_m)} on ({place}), in "
+            f"{_origin(self.corner_m + laid.offset_m)} on ({origin_hint}), in "
             f"{_name_of(self.crs)}; {gigabytes} GB before "
             "compression."
         )
 
     def frame(self, laid: Laid, step: float) -> dict[str, Any]:
-        """Return where the cells of all maps and one around them lie, as `Raster.laid`
-        takes it.
+        """Return the cells of all maps, padded by one, as an argument of `Raster.laid`.
 
         Args:
             laid: The maps.
@@ -291,9 +287,7 @@ class Extent:
         }
 
     def _has_maps(self, laid: Laid, step: float) -> bool:
-        """Return whether each split has a map whose elevation is whole; it reads until
-        there is one.
-        """
+        """Return whether each split has a map without missing elevation."""
         layer, without_map = (
             self.raster.laid(self.frame(laid, step), [1], laid.how),
             set(self.shares),
@@ -315,8 +309,7 @@ class Extent:
     def suggest_origin(
         self, raster: Raster, laid: Laid, step: float, announce: Callable[[str], object]
     ) -> None:
-        """Announce an origin where another raster begins on the ground but off the
-        corners of the maps.
+        """Announce the corner of another raster as an origin, if it lies within a map.
 
         Args:
             raster: Not the elevation model.
@@ -378,9 +371,7 @@ class Extent:
     def _corrections(
         self, laid: Laid, recipe: Recipe, max_maps: int, is_coarse: bool
     ) -> Iterator[tuple[dict[str, Any], float | None]]:
-        """Yield recipe settings and a stride that fit, those nearest to the user's
-        first.
-        """
+        """Yield recipe settings and a stride that fit, nearest to the user's first."""
         cell_m = float(max(self.cell_m))
         for divisor in (1, 2, 4) if is_coarse else (1,):
             for step in (cell_m, cell_m / 2) if is_coarse else (recipe.resolution_m,):
@@ -412,8 +403,7 @@ class Extent:
 
 
 def _scaled(recipe: Recipe, step: float, divisor: int) -> dict[str, Any]:
-    """Return fields of a recipe for another resolution, with start, goal and classes on
-    the same part of a map.
+    """Return fields of a recipe for another resolution, scaled with the map.
 
     Args:
         recipe: Of the maps.
@@ -461,16 +451,13 @@ def _plain(changes: Mapping[str, Any], recipe: Recipe) -> dict[str, Any]:
 
 
 def _name_of(crs: Any) -> str:
-    """Return the code of a CRS, or its name where it has none."""
-    text, about = crs.to_string(), crs.to_dict(projjson=True)
-    name = about.get("source_crs", about).get("name", "unknown")
-    return (
-        text
-        if len(text) < 60
-        else "a CRS without a name"
-        if name == "unknown"
-        else str(name)
-    )
+    """Return the code of a CRS; if it has no code, its name."""
+    text = crs.to_string()
+    if len(text) < 60:
+        return text
+    projjson = crs.to_dict(projjson=True)
+    name = projjson.get("source_crs", projjson).get("name", "unknown")
+    return "a CRS without a name" if name == "unknown" else str(name)
 
 
 def _whole_cells(size_m: ndarray, step: float) -> list[int]:

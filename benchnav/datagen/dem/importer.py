@@ -1,15 +1,15 @@
-"""Real ground: rasters into maps of the dataset schema.
+"""Import of real data: rasters become maps of the dataset schema.
 
-Slopes follow from the real elevation, at a map's edge too, where that of the ground
-beyond is read. What the rasters do not say comes from the recipe. The truth of λ, its
-distribution in each cell, is not known of real ground: `Terrain.truth` is what the
-recipe's class table would make it, and the dataset says that it is unknown.
+Slopes follow from the real elevation, also at a map's edges, where the surrounding
+elevation is read. The recipe provides what the rasters do not contain. The true
+distribution of λ in real terrain is unknown, and the dataset records this;
+`Terrain.truth` is then the distribution of the recipe's class table.
 
-Maps that overlap say the same of the same ground. So they are stored with a `group`,
-the statistical unit: maps of one group overlap, directly or by others between them, and
-maps of two groups share no ground. Where all maps of a split are connected, it is one
-group, and statistics have one unit. Cutting such ground into smaller groups would need
-maps to be left out between them, and gives no more units than maps side by side.
+Overlapping maps contain the same cells. They are stored with a `group`, the statistical
+unit: maps of one group overlap, directly or through other maps, and maps of two groups
+do not. If all maps of a split are connected, it is one group, and statistics have one
+unit. To cut such terrain into smaller groups, maps between them must be omitted. This
+gives no more units than adjacent maps without overlap.
 """
 
 import hashlib
@@ -31,7 +31,13 @@ from benchnav.datagen.dem.raster import Cut, Rasters, load_rasterio
 from benchnav.datagen.dem.survey import Survey
 from benchnav.datagen.dem.tiling import Run
 from benchnav.datagen.files.create import SHARD_CELLS
-from benchnav.datagen.files.hdf5 import Contents, ShardFile, assemble, held, pack
+from benchnav.datagen.files.hdf5 import (
+    Contents,
+    ShardFile,
+    assemble,
+    exclusive_output,
+    pack,
+)
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import Recipe, Split
 from benchnav.datagen.schema import (
@@ -46,11 +52,10 @@ from benchnav.datagen.schema import (
 from benchnav.datagen.synth.generate import class_map, complete, reference_time_s
 
 _CELLS_AT_ONCE = 2**20
-_CACHE_BYTES = (
-    2**29
-)  # of rasters that GDAL keeps; what it would choose grows with the machine
+# Cache of GDAL for rasters; its default grows with the machine.
+_CACHE_BYTES = 2**29
 
-# Why maps are left out, in the order of being found.
+# Reasons why maps are left out, in the order of the checks.
 REASONS = {
     "not_driven": "have no cell that a drive of their split crossed",
     "missing_elevation": "have cells without elevation",
@@ -79,30 +84,29 @@ def import_dem(
     overwrite: bool = False,
     announce: Callable[[str], object] = str,
 ) -> Iterator[tuple[int, int]]:
-    """Makes a dataset from rasters, yielding (maps done, maps in all); to be iterated
-    to the end.
+    """Create a dataset from rasters; yield (maps done, total maps).
 
-    Maps with cells without elevation or colour are left out. Cells without a class, a
-    measured λ or a value of a layer are kept as such. A map's random numbers go by its
-    number in the ground, so they are the same whichever others are left out.
+    Iterate to the end. Maps that lack elevation or colour in some cells are left out.
+    Cells may lack a class, measured λ or values of layers. A map's random numbers
+    depend on its index in the terrain, and not on other maps that are left out.
 
     Args:
         dem: elevations, by any name that rasterio opens.
         out: file to write, of suffix `.h5` or `.hdf5`; else a folder.
         recipe: id of the dataset, size, resolution, start and goal of the maps, class
             table, light, seed.
-        rasters: where classes, colours, λ and layers come from.
-        drives: log of drives that λ comes from, around which the ground is cut; maps
-            that none crossed are left out.
-        cut: which maps are cut out of the ground.
-        overwrite: replace what is there.
-        announce: is given what will be imported, in sentences, before anything is read.
+        rasters: rasters of classes, colours, λ and layers.
+        drives: log of drives, the source of λ. The maps are cut around its positions;
+            maps without a driven cell are left out.
+        cut: selection of maps in the terrain.
+        overwrite: whether to replace an existing dataset.
+        announce: receives a description of the import before maps are read.
 
     Raises:
-        ConfigError: rasterio is not installed, a setting does not fit the recipe, or
-            `out` is taken.
-        DatasetError: a raster does not fit, a split is left without maps, or `out`
-            cannot be written.
+        ConfigError: If rasterio is not installed, a setting does not fit the recipe, or
+            `out` exists.
+        DatasetError: If a raster does not fit, a split gets no map, or `out` cannot be
+            written.
     """
     expect(
         drives is None or not rasters.traversability,
@@ -126,7 +130,7 @@ def import_dem(
     }
     recipe = replace(recipe, splits=splits)
     with ExitStack() as stack:
-        stack.enter_context(held(out, overwrite))
+        stack.enter_context(exclusive_output(out, overwrite))
         stack.enter_context(load_rasterio().Env(GDAL_CACHEMAX=_CACHE_BYTES))
         survey = Survey(stack, dem, rasters, recipe, cut, drives, announce)
         folder = stack.enter_context(building(out))
@@ -145,7 +149,7 @@ def import_dem(
         for part in parts.values():
             part.finish()
         sizes = {
-            name: replace(splits[name], maps=len(part.about["kept"]))
+            name: replace(splits[name], maps=len(part.records["kept"]))
             for name, part in parts.items()
         }
         contents = Contents(
@@ -162,28 +166,25 @@ def import_dem(
 
 
 def _fields_of(ground: Survey) -> Fields:
-    """What the maps have; groups are added when all maps are known."""
-    names = ["group"] * ground.tiling.overlaps + ["drive_count", "drive_std"] * (
-        ground.driven is not None
-    )
-    return (
-        FIELDS
-        | {name: OPTIONAL[name] for name in OPTIONAL if name in names}
-        | ground.fields
-    )
+    """Return the fields of the maps; groups are added when all maps exist."""
+    names = []
+    if ground.tiling.overlaps:
+        names.append("group")
+    if ground.driven is not None:
+        names += ["drive_count", "drive_std"]
+    optional = {name: OPTIONAL[name] for name in OPTIONAL if name in names}
+    return FIELDS | optional | ground.fields
 
 
 @dataclass
 class _Part:
-    """What has become of the maps of one split: shards of those kept, what is said of
-    each, counts of the others.
-    """
+    """Maps of one split: shards, records of each stored map, and counts of others."""
 
     name: str
     recipe: Recipe
     folder: Path
     ground: Survey
-    about: dict[str, list[Any]] = field(
+    records: dict[str, list[Any]] = field(
         default_factory=lambda: {"kept": [], "lowest_m": [], "unlabelled": []}
     )
     left_out: Counter[str] = field(default_factory=Counter)
@@ -191,94 +192,85 @@ class _Part:
     pending: list[Maps] = field(default_factory=list)
 
     def add(self, run: Run) -> None:
-        """Makes maps and counts those that are left out; writes a shard where enough
-        are kept.
-        """
+        """Add the valid maps of a run, count the others, and write full shards."""
         recipe = self.recipe
-        framed_m, given = self.ground.read(run)
-        kept = np.ones(len(run.columns), dtype=bool)
+        padded_m, inputs = self.ground.read(run)
+        is_valid = np.ones(len(run.columns), dtype=bool)
         lacking = {
-            name: np.isnan(values).any(axis=(1, 2, 3)) for name, values in given.items()
+            name: np.isnan(values).any(axis=(1, 2, 3))
+            for name, values in inputs.items()
         }
-        if (
-            "classes" in given and "photo" in given
-        ):  # else a cell is painted in the colour of its class
-            # A measured λ is worth learning from without a class.
-            unknown = np.isnan(given["classes"]) & np.isnan(
-                given.get("traversability", np.nan)
-            )
-            lacking["classes"] = unknown.all(axis=(1, 2, 3))
-        if "drive_count" in given:
-            lacking["drive_count"] = (given["drive_count"] == 0).all(axis=(1, 2, 3))
+        # Without a photo, a cell has the colour of its class.
+        if "classes" in inputs and "photo" in inputs:
+            # Models can learn from measured λ without a class.
+            measured = inputs.get("traversability", np.nan)
+            is_useless = np.isnan(inputs["classes"]) & np.isnan(measured)
+            lacking["classes"] = is_useless.all(axis=(1, 2, 3))
+        if "drive_count" in inputs:
+            lacking["drive_count"] = (inputs["drive_count"] == 0).all(axis=(1, 2, 3))
         for reason, name in _LACKING.items():
             if name in lacking:
-                self.left_out[reason] += int((kept & lacking[name]).sum())
-                kept &= ~lacking[name]
-        relief_m = np.ptp(framed_m[:, 1:-1, 1:-1], axis=(1, 2))
-        rough = kept & (relief_m > MAX_RELIEF_M)
+                self.left_out[reason] += int((is_valid & lacking[name]).sum())
+                is_valid &= ~lacking[name]
+        relief_m = np.ptp(padded_m[:, 1:-1, 1:-1], axis=(1, 2))
+        rough = is_valid & (relief_m > MAX_RELIEF_M)
         if rough.any():
             self.left_out["too_rough"] += int(rough.sum())
-            kept &= ~rough
-        numbers = (run.row * self.ground.tiling.tiles[1] + np.array(run.columns))[kept]
-        if not len(numbers):
+            is_valid &= ~rough
+        first = run.row * self.ground.tiling.tiles[1]
+        indices = (first + np.array(run.columns))[is_valid]
+        if not len(indices):
             return
-        framed_m, given = (
-            quantise(framed_m[kept], 13),
-            {name: values[kept] for name, values in given.items()},
-        )
-        lowest_m = framed_m[:, 1:-1, 1:-1].min(axis=(1, 2))
-        class_id = class_map(recipe, self.name, numbers)
-        if "classes" in given:
-            class_id = np.nan_to_num(given["classes"][:, 0], nan=UNLABELLED).astype(
-                np.int64
-            )
+        padded_m = quantise(padded_m[is_valid], 13)
+        inputs = {name: values[is_valid] for name, values in inputs.items()}
+        lowest_m = padded_m[:, 1:-1, 1:-1].min(axis=(1, 2))
+        class_id = class_map(recipe, self.name, indices)
+        if "classes" in inputs:
+            class_id = np.nan_to_num(inputs["classes"][:, 0], nan=UNLABELLED)
+            class_id = class_id.astype(np.int64)
         labelled = class_id != UNLABELLED
-        height_m = framed_m - lowest_m[:, None, None]
-        maps = complete(
-            recipe, self.name, numbers, np.where(labelled, class_id, 0), height_m
-        )
+        height_m = padded_m - lowest_m[:, None, None]
+        filled_id = np.where(labelled, class_id, 0)
+        maps = complete(recipe, self.name, indices, filled_id, height_m)
         maps["class_id"] = class_id
         maps["traversability"] = np.where(labelled, maps["traversability"], np.nan)
-        if "classes" in given:
-            maps["environment"] = np.zeros(len(numbers))
-        if "photo" in given:
-            maps["rgb"] = np.rint(given["photo"])
-        if "traversability" in given:
-            maps["traversability"] = quantise(given["traversability"][:, 0], 16)
-        if "drive_count" in given:
-            maps["drive_count"] = given["drive_count"][:, 0]
-            maps["drive_std"] = quantise(given["drive_std"][:, 0], 16)
-        maps["reference_time_s"] = np.full(len(numbers), np.nan)
+        if "classes" in inputs:
+            maps["environment"] = np.zeros(len(indices))
+        if "photo" in inputs:
+            maps["rgb"] = np.rint(inputs["photo"])
+        if "traversability" in inputs:
+            maps["traversability"] = quantise(inputs["traversability"][:, 0], 16)
+        if "drive_count" in inputs:
+            maps["drive_count"] = inputs["drive_count"][:, 0]
+            maps["drive_std"] = quantise(inputs["drive_std"][:, 0], 16)
+        maps["reference_time_s"] = np.full(len(indices), np.nan)
         if recipe.splits[self.name].solvable:
             maps["reference_time_s"] = reference_time_s(recipe, maps)
         solved = ~np.isinf(maps["reference_time_s"])
         self.left_out["not_solvable"] += int((~solved).sum())
-        about = {
-            "kept": numbers,
-            "lowest_m": lowest_m,
-            "unlabelled": (~labelled).sum(axis=(1, 2)),
+        for name in self.ground.fields:
+            maps[name] = inputs[f"layer {name}"][:, 0]
+        fields = dict(_fields_of(self.ground))
+        fields.pop("group", None)
+        stored = {
+            name: maps[name].astype(field.dtype) for name, field in fields.items()
         }
-        maps |= {name: given[f"layer {name}"][:, 0] for name in self.ground.fields}
-        fields = {
-            name: kind
-            for name, kind in _fields_of(self.ground).items()
-            if name != "group"
-        }
-        stored = {name: maps[name].astype(kind.dtype) for name, kind in fields.items()}
-        stored |= {f"about {name}": values for name, values in about.items()}
+        stored["record kept"] = indices
+        stored["record lowest_m"] = lowest_m
+        stored["record unlabelled"] = (~labelled).sum(axis=(1, 2))
         self.pending.append({name: values[solved] for name, values in stored.items()})
         if sum(maps["class_id"].size for maps in self.pending) >= SHARD_CELLS:
             self._flush()
 
     def finish(self) -> None:
-        """Writes what is pending, and groups where maps overlap.
+        """Write pending maps, and groups of overlapping maps.
 
         Raises:
-            DatasetError: no map was kept.
+            DatasetError: If the split has no map.
         """
         if self.pending:
             self._flush()
-        if not self.about["kept"]:
+        if not self.records["kept"]:
             reasons = [
                 f"{count} {REASONS[reason]}"
                 for reason, count in self.left_out.items()
@@ -288,42 +280,39 @@ class _Part:
                 f"Expected split {self.name!r} to get at least one map, got none from "
                 f"{self.ground.layers['dem'].raster.name}: of "
                 f"{self.left_out.total()}, {', '.join(reasons)}. Fill the gaps, or "
-                "take smaller maps, other shares "
-                "or a recipe of easier ground."
+                "take smaller maps, other shares or a recipe of easier ground."
             )
         if self.ground.tiling.overlaps:
             self._add_groups()
 
     def _flush(self) -> None:
         maps = join_maps(self.pending)
-        first = len(self.about["kept"])
-        for name, values in self.about.items():
-            values += maps.pop(f"about {name}").tolist()
-        shard = ShardFile(self.name, first, len(self.about["kept"]))
+        first = len(self.records["kept"])
+        for name, values in self.records.items():
+            values += maps.pop(f"record {name}").tolist()
+        shard = ShardFile(self.name, first, len(self.records["kept"]))
         self.pending = []
         if shard.maps:
             self.shards.append(shard)
             self._write(shard, maps)
 
     def _write(self, shard: ShardFile, maps: Maps) -> None:
-        about = self.entry(shard.first, shard.stop)
-        content = pack(self.recipe, self.name, about, maps, _fields_of(self.ground))
+        entry = self.entry(shard.first, shard.stop)
+        content = pack(self.recipe, self.name, entry, maps, _fields_of(self.ground))
         (self.folder / shard.name).write_bytes(content)
 
     def _add_groups(self) -> None:
-        """Writes the shards anew with each map's group, which is known only when all
-        maps are.
+        """Rewrite the shards with the group of each map, when all maps exist.
 
-        Of the ground and its least map the number is a digest, so that datasets can be
-        merged: the same on the same ground, and else another.
+        The number of a group is a digest of the terrain and its first map. Groups can
+        therefore be merged: numbers are equal only on the same terrain.
         """
         source = self.ground.source
-        about = [
-            source[key] for key in ("file", "sha256", "crs", "origin_m", "stride_m")
-        ]
-        about += self.ground.tiling.shape
-        firsts = self.ground.tiling.groups(self.about["kept"]).tolist()
-        texts = (json.dumps([*about, first]).encode() for first in firsts)
+        keys = ("file", "sha256", "crs", "origin_m", "stride_m")
+        terrain = [source[key] for key in keys]
+        terrain += self.ground.tiling.shape
+        firsts = self.ground.tiling.groups(self.records["kept"]).tolist()
+        texts = (json.dumps([*terrain, first]).encode() for first in firsts)
         numbers = np.array(
             [int(hashlib.sha256(text).hexdigest()[:13], 16) for text in texts]
         )
@@ -333,16 +322,17 @@ class _Part:
             self._write(shard, maps)
 
     def entry(self, first: int = 0, stop: int | None = None) -> dict[str, Any]:
-        """The manifest's entry of the maps from one on, to the last or before another."""
-        kept = {name: values[first:stop] for name, values in self.about.items()}
+        """Return the manifest entry of consecutive maps, from `first` to before `stop`."""
+        records = {name: values[first:stop] for name, values in self.records.items()}
         left_out = {**self.left_out, "between_splits": self.ground.tiling.between}
         source = {
             **self.ground.source,
             "truth": "unknown",
-            **kept,
+            **records,
             "left_out": left_out,
         }
-        count, scenario = len(kept["kept"]), self.recipe.splits[self.name].scenario
+        count = len(records["kept"])
+        scenario = self.recipe.splits[self.name].scenario
         return {
             "scenario": scenario,
             "maps": count,

@@ -1,4 +1,4 @@
-"""Rasters that become layers of a dataset, as they are named on the command line."""
+"""Rasters that become layers of a dataset, as named on the command line."""
 
 import re
 from typing import NamedTuple
@@ -10,18 +10,17 @@ from benchnav.core.grid import is_azimuth
 from benchnav.datagen import schema
 from benchnav.datagen.layers.spec import shipped_fields
 
-_UNITS = {
-    "_m": "m",
-    "_deg": "deg",
-    "_s": "s",
-    "_mps": "m/s",
-    "_k": "K",
-}  # by the end of a layer's name
+# By the end of a layer's name.
+_UNITS = {"_m": "m", "_deg": "deg", "_s": "s", "_mps": "m/s", "_k": "K"}
 
 
 class LayerRaster(NamedTuple):
-    """A raster that becomes a layer: the layer's name, the raster's, and what the layer
-    is.
+    """Raster that becomes a layer.
+
+    Args:
+        name: name of the layer.
+        raster: name of the raster.
+        field: stored field of the layer.
     """
 
     name: str
@@ -30,35 +29,35 @@ class LayerRaster(NamedTuple):
 
     @property
     def how(self) -> str:
-        """How it is resampled: angles are no numbers to be averaged."""
+        """Resampling in GDAL's terms; the mean of angles would be wrong."""
         return "nearest" if is_azimuth(self.name) else "average"
 
 
 def read_layer(text: str) -> LayerRaster:
-    """Reads `NAME=RASTER` or `NAME=RASTER:UNIT`; what follows the last colon is a unit
-    where it is no path.
+    """Return the layer of a text `NAME=RASTER` or `NAME=RASTER:UNIT`.
+
+    The text after the last colon is a unit unless it looks like a path.
 
     Raises:
-        ConfigError: it is not of that form, or the name is no identifier or that of a
-            field that is no layer.
+        ConfigError: If it has another form, or the name is not valid for a layer.
     """
-    name, equals, rest = text.partition("=")
-    place, colon, unit = rest.rpartition(":")
-    if not colon or not place or not re.fullmatch(r"[^/\\.]+", unit):
-        place, unit = rest, ""
+    name, equals, source = text.partition("=")
+    raster, colon, unit = source.rpartition(":")
+    if not colon or not raster or not re.fullmatch(r"[^/\\.]+", unit):
+        raster = source
+        unit = ""
     expect(
-        equals and place, f"`layer` as NAME=RASTER or NAME=RASTER:UNIT, got {text!r}."
+        equals and raster, f"`layer` as NAME=RASTER or NAME=RASTER:UNIT, got {text!r}."
     )
     schema.check_layer_name(f"the name of a `layer` in {text!r}", name)
     field = shipped_fields().get(name)
     if field is None:
-        unit = unit or next(
-            (own for end, own in _UNITS.items() if name.endswith(end)), "1"
-        )
+        units = (unit for end, unit in _UNITS.items() if name.endswith(end))
+        unit = unit or next(units, "1")
         field = schema.Field("<f4", ("H", "W"), unit, -np.inf, np.inf, "imported layer")
     expect(
         unit in ("", field.unit),
         f"`layer` {name} in {field.unit}, got {unit!r}. Convert it or leave the unit "
         "out.",
     )
-    return LayerRaster(name, place, field)
+    return LayerRaster(name, raster, field)

@@ -1,9 +1,8 @@
-"""Rasters by any name that GDAL opens, laid on the cells of the maps by GDAL's warper
-and read by windows.
+"""Rasters by any name that GDAL opens, resampled to the maps and read by windows.
 
-rasterio is an extra of this package, imported when a raster is opened. A raster's rows
-run southward; what is read here runs northward, with y. Letters in shapes: K bands, H×W
-cells.
+rasterio is an extra of this package, imported when a raster is opened. Rows of rasters
+run southward; rows of arrays from here run northward, with y. Letters in shapes: K
+bands, H×W cells.
 """
 
 import json
@@ -20,24 +19,23 @@ from benchnav.core.touched import note_file
 from benchnav.datagen.dem.layer import LayerRaster, read_layer
 
 MAX_MAPS = 20_000  # of an import, unless more are allowed
-_MOST_STRETCH = (
-    0.02  # of a projection against the ground; within a UTM zone it is at most 0.001
-)
-_PROBE_M = 10.0  # to either side of a place where the scale of a projection is measured
-_TOLERANCE = 0.01  # of a raster's cell that a place may be off by in another CRS
+# |scale − 1| of a projection; within a UTM zone it is at most 0.001.
+_MAX_STRETCH = 0.02
+_PROBE_M = 10.0  # distance over which the scale of a projection is measured
+_TOLERANCE = 0.01  # error of positions in another CRS, in cells of the raster
 
 
 @dataclass(frozen=True, kw_only=True)
 class GroundOptions:
-    """How an elevation model is read and cut into maps.
+    """Reading of an elevation model, and cutting into maps.
 
     Args:
-        dem_unit: Unit of elevations: m, ft, us-ft, or metres in a unit; if empty, what
-            the raster declares.
-        origin: Where the first map's south-west corner lies, [X,Y] in the coordinate
-            reference system of the maps.
-        max_maps: Most maps; ground of more stops the import, with a command that makes
-            fewer.
+        dem_unit: Unit of elevations: m, ft, us-ft, or metres in a unit. If empty, the
+            unit that the raster declares.
+        origin: South-west corner of the first map, [X,Y] in the coordinate reference
+            system of the maps.
+        max_maps: Maximum number of maps. More stop the import, with a command that
+            makes fewer.
         coarse: Allow an elevation model whose cells are three times as wide as the
             maps', or wider.
     """
@@ -54,15 +52,15 @@ class GroundOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class Cut:
-    """Which maps an import cuts out of the ground.
+    """Selection of the maps of an import.
 
     Args:
-        shares: of the maps, by split.
-        scenario: which of the recipe's scenarios lights the maps.
-        stride_m: from one map to the next; None for maps side by side.
-        solvable: keep only maps whose goal can be reached, and store the grid reference
-            time.
-        ground: how the elevation model is read and cut.
+        shares: fraction of the maps of each split.
+        scenario: scenario of the recipe that lights the maps.
+        stride_m: distance from one map to the next in metres; None for adjacent maps.
+        solvable: whether to keep only maps whose goal is reachable, and to store the
+            grid reference time.
+        ground: reading and cutting of the elevation model.
     """
 
     shares: Mapping[str, float] = field(default_factory=lambda: {"test/real": 1.0})
@@ -74,22 +72,22 @@ class Cut:
 
 @dataclass(frozen=True, kw_only=True)
 class Rasters:
-    """What there is of the ground beside its elevation. Where a raster does not cover
-    it, maps are left out.
+    """Further rasters of the terrain. Maps that they do not cover are left out.
 
-    A layer alone has to cover all maps; where it has no value, it is NaN.
+    Only layers must cover all maps; missing values of a layer are NaN.
 
     Args:
-        classes: Raster of terrain classes; laid out at random when not given.
+        classes: Raster of terrain classes. If empty, classes are laid out at random.
         class_ids: Class names by value of that raster, such as '{1: gravel, 9: null}',
-            null for no label; else indices.
-        random_classes: Allow a photo or measured traversability without classes: these
+            null for no label. If not given, values are class indices.
+        random_classes: Allow a photo or measured traversability without classes; they
             are laid out at random.
-        unlabelled: Allow a photo and measured traversability without classes: no cell
-            has one.
-        photo: Raster of red, green and blue; painted by the class when not given.
-        traversability: Raster of measured traversability in [0, 1]; drawn by the class
-            table when not given.
+        unlabelled: Allow a photo and measured traversability without classes; all cells
+            are unlabelled.
+        photo: Raster of red, green and blue. If empty, cells have the colours of their
+            classes.
+        traversability: Raster of measured traversability in [0, 1]. If empty, it is
+            drawn by the class table.
         layer: A layer as NAME=RASTER or NAME=RASTER:UNIT, such as
             vegetation_m=canopy.tif; several as a list.
     """
@@ -103,7 +101,7 @@ class Rasters:
     layer: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Refuses what does not go together."""
+        """Reject options that contradict each other."""
         expect(
             self.classes or self.class_ids is None,
             "`classes` with `class_ids`, got none. Pass the raster they belong to.",
@@ -137,13 +135,18 @@ class Rasters:
 
     @property
     def layers(self) -> list[LayerRaster]:
-        """What `layer` says, read."""
+        """Layers of the option `layer`."""
         return [read_layer(text) for text in self.layer]
 
 
 class Raster(NamedTuple):
-    """An open raster: what the user calls it, its name, rasterio's reader, and metres
-    per unit of its values.
+    """Open raster.
+
+    Args:
+        argument: name of the user's argument.
+        name: name of the raster.
+        file: rasterio's reader.
+        metres: metres per unit of its values.
     """
 
     argument: str
@@ -152,14 +155,12 @@ class Raster(NamedTuple):
     metres: float = 1.0
 
     def raw(self, value: float) -> float:
-        """Return a value of the first band as the file holds it."""
+        """Return a value of the first band as stored in the file."""
         return float((value / self.metres - self.file.offsets[0]) / self.file.scales[0])
 
     @property
     def mask_kinds(self) -> set[str]:
-        """How it tells cells without a value, in GDAL's words; `all_valid` alone where
-        it does not.
-        """
+        """GDAL's mask flags; only `all_valid` if the raster declares no missing cells."""
         return {flag.name for flags in self.file.mask_flag_enums for flag in flags}
 
     @property
@@ -168,48 +169,51 @@ class Raster(NamedTuple):
         return self.mask_kinds != {"all_valid"}
 
     def place(self) -> tuple[Any, Any, tuple[float, float]]:
-        """Where it lies: a CRS in metres, its bounds there, and the size of its cells
-        northward and eastward.
+        """Return a CRS in metres, bounds in it, and cell size northward and eastward.
 
-        The CRS is its own where a metre of that is one on the ground, all over the
-        raster. Else it is that of its UTM zone, and off the Earth a transverse Mercator
-        projection of the raster's middle.
+        It is the raster's CRS if its metres are metres on the terrain, all over the
+        raster. Else it is that of its UTM zone; off the Earth, it is a transverse
+        Mercator projection at the raster's centre.
 
         Raises:
-            DatasetError: there is none, as of ground that is too large.
+            DatasetError: If there is no such CRS, as for large areas.
         """
-        own, bounds = horizontal(self.file.crs), self.file.bounds
+        raster_crs = horizontal(self.file.crs)
+        bounds = self.file.bounds
         x, y = np.meshgrid(
             np.linspace(bounds.left, bounds.right, 3),
             np.linspace(bounds.bottom, bounds.top, 3),
         )
         middle = x[1, 1], y[1, 1]
-        local = local_crs(own, *middle)
+        local = local_crs(raster_crs, *middle)
         if local is None:
             raise DatasetError(
                 f"Expected `{self.argument}` in a CRS of the Earth or another body, "
-                f"got {own.to_string()[:80]} in "
-                f"{self.name}. If you know it, declare it: rio edit-info --crs "
-                f"EPSG:CODE {self.name}"
+                f"got {raster_crs.to_string()[:80]} in {self.name}. If you know it, "
+                f"declare it: rio edit-info --crs EPSG:CODE {self.name}"
             )
-        for crs in (own, _utm_of(own, *middle), local):
+        for crs in (raster_crs, _utm_of(raster_crs, *middle), local):
             if crs is not None and crs.is_projected and crs.linear_units_factor[1] == 1:
-                places = transformed(own, crs, x.ravel(), y.ravel()).T
-                if max(stretch(crs, *place) for place in places) <= _MOST_STRETCH:
+                positions = transformed(raster_crs, crs, x.ravel(), y.ravel()).T
+                if (
+                    max(stretch(crs, *position) for position in positions)
+                    <= _MAX_STRETCH
+                ):
                     with self.warped(crs) as warped:
                         return crs, warped.bounds, (warped.res[1], warped.res[0])
         wide, high = bounds.right - bounds.left, bounds.top - bounds.bottom
         raise DatasetError(
             f"Expected `{self.argument}` of ground small enough for a map whose "
             "metres are metres on the ground, got "
-            f"{self.name} of {wide:g} × {high:g} units of {own.to_string()[:80]}. "
-            f"Cut out a part: rio clip {self.name} part.tif --bounds 'WEST SOUTH EAST "
-            "NORTH'"
+            f"{self.name} of {wide:g} × {high:g} units of "
+            f"{raster_crs.to_string()[:80]}. Cut out a part: rio clip {self.name} "
+            "part.tif --bounds 'WEST SOUTH EAST NORTH'"
         )
 
     def warped(self, crs: Any, **settings: Any) -> Any:
-        """The raster in another CRS; where it has no values, that shows, if need be by
-        one more band.
+        """Return the raster in another CRS, with missing cells marked.
+
+        An alpha band is added if the raster has no other mark.
         """
         if (
             self.mask_kinds == {"all_valid"}
@@ -228,17 +232,17 @@ class Raster(NamedTuple):
             )
 
     def laid(self, frame: Mapping[str, Any], bands: list[int], how: str) -> "Layer":
-        """Lays bands of it on cells, resampled in one of GDAL's ways.
+        """Return bands resampled to cells.
 
         Args:
-            frame: the cells of all maps and one around them: `crs`, `transform`,
-                `height` and `width`.
-            bands: which bands.
+            frame: the cells of all maps, padded by one: `crs`, `transform`, `height`
+                and `width`.
+            bands: bands of the raster.
             how: name of one of `rasterio.enums.Resampling`.
         """
         resampling = load_rasterio().enums.Resampling[how]
-        # Of whole numbers the means need not be whole; with transparency GDAL wants a
-        # photo's own type.
+        # Means of integers need not be integers. With transparency, GDAL requires the
+        # dtype of the photo.
         dtype = "float64" if len(bands) == 1 else self.file.dtypes[0]
         return Layer(
             self, bands, self.warped(**frame, resampling=resampling, dtype=dtype)
@@ -246,31 +250,28 @@ class Raster(NamedTuple):
 
 
 class Layer(NamedTuple):
-    """The first bands of a raster as resampled to the cells of all maps and one around
-    them.
-    """
+    """Bands of a raster, resampled to the cells of all maps, padded by one."""
 
     raster: Raster
     bands: list[int]
     warped: Any
 
     def read(self, rows: range, columns: range) -> np.ndarray:
-        """Reads cells of the maps and one cell around them.
+        """Return cells of the maps, padded by one.
 
         Args:
-            rows: counted northward.
-            columns: counted eastward.
+            rows: rows, counted northward.
+            columns: columns, counted eastward.
 
         Returns:
-            Values, NaN where there are none, float64, shape [K, len(rows) + 2,
-            len(columns) + 2].
+            Values, NaN if missing, float64, shape [K, len(rows) + 2, len(columns) + 2].
         """
         file, warped = self.raster.file, self.warped
         top = warped.height - 2 - rows.stop
         window = ((top, top + len(rows) + 2), (columns.start, columns.stop + 2))
         with _naming(self.raster.argument, self.raster.name):
             values = warped.read(self.bands, window=window).astype(np.float64)
-            if warped.count > file.count:  # one more band says where there are values
+            if warped.count > file.count:  # an alpha band was added
                 mask = warped.read(warped.count, window=window)
             else:
                 mask = warped.dataset_mask(window=window)
@@ -283,18 +284,18 @@ class Layer(NamedTuple):
 
 @contextmanager
 def opened(argument: str, name: str, kinds: tuple[str, ...] = ()) -> Iterator[Raster]:
-    """Opens a raster.
+    """Open a raster.
 
     Args:
-        argument: what the user calls it.
-        name: where it is.
-        kinds: dtypes of its first bands; none for one band of any.
+        argument: name of the user's argument.
+        name: name of the raster.
+        kinds: expected dtypes of its first bands; empty for one band of any dtype.
 
     Raises:
-        DatasetError: it cannot be read, holds other bands, or does not say where it
-            lies.
+        DatasetError: If it cannot be read, has other bands, or lacks a CRS or a
+            geotransform.
     """
-    # Rasterio warns of a missing place, which is an error below.
+    # rasterio warns of a missing geotransform, which is an error below.
     with warnings.catch_warnings(action="ignore"), _naming(argument, name):
         note_file(name)
         file = load_rasterio().open(name)
@@ -336,7 +337,7 @@ def opened(argument: str, name: str, kinds: tuple[str, ...] = ()) -> Iterator[Ra
 
 
 def _utm_of(crs: Any, x: float, y: float) -> Any:
-    """The CRS of the UTM zone (or polar cap) that a place lies in; None off the Earth."""
+    """Return the CRS of the UTM zone (or polar cap) of a position; None off the Earth."""
     longitude, latitude = transformed(crs, "EPSG:4326", [x], [y])[:, 0]
     if not np.isfinite(longitude + latitude):
         return None
@@ -345,13 +346,15 @@ def _utm_of(crs: Any, x: float, y: float) -> Any:
 
 
 def local_crs(crs: Any, x: float, y: float) -> Any:
-    """A transverse Mercator projection of the same body and datum, true to scale at a
-    place; None where it has none.
+    """Return a transverse Mercator projection of the same datum, true at a position.
 
     Args:
-        crs: of the place, on any ellipsoid.
+        crs: CRS of the position, on any ellipsoid.
         x: eastward, or longitude.
         y: northward, or latitude.
+
+    Returns:
+        The CRS; None if there is no geographic CRS of the body.
     """
     base = crs.to_dict(projjson=True)
     while inner := base.get("base_crs") or base.get("source_crs"):
@@ -392,46 +395,44 @@ def local_crs(crs: Any, x: float, y: float) -> Any:
 
 
 def stretch(crs: Any, x: float, y: float) -> float:
-    """How far a metre of a projection in metres is from one on the ground at a place,
-    in the worst direction.
+    """Return |scale − 1| of a projection at a position, in the worst direction.
 
-    Returns:
-        |scale − 1|; infinite where the place is not on the ground.
+    It is infinite if the position is not on the body.
     """
     local = local_crs(crs, x, y)
     if local is None:
         return np.inf
     steps = _PROBE_M * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
-    moved = transformed(crs, local, *(np.array([x, y]) + steps).T).T
-    if not np.isfinite(moved).all():
+    probes = transformed(crs, local, *(np.array([x, y]) + steps).T).T
+    if not np.isfinite(probes).all():
         return np.inf
-    scales = np.linalg.svd(moved[::2] - moved[1::2], compute_uv=False) / (2 * _PROBE_M)
+    differences = probes[::2] - probes[1::2]
+    scales = np.linalg.svd(differences, compute_uv=False) / (2 * _PROBE_M)
     return float(np.abs(scales - 1).max())
 
 
 def transformed(crs: Any, to: Any, x: Any, y: Any) -> np.ndarray:
-    """Moves N places from one CRS to another, shape [2, N]; not finite where no way
-    leads, as from another planet.
+    """Return N positions in another CRS, shape [2, N].
+
+    They are non-finite if there is no transformation, as from another planet.
     """
     try:
         return np.array(load_rasterio().warp.transform(crs, to, list(x), list(y)))
-    except Exception:  # rasterio gives PROJ's failures no public class
+    except Exception:  # rasterio has no public class for PROJ's errors
         return np.full((2, len(x)), np.nan)
 
 
 def horizontal(crs: Any) -> Any:
-    """The part of a CRS that says where on the map, where another says how high."""
-    whole = crs.to_dict(projjson=True)
-    return (
-        type(crs).from_user_input(json.dumps(whole["components"][0]))
-        if "components" in whole
-        else crs
-    )
+    """Return the horizontal component of a compound CRS; else the CRS itself."""
+    components = crs.to_dict(projjson=True).get("components")
+    if components is None:
+        return crs
+    return type(crs).from_user_input(json.dumps(components[0]))
 
 
 @contextmanager
 def _naming(argument: str, name: str) -> Iterator[None]:
-    """Says which raster could not be read, and why."""
+    """Convert rasterio's errors to errors that name the raster."""
     try:
         yield
     except load_rasterio().errors.RasterioError as error:
@@ -443,10 +444,10 @@ def _naming(argument: str, name: str) -> Iterator[None]:
 
 
 def load_rasterio() -> Any:
-    """Imports rasterio.
+    """Return rasterio, imported on first use.
 
     Raises:
-        ConfigError: it is not installed.
+        ConfigError: If it is not installed.
     """
     try:
         import rasterio.vrt

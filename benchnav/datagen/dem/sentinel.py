@@ -1,8 +1,6 @@
-"""Values that stand for missing in rasters that do not declare them, or declare another
-one.
+"""Sentinels: undeclared values that mean missing in rasters.
 
-Rasters commonly write nines, the ends of an integer type, floats beyond any height, or
-0.
+Common ones are nines, the limits of an integer type, floats beyond any height, and 0.
 """
 
 import numpy as np
@@ -10,7 +8,7 @@ from numpy import ndarray
 
 from benchnav.datagen.dem.raster import Raster
 
-_SHORT = (-1, 255)  # which are heights too
+_SHORT = (-1, 255)  # may be heights too
 _LONG = (
     -999,
     -9999,
@@ -26,11 +24,11 @@ _LONG = (
     -1e6,
     1e6,
 )
-_CERTAIN = (-9999, -99999, -999999, -32767, -32768)  # of any quantity
-_HUGE = 1e5  # from which on a value is missing where it is no height
+_CERTAIN = (-9999, -99999, -999999, -32767, -32768)  # for any quantity
+_HUGE = 1e5  # larger values that are not heights are missing
 _HEIGHTS_M = (-12_000.0, 30_000.0)  # of the Earth, the Moon and Mars
 _APART_M = 100.0  # from all heights of a map
-_FROM = 999.0  # below it values are common as heights too
+_FROM = 999.0  # smaller values are common heights too
 
 
 def looks_missing(raster: Raster, value: float) -> bool:
@@ -46,14 +44,12 @@ def looks_missing(raster: Raster, value: float) -> bool:
 def _is_common(raster: Raster, value: float) -> bool:
     raw, dtype = raster.raw(value), np.dtype(raster.file.dtypes[0])
     ends = (np.iinfo(dtype).min, np.iinfo(dtype).max) if dtype.kind in "iu" else ()
-    return any(
-        np.isclose(raw, other, rtol=1e-6, atol=0) for other in (*_SHORT, *_LONG, *ends)
-    )
+    sentinels = (*_SHORT, *_LONG, *ends)
+    return any(np.isclose(raw, value, rtol=1e-6, atol=0) for value in sentinels)
 
 
 def is_certain(raster: Raster, value: float, values: ndarray) -> bool:
-    """Return whether the lowest or highest value of a map stands for missing in a
-    raster of any quantity.
+    """Return whether an extreme value of a map means missing, for any quantity.
 
     Args:
         raster: Whose value it is.
@@ -65,7 +61,7 @@ def is_certain(raster: Raster, value: float, values: ndarray) -> bool:
     raw = raster.raw(value)
     if abs(raw) > 1e30:
         return True
-    if not any(np.isclose(raw, other, rtol=1e-6, atol=0) for other in _CERTAIN):
+    if not any(np.isclose(raw, sentinel, rtol=1e-6, atol=0) for sentinel in _CERTAIN):
         return False
     apart = np.abs(values - value)
     others = apart > 1e-6 * abs(value)
@@ -78,8 +74,7 @@ def is_certain(raster: Raster, value: float, values: ndarray) -> bool:
 def is_missing(
     dem: Raster, height_m: float, heights_m: ndarray, cliff_m: float
 ) -> bool:
-    """Return whether the lowest or highest value of a map stands for missing rather
-    than for a height.
+    """Return whether an extreme value of a map means missing instead of a height.
 
     Args:
         dem: Elevation model.
@@ -106,8 +101,7 @@ def widest_gap_m(cliff_m: float) -> float:
 
 
 def zero_gap_m(heights_m: ndarray) -> float:
-    """Return how far cells of a height of exactly 0 are from all others; 0 if either
-    kind is missing.
+    """Return the gap between a height of exactly 0 and all others; 0 without both.
 
     Args:
         heights_m: Lowest values in the map's cells, NaN in cells without one.

@@ -1,10 +1,10 @@
-"""What rasters say of the ground, map by map.
+"""Reading of rasters, map by map.
 
-Elevation is the raster's own at its own resolution. Where its cells are at most half as
-wide as the maps', it is averaged, so that bumps too small for the maps do not fold into
-slopes of theirs; else it is interpolated by cubic convolution. Colours and
-traversability are averaged; a cell takes the class that
-covers most of it. Letters in shapes: B maps, K bands, H×W cells of a map.
+Elevation at the resolution of the maps is read without resampling. If the raster's
+cells are at most half as wide as the maps', elevation is averaged: otherwise, small
+bumps would alias into slopes. Else it is interpolated by cubic convolution. Colours and
+traversability are averaged; a cell gets the class that covers most of it. Letters in
+shapes: B maps, K bands, H×W cells of a map.
 """
 
 import re
@@ -42,11 +42,9 @@ from benchnav.datagen.dem.units import check_metres, in_unit
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.datagen.schema import FIELDS, OPTIONAL, Maps
 
-_CLIFF = (
-    5.67  # of 80°, metres a metre: steeper than natural ground beside cells of height 0
-)
-# Rasters beside the elevation model: what the user calls them, dtypes of their bands,
-# and how they are resampled.
+# Slope of 80°: natural terrain next to cells of height 0 is less steep.
+_CLIFF = 5.67
+# Further rasters: argument, dtypes of their bands, and resampling.
 _OTHERS = (
     ("classes", (), "mode"),
     ("photo", ("uint8",) * 3, "average"),
@@ -55,22 +53,23 @@ _OTHERS = (
 
 
 class Survey:
-    """Rasters laid on the cells of all maps.
+    """Rasters resampled to the cells of all maps.
 
     Attributes:
-        tiling: how the ground is cut into maps.
-        layers: by what the user calls the raster; under `NAME min` and `NAME max` what
-            is averaged there.
-        unlabelled: whether no cell has a class.
-        driven: what drives say of the cells; None without a log.
-        given: what the user calls each raster; layers are `layer NAME`.
-        fields: those of layers, by name.
-        valued: layers of which some value was read.
-        known: which rows and columns of all cells, framed by one, lie wholly on the
-            elevation model.
-        indices: of classes, by value of their raster; NaN for no label.
-        cliff_m: difference of heights that no natural ground has next to a cell.
-        source: what the manifest says of the rasters.
+        tiling: tiling of the terrain into maps.
+        layers: resampled rasters by argument; `NAME min` and `NAME max` are the
+            extremes of averaged cells.
+        unlabelled: whether all cells lack a class.
+        driven: values of driven cells; None without a log.
+        arguments: arguments of the rasters; layers are `layer NAME`.
+        fields: fields of layers, by name.
+        valued: layers of which at least one value was read.
+        is_inside: rows and columns of all cells, padded by one, that lie completely on
+            the elevation model; two masks.
+        indices: index of the class of each raster value; NaN for no label.
+        cliff_m: difference of heights of neighbouring cells that no natural terrain
+            has.
+        source: manifest entry of the rasters.
     """
 
     def __init__(
@@ -83,21 +82,22 @@ class Survey:
         drives: Drives | None = None,
         announce: Callable[[str], object] = str,
     ) -> None:
-        """Opens rasters and lays them on the cells of all maps.
+        """Open rasters and resample them to the cells of all maps.
 
         Args:
-            stack: closes them.
-            dem: of elevations, one band, by any name that rasterio opens.
-            rasters: the others.
+            stack: context that closes them.
+            dem: raster of elevations, one band, by any name that rasterio opens.
+            rasters: further rasters.
             recipe: size and resolution of the maps, class table.
-            cut: which maps are cut out of the ground.
-            drives: log of drives, around which the ground is cut; None for all of the
+            cut: selection of maps in the terrain.
+            drives: log of drives, around which maps are cut; None for all of the
                 elevation model.
-            announce: is given what will be imported, in sentences.
+            announce: receives a description of the import, in sentences.
 
         Raises:
-            ConfigError: a setting does not fit the recipe.
-            DatasetError: a raster or the log does not fit, or the ground is too small.
+            ConfigError: If a setting does not fit the recipe.
+            DatasetError: If a raster or the log does not fit, or the terrain is too
+                small.
         """
         shares, stride_m, options = cut.shares, cut.stride_m, cut.ground
         names, step = [kind.name for kind in recipe.classes], recipe.resolution_m
@@ -136,7 +136,7 @@ class Survey:
             places_m=None if log is None else log.places_m,
         )
         laid = extent.lay(recipe.grid, stride)
-        self.fields = {own.name: own.field for own in rasters.layers}
+        self.fields = {layer.name: layer.field for layer in rasters.layers}
         tiling, offset_m, how = laid
         self.tiling = tiling
         drive_fields = {
@@ -157,24 +157,27 @@ class Survey:
                 )
                 extent.suggest_origin(sources[-1][0], laid, step, announce)
         area = (west_m, south_m, west_m + width * step, south_m + height * step)
-        for own in rasters.layers:
-            raster = stack.enter_context(opened(f"layer {own.name}", own.raster))
+        for layer_raster in rasters.layers:
+            argument = f"layer {layer_raster.name}"
+            raster = stack.enter_context(opened(argument, layer_raster.raster))
             extent.suggest_origin(raster, laid, step, announce)
-            if own.field.unit == "m":
+            if layer_raster.field.unit == "m":
                 check_metres(raster)
             _check_covers(raster, crs, area, step)
-            sources.append((raster, own.how))
+            sources.append((raster, layer_raster.how))
         self.layers: dict[str, Layer] = {}
         for raster, how in sources:
             is_photo = raster.argument == "photo"
-            ends = (
-                ("min", "max") if how in ("average", "cubic") and not is_photo else ()
-            )
-            for way in (how, *ends):
-                layer = raster.laid(frame, [1, 2, 3] if is_photo else [1], way)
-                self.layers[raster.argument + f" {way}" * (way in ends)] = layer
+            bands = [1, 2, 3] if is_photo else [1]
+            is_smoothed = how in ("average", "cubic") and not is_photo
+            resamplings = {raster.argument: how}
+            for end in ("min", "max") if is_smoothed else ():
+                resamplings[f"{raster.argument} {end}"] = end
+            for name, resampling in resamplings.items():
+                layer = raster.laid(frame, bands, resampling)
+                self.layers[name] = layer
                 stack.enter_context(layer.warped)
-        self.given = [raster.argument for raster, _ in sources]
+        self.arguments = [raster.argument for raster, _ in sources]
         origins: dict[str, Any] = {
             raster.argument: provenance(raster.name) for raster, _ in sources
         }
@@ -199,59 +202,60 @@ class Survey:
                 name: origins[f"layer {name}"] for name in self.fields
             }
         self.valued: set[str] = set()
-        self.known = []
+        self.is_inside = []
         for offset, count, size in zip(
             offset_m, tiling.cells, extent.size_m, strict=True
         ):
             edges = offset + step * np.arange(-1, count + 2)
-            self.known.append(
-                (edges[:-1] > -SLACK * step) & (edges[1:] < size + SLACK * step)
-            )
+            slack = SLACK * step
+            self.is_inside.append((edges[:-1] > -slack) & (edges[1:] < size + slack))
         self.indices = {
             value: np.nan if name is None else names.index(name)
             for value, name in named.items()
         }
-        self.unlabelled, self.driven = rasters.unlabelled, None
+        self.unlabelled = rasters.unlabelled
+        self.driven = None
         if log is not None:
-            cells_of = (log.places_m - offset_m) / step
-            log = compare_slopes(
-                log, elevation_under(log, self.layers["dem"], *(cells_of - 0.5).T)
-            )
-            log, self.driven = drive_over(
-                log, tiling, *np.floor(cells_of).astype(np.int64).T
-            )
-            self.source["drives"] = about = describe_drives(log, list(shares))
+            positions = (log.places_m - offset_m) / step
+            elevation_m = elevation_under(log, self.layers["dem"], *(positions - 0.5).T)
+            log = compare_slopes(log, elevation_m)
+            cells = np.floor(positions).astype(np.int64)
+            log, self.driven = drive_over(log, tiling, *cells.T)
+            entry = describe_drives(log, list(shares))
+            self.source["drives"] = entry
             self.source["traversability"] = {
-                name: about[name] for name in ("file", "sha256")
+                name: entry[name] for name in ("file", "sha256")
             }
         self.cliff_m = _CLIFF * max(*cell_m, step)
 
     def read(self, run: Run) -> tuple[ndarray, Maps]:
-        """Reads some maps.
+        """Return the inputs of some maps.
 
         Returns:
-            Elevation with one cell of the ground beyond, shape [B, H + 2, W + 2], and
-            by the names in `given` and in `BANDS` what others say, shape [B, K, H, W];
-            NaN where there is nothing.
+            Elevation padded by one cell of the surrounding terrain, shape [B, H + 2, W
+            + 2]; and values by the names in `arguments` and in `BANDS`, each of shape
+            [B, K, H, W]; NaN if missing.
 
         Raises:
-            DatasetError: a raster cannot be read, or holds what it should not.
+            DatasetError: If a raster cannot be read, or contains invalid values.
         """
-        (north, east), (height, width) = self.tiling.stride, self.tiling.shape
-        south, wests = run.row * north, [column * east for column in run.columns]
-        framed = Maps()  # each map by a cell
+        north, east = self.tiling.stride
+        height, width = self.tiling.shape
+        south = run.row * north
+        wests = [column * east for column in run.columns]
+        strip_rows = range(south, south + height)
+        strip_columns = range(wests[0], wests[-1] + width)
+        padded = Maps()  # by one cell around each map
         for name, layer in self.layers.items():
-            strip = layer.read(
-                range(south, south + height), range(wests[0], wests[-1] + width)
-            )
-            framed[name] = np.stack(
+            strip = layer.read(strip_rows, strip_columns)
+            padded[name] = np.stack(
                 [strip[:, :, west - wests[0] :][:, :, : width + 2] for west in wests]
             )
-        rows, columns = self.known
-        for place, west in enumerate(wests):
-            own = {name: maps[place] for name, maps in framed.items()}
-            ends = [own.get(f"dem {end}", own["dem"]) for end in ("min", "max")]
-            low, high = _range("dem", own)
+        rows, columns = self.is_inside
+        for index, west in enumerate(wests):
+            values = {name: maps[index] for name, maps in padded.items()}
+            ends = [values.get(f"dem {end}", values["dem"]) for end in ("min", "max")]
+            low, high = _range("dem", values)
             for odd, heights in zip((low, high), ends, strict=True):
                 if is_missing(self.layers["dem"].raster, odd, heights, self.cliff_m):
                     raise self._out_of_range(
@@ -260,73 +264,64 @@ class Survey:
             declared_m = widest_gap_m(self.cliff_m)
             for value in (0, -1):
                 gap_m = zero_gap_m(ends[0] - value)
-                if gap_m > (
-                    declared_m
-                    if self.layers["dem"].raster.declares_missing
-                    else self.cliff_m
-                ):
+                is_declared = self.layers["dem"].raster.declares_missing
+                if gap_m > (declared_m if is_declared else self.cliff_m):
                     expected = f"elevations of `dem` without a gap next to {value}"
-                    is_sea = gap_m <= declared_m
-                    other = (
-                        f"Where {value} is a height, declare a value that does not "
-                        "occur, such as -9999." * is_sea
-                    )
-                    raise self._out_of_range("dem", expected, low, high, value, other)
-            own["dem"][:, ~rows[south:][: height + 2]] = np.nan
-            own["dem"][:, :, ~columns[west:][: width + 2]] = np.nan
-        if "traversability" in framed:
-            low, high = _range("traversability", framed)
+                    advice = ""
+                    if gap_m <= declared_m:  # perhaps the sea
+                        advice = (
+                            f"Where {value} is a height, declare a value that does not "
+                            "occur, such as -9999."
+                        )
+                    raise self._out_of_range("dem", expected, low, high, value, advice)
+            values["dem"][:, ~rows[south:][: height + 2]] = np.nan
+            values["dem"][:, :, ~columns[west:][: width + 2]] = np.nan
+        if "traversability" in padded:
+            low, high = _range("traversability", padded)
             if low < 0 or high > 1:
                 expected = "values of `traversability` in [0, 1]"
                 raise self._out_of_range(
                     "traversability", expected, low, high, low if low < 0 else high
                 )
         for name, kind in self.fields.items():
-            low, high = _range(f"layer {name}", framed)
-            if low < kind.least or high > kind.most:
+            low, high = _range(f"layer {name}", padded)
+            if low < kind.minimum or high > kind.maximum:
                 expected = (
-                    f"values of `layer {name}` in [{kind.least:g}, {kind.most:g}]"
+                    f"values of `layer {name}` in [{kind.minimum:g}, {kind.maximum:g}]"
                 )
                 raise self._out_of_range(
                     f"layer {name}",
                     expected,
                     low,
                     high,
-                    low if low < kind.least else high,
+                    low if low < kind.minimum else high,
                 )
             if low > high:
                 continue
             self.valued.add(name)
             raster = self.layers[f"layer {name}"].raster
             for odd, end in ((low, "min"), (high, "max")):
-                if is_certain(
-                    raster,
-                    odd,
-                    framed.get(f"layer {name} {end}", framed[f"layer {name}"]),
-                ):
-                    expected = f"values of `layer {name}` without stand-ins"
-                    other = "Where it is a value, declare one that does not occur." * (
-                        not raster.declares_missing
-                    )
-                    raise self._out_of_range(
-                        f"layer {name}", expected, low, high, odd, other
-                    )
-        given = {name: framed[name][:, :, 1:-1, 1:-1] for name in self.given}
-        if "classes" in given:
-            given["classes"] = self._classes(given["classes"])
+                key = f"layer {name}"
+                extremes = padded.get(f"{key} {end}", padded[key])
+                if is_certain(raster, odd, extremes):
+                    expected = f"values of `{key}` without stand-ins"
+                    advice = ""
+                    if not raster.declares_missing:
+                        advice = "Where it is a value, declare one that does not occur."
+                    raise self._out_of_range(key, expected, low, high, odd, advice)
+        inputs = {name: padded[name][:, :, 1:-1, 1:-1] for name in self.arguments}
+        if "classes" in inputs:
+            inputs["classes"] = self._classes(inputs["classes"])
         elif self.unlabelled:
-            given["classes"] = np.full_like(given["dem"], np.nan)
+            inputs["classes"] = np.full_like(inputs["dem"], np.nan)
         if self.driven:
-            strip = self.driven.read(
-                range(south, south + height), range(wests[0], wests[-1] + width)
-            )
+            strip = self.driven.read(strip_rows, strip_columns)
             maps = np.stack(
                 [strip[:, :, west - wests[0] :][:, :, :width] for west in wests]
             )
-            given |= {
-                name: maps[:, place : place + 1] for place, name in enumerate(BANDS)
-            }
-        return framed["dem"][:, 0], given
+            for band, name in enumerate(BANDS):
+                inputs[name] = maps[:, band : band + 1]
+        return padded["dem"][:, 0], inputs
 
     def _out_of_range(
         self,
@@ -335,13 +330,20 @@ class Survey:
         low: float,
         high: float,
         odd: float,
-        other: str = "",
+        advice: str = "",
     ) -> DatasetError:
-        """Return an error that names a value as missing where it looks so, with a
-        command that declares it.
+        """Return an error on invalid values, with a command that corrects them.
+
+        Args:
+            name: argument of the raster.
+            expected: expectation, for the message.
+            low: lowest value of a map.
+            high: highest value of a map.
+            odd: the value that is invalid, perhaps a sentinel.
+            advice: further advice, a sentence.
         """
         raster = self.layers[name].raster
-        said = f"Expected {expected}, got {low:g} to {high:g} in {raster.name}."
+        problem = f"Expected {expected}, got {low:g} to {high:g} in {raster.name}."
         value = raster.raw(odd)
         if odd and not looks_missing(raster, odd):
             scaled = (
@@ -349,7 +351,7 @@ class Survey:
                 f"{raster.name} scaled.tif"
             )
             how = f", from percent so: {scaled}" if name == "traversability" else "."
-            return DatasetError(f"{said} Convert them{how}")
+            return DatasetError(f"{problem} Convert them{how}")
         if raster.file.nodata is None:
             remedy = f"declare it: rio edit-info --nodata {value:.9g} {raster.name}"
             if raster.declares_missing:  # by a mask, which would hide what is declared
@@ -365,10 +367,9 @@ class Survey:
                 f"replace it by what is declared: rio calc '{chosen}' "
                 f"{raster.name} filled.tif"
             )
-        return DatasetError(
-            f"{said} If {value:.9g} stands for missing, "
-            f"{remedy}{other and f'. {other}'}"
-        )
+        if advice:
+            remedy += f". {advice}"
+        return DatasetError(f"{problem} If {value:.9g} stands for missing, {remedy}")
 
     def _classes(self, values: ndarray) -> ndarray:
         indices = np.full_like(values, np.nan)
@@ -377,15 +378,14 @@ class Survey:
         strange = np.setdiff1d(values[~np.isnan(values)], list(self.indices))
         if len(strange):
             name = self.layers["classes"].raster.name
-            few = ", ".join(f"{value:g}" for value in strange[:10]) + (
-                ", …" if len(strange) > 10 else ""
-            )
+            shown = [f"{value:g}" for value in strange[:10]]
+            if len(strange) > 10:
+                shown.append("…")
             raise DatasetError(
-                f"Expected values of `classes` in {sorted(self.indices)}, got [{few}] "
-                f"too in {name}. Name each by "
-                "`class_ids`, null for no label; or, if one stands for missing, "
-                "declare it: "
-                f"rio edit-info --nodata VALUE {name}"
+                f"Expected values of `classes` in {sorted(self.indices)}, got "
+                f"[{', '.join(shown)}] too in {name}. Name each by `class_ids`, null "
+                "for no label; or, if one stands for missing, declare it: rio "
+                f"edit-info --nodata VALUE {name}"
             )
         return indices
 
@@ -393,17 +393,16 @@ class Survey:
 def _check_covers(
     raster: Raster, crs: Any, area: tuple[float, float, float, float], step: float
 ) -> None:
-    """Refuses a raster that does not reach over all maps, but for a cell; within it
-    values may be missing.
+    """Check that a raster covers all maps to within a cell; values may be missing.
 
     Args:
-        raster: of a layer.
-        crs: of the maps.
+        raster: raster of a layer.
+        crs: CRS of the maps.
         area: west, south, east and north end of the maps, in metres.
-        step: cell width of the maps.
+        step: cell width of the maps in metres.
 
     Raises:
-        DatasetError: it lies elsewhere, or covers a part.
+        DatasetError: If it covers only a part, or none.
     """
     with raster.warped(crs) as warped:
         bounds, slack = warped.bounds, max(step, *warped.res)
@@ -414,27 +413,25 @@ def _check_covers(
     if (lacking > slack).any():
         raise DatasetError(
             f"Expected `{raster.argument}` over all of the ground, WEST SOUTH EAST "
-            f"NORTH {ours} in "
-            f"{crs.to_string()[:80]}, got {raster.name} over {theirs}. Take a raster "
-            "that covers it, with a value for "
-            "missing where nothing is known, or cut `dem` out: rio clip DEM part.tif "
-            "--bounds 'WEST SOUTH EAST NORTH'"
+            f"NORTH {ours} in {crs.to_string()[:80]}, got {raster.name} over {theirs}. "
+            "Take a raster that covers it, with a value for missing where nothing is "
+            "known, or cut `dem` out: rio clip DEM part.tif --bounds 'WEST SOUTH EAST "
+            "NORTH'"
         )
 
 
 def _range(name: str, maps: Maps) -> tuple[float, float]:
-    """The least and the greatest value, of what is averaged too."""
+    """Return minimum and maximum, before averaging."""
     low, high = (maps.get(f"{name} {end}", maps[name]) for end in ("min", "max"))
-    least, most = (
-        np.fmin.reduce(low, None, initial=np.inf),
-        np.fmax.reduce(high, None, initial=-np.inf),
-    )
-    return float(least), float(most)
+    minimum = np.fmin.reduce(low, None, initial=np.inf)
+    maximum = np.fmax.reduce(high, None, initial=-np.inf)
+    return float(minimum), float(maximum)
 
 
 def provenance(name: str) -> dict[str, str | None]:
-    """The name of a raster and, of a file, its SHA-256; of an address without what may
-    be secret.
+    """Return the name of a raster, and the SHA-256 of a file.
+
+    Credentials and queries of addresses are removed, since they may be secret.
     """
     path = Path(name)
     if path.is_file():

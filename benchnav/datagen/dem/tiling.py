@@ -1,10 +1,10 @@
-"""How ground is cut into maps, and which of them belong to which split.
+"""Tiling of terrain into maps, and assignment of maps to splits.
 
-Maps are cut from the ground's south-west corner on, a stride apart, and are numbered
-row by row, northward, each row eastward. Splits take strips across the longer side of
-the ground, one each, in the order given. Between two strips lies ground of at least a
-map's width that no map shows, so that maps of different splits neither overlap nor
-touch.
+Maps are cut from the south-west corner of the terrain, a stride apart. Their indices
+run row by row, northward, and eastward within a row. Each split gets one strip across
+the longer side of the terrain, in the order of the splits. Between two strips, terrain
+of at least a map's width is in no map. Maps of different splits therefore neither
+overlap nor touch.
 """
 
 import math
@@ -19,11 +19,17 @@ from benchnav.core.errors import DatasetError, expect
 
 Shape = tuple[int, int]  # along y and along x
 
-SLACK = 1e-3  # of a cell, which arithmetic may be off by
+SLACK = 1e-3  # tolerance of positions, in cells
 
 
 class Run(NamedTuple):
-    """Neighbouring maps of one split: their row of maps, and which of the row."""
+    """Neighbouring maps of one split.
+
+    Args:
+        split: name of the split.
+        row: their row of maps.
+        columns: their indices in the row.
+    """
 
     split: str
     row: int
@@ -37,8 +43,8 @@ class Tiling(NamedTuple):
         shape: cells of a map, (H, W).
         stride: cells from one map to the next, northward and eastward.
         tiles: rows and columns of maps.
-        strips: by split the rows of maps that it takes, or the columns where there are
-            as many or more.
+        strips: rows of maps of each split if there are more rows than columns; else
+            columns.
     """
 
     shape: Shape
@@ -58,50 +64,52 @@ class Tiling(NamedTuple):
 
     @property
     def overlaps(self) -> bool:
-        """Whether neighbouring maps show some of the same ground."""
+        """Whether neighbouring maps overlap."""
         return bool(np.less(self.stride, self.shape).any())
 
     def groups(self, numbers: Sequence[int]) -> np.ndarray:
-        """Finds which maps overlap, directly or by others between them.
+        """Return groups of maps that overlap, directly or through other maps.
 
         Args:
-            numbers: of some maps, as they are numbered in the ground.
+            numbers: indices of some maps in the terrain.
 
         Returns:
-            For each the least number of a map of its group, int64, shape of `numbers`.
+            The lowest index of a map of each map's group, int64, shape of `numbers`.
         """
-        # A map is drawn on every second place of a lattice as a block that reaches to
-        # the last map that it overlaps. So blocks share a place just where maps
-        # overlap, and never touch where they do not.
+        # On a lattice of twice the resolution, draw each map as a block up to the last
+        # map that it overlaps. Blocks intersect exactly if maps overlap, and do not
+        # touch otherwise.
         reach = 2 * np.ceil(np.divide(self.shape, self.stride)).astype(int) - 2
-        own = np.asarray(numbers, dtype=np.int64)
-        corners = tuple(2 * place for place in np.divmod(own, self.tiles[1]))
+        indices = np.asarray(numbers, dtype=np.int64)
+        corners = tuple(2 * index for index in np.divmod(indices, self.tiles[1]))
         drawn = np.zeros(2 * np.array(self.tiles) + reach, dtype=np.uint8)
         drawn[corners] = 1
         drawn = ndimage.maximum_filter(
             drawn, (reach + 1).tolist(), origin=(reach // 2).tolist(), mode="constant"
         )
-        parts = ndimage.label(drawn)[0][corners]
-        _, firsts, inverse = np.unique(parts, return_index=True, return_inverse=True)
-        return own[firsts][inverse]
+        labels = ndimage.label(drawn)[0][corners]
+        _, firsts, inverse = np.unique(labels, return_index=True, return_inverse=True)
+        return indices[firsts][inverse]
 
     def split_of(self, row: np.ndarray, column: np.ndarray) -> np.ndarray:
-        """Which split's maps show cells: index into `strips`, −1 where none do, int64,
-        shape of `row`.
+        """Return the split whose maps contain each cell.
 
         Args:
-            row: of the cells, counted northward.
-            column: counted eastward.
+            row: rows of the cells, counted northward.
+            column: columns of the cells, counted eastward.
+
+        Returns:
+            Index into `strips`, −1 for cells in no map, int64, shape of `row`.
         """
         rows, columns = self.tiles
         side = 0 if rows > columns else 1
-        along, split = (row, column)[side], np.full(np.shape(row), -1)
-        for place, strip in enumerate(self.strips.values()):
-            first, last = (
-                strip.start * self.stride[side],
-                (strip.stop - 1) * self.stride[side] + self.shape[side],
-            )
-            split[(along >= first) & (along < last)] = place
+        along = (row, column)[side]
+        stride = self.stride[side]
+        split = np.full(np.shape(row), -1)
+        for index, strip in enumerate(self.strips.values()):
+            first = strip.start * stride
+            stop = (strip.stop - 1) * stride + self.shape[side]
+            split[(along >= first) & (along < stop)] = index
         for cell, count, stride, size in zip(
             (row, column), self.cells, self.stride, self.shape, strict=True
         ):
@@ -110,34 +118,35 @@ class Tiling(NamedTuple):
 
     @property
     def between(self) -> int:
-        """Number of maps that would lie between the splits, which belong to none."""
+        """Number of omitted maps between the splits."""
         return self.tiles[0] * self.tiles[1] - self.maps
 
-    def runs(self, most: int) -> Iterator[Run]:
-        """Goes through all maps, row by row, at most so many at a time."""
+    def runs(self, max_maps: int) -> Iterator[Run]:
+        """Yield all maps row by row, in runs of up to `max_maps`."""
         rows, columns = self.tiles
         for row in range(rows):
             for split, strip in self.strips.items():
-                own = (
-                    strip if rows <= columns else range(columns if row in strip else 0)
-                )
-                for first in range(own.start, own.stop, most):
-                    yield Run(split, row, range(first, min(first + most, own.stop)))
+                indices = strip
+                if rows > columns:
+                    indices = range(columns if row in strip else 0)
+                for first in range(indices.start, indices.stop, max_maps):
+                    stop = min(first + max_maps, indices.stop)
+                    yield Run(split, row, range(first, stop))
 
 
 def cut(
     cells: Sequence[int], shape: Shape, stride: Shape, shares: Mapping[str, float]
 ) -> Tiling:
-    """Cuts ground into maps and splits.
+    """Return the tiling of terrain into maps and splits.
 
     Args:
-        cells: of the ground, northward and eastward, of at least one map.
+        cells: cells of the terrain, northward and eastward; at least one map.
         shape: cells of a map, (H, W).
         stride: cells from one map to the next, northward and eastward.
-        shares: of the maps, by split.
+        shares: fraction of the maps of each split.
 
     Raises:
-        DatasetError: the ground is too small for so many splits.
+        DatasetError: If the terrain is too small for the number of splits.
     """
     rows, columns = (np.subtract(cells, shape) // stride + 1).tolist()
     side, lines = (0, rows) if rows > columns else (1, columns)
@@ -146,25 +155,23 @@ def cut(
     if usable < len(shares):
         raise DatasetError(
             f"Expected ground for {len(shares)} splits with a map's width between "
-            f"them, got {lines} maps along its "
-            "longer side. Take fewer splits, smaller maps or larger ground."
+            f"them, got {lines} maps along its longer side. Take fewer splits, smaller "
+            "maps or larger ground."
         )
     ends = [0]
-    for place, total in enumerate(accumulate(shares.values()), start=1):
-        # Every split gets a strip, however small its share.
-        ends.append(
-            min(max(round(total * usable), ends[-1] + 1), usable - len(shares) + place)
-        )
-    strips = {
-        split: range(ends[place] + place * gap, ends[place + 1] + place * gap)
-        for place, split in enumerate(shares)
-    }
+    for count, total in enumerate(accumulate(shares.values()), start=1):
+        # Each split gets a strip, even for a small fraction.
+        end = max(round(total * usable), ends[-1] + 1)
+        ends.append(min(end, usable - len(shares) + count))
+    strips = {}
+    for index, split in enumerate(shares):
+        offset = index * gap
+        strips[split] = range(ends[index] + offset, ends[index + 1] + offset)
     return Tiling(shape, stride, (rows, columns), strips)
 
 
 def fewest_cells(shape: Shape, stride: Shape, splits: int) -> list[Shape]:
-    """Return the cells of the smallest grounds for some splits, northward and eastward,
-    each way that strips can lie.
+    """Return the smallest sizes of terrain for some splits, for both strip directions.
 
     Args:
         shape: cells of a map, (H, W).
@@ -180,58 +187,57 @@ def fewest_cells(shape: Shape, stride: Shape, splits: int) -> list[Shape]:
 
 
 def _gap(shape: Shape, stride: Shape, side: int) -> int:
-    """Return the maps between two splits that belong to none, along a side."""
+    """Return the number of omitted maps between two splits, along a side."""
     return math.ceil(2 * shape[side] / stride[side]) - 1
 
 
 def cut_around(
-    places_m: np.ndarray,
-    whole_m: np.ndarray,
+    positions_m: np.ndarray,
+    raster_m: np.ndarray,
     cell_m: np.ndarray,
     shape_m: np.ndarray,
     stride_m: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Cuts ground of whole maps around places, from an edge between cells of the raster
-    on, where there is room.
+    """Return terrain around positions that fits an integer number of maps.
+
+    If there is room, it begins at an edge between cells of the raster. All pairs are
+    northward and eastward, in metres.
 
     Args:
-        places_m: northward and eastward from the raster's south-west corner, shape [N,
-            2].
-        whole_m: size of the raster; as what follows northward and eastward, shape [2].
-        cell_m: size of its cells.
-        shape_m: size of a map.
-        stride_m: from one map to the next.
+        positions_m: positions from the raster's south-west corner, shape [N, 2].
+        raster_m: size of the raster, shape [2].
+        cell_m: size of its cells, shape [2].
+        shape_m: size of a map, shape [2].
+        stride_m: distance from one map to the next, shape [2].
 
     Returns:
-        South-west corner and size of the ground, each of shape [2].
+        South-west corner and size of the terrain, each of shape [2].
     """
-    low_m = np.maximum(places_m.min(axis=0) - cell_m, 0)
-    high_m = np.minimum(places_m.max(axis=0) + cell_m, whole_m)
-    more = np.maximum(np.ceil((high_m - low_m - shape_m) / stride_m - SLACK), 0)
-    size_m = np.minimum(shape_m + more * stride_m, whole_m)
-    edge_m = np.clip((low_m + high_m - size_m) / 2, 0, whole_m - size_m)
+    low_m = np.maximum(positions_m.min(axis=0) - cell_m, 0)
+    high_m = np.minimum(positions_m.max(axis=0) + cell_m, raster_m)
+    n_strides = np.maximum(np.ceil((high_m - low_m - shape_m) / stride_m - SLACK), 0)
+    size_m = np.minimum(shape_m + n_strides * stride_m, raster_m)
+    edge_m = np.clip((low_m + high_m - size_m) / 2, 0, raster_m - size_m)
     return np.floor(edge_m / cell_m + SLACK) * cell_m, size_m
 
 
 def read_shares(text: str) -> dict[str, float]:
-    """Reads splits and their shares of the maps, such as
-    `train:0.7,valid:0.1,test/site:0.2`.
+    """Return splits and fractions from text: `train:0.7,valid:0.1,test/site:0.2`.
 
     Raises:
-        ConfigError: it is not of that form, or the shares do not sum to 1.
+        ConfigError: If it has another form, or the fractions do not sum to 1.
     """
     shares: dict[str, float] = {}
     for part in text.split(","):
-        name, _, share = part.strip().partition(":")
+        name, _, fraction = part.strip().partition(":")
         try:
-            value = float(share or 1)
+            value = float(fraction or 1)
         except ValueError:
             value = math.nan
         expect(
             name and name not in shares and 0 < value <= 1,
             "`splits` such as train:0.7,valid:0.1,test/site:0.2, each name once and "
-            "each share above 0, "
-            f"got {part.strip()!r} in {text!r}.",
+            f"each share above 0, got {part.strip()!r} in {text!r}.",
         )
         shares[name] = value
     total = sum(shares.values())

@@ -29,18 +29,19 @@ _SPELLINGS = {
 
 
 def in_unit(dem: Raster, unit: str) -> tuple[Raster, str]:
-    """Return an elevation model with its unit, and where that comes from, in words.
+    """Return an elevation model with its unit, and the unit's source as text.
 
     Args:
         dem: Elevation model, one band.
-        unit: A name of `UNITS_M`, or metres in a unit as text; if empty, what the
-            raster declares.
+        unit: A name of `UNITS_M`, or metres in a unit as text. If empty, the unit that
+            the raster declares.
 
     Raises:
-        ConfigError: If the unit is neither.
-        DatasetError: If it is empty and the raster is not sure to be in metres.
+        ConfigError: If the unit is invalid.
+        DatasetError: If it is empty and the raster may not be in metres.
     """
-    declared, crs = dem.file.units[0] or "", horizontal(dem.file.crs)
+    declared = dem.file.units[0] or ""
+    crs = horizontal(dem.file.crs)
     if unit:
         try:
             metres = UNITS_M.get(unit) or float(unit)
@@ -78,10 +79,10 @@ def in_unit(dem: Raster, unit: str) -> tuple[Raster, str]:
 
 
 def check_metres(raster: Raster) -> None:
-    """Reject a raster of metres that declares another unit.
+    """Check that a raster of metres does not declare another unit.
 
     Raises:
-        DatasetError: If it does, with a command that converts it.
+        DatasetError: If it does; the message has a command that converts it.
     """
     declared = raster.file.units[0] or ""
     name = _known(declared)
@@ -103,6 +104,6 @@ def check_metres(raster: Raster) -> None:
 
 
 def _known(declared: str) -> str:
-    """Return what `dem_unit` takes for a declared unit; empty where it is unknown."""
+    """Return the value of `dem_unit` for a declared unit; empty if it is unknown."""
     text = declared.strip().lower()
     return next((name for name, words in _SPELLINGS.items() if text in words), "")

@@ -1,6 +1,6 @@
-"""Exports a dataset to a folder, whole or not at all: Parquet files, and what they are.
+"""Atomic export of a dataset to a folder of Parquet files with metadata.
 
-For programs that is Croissant 1.0 metadata (JSON-LD), for hubs and people a card.
+Croissant 1.0 metadata (JSON-LD) describe the files for programs, a card for readers.
 
 Source: Croissant Format Specification 1.0, http://mlcommons.org/croissant/1.0.
 """
@@ -26,7 +26,7 @@ from benchnav.datagen.export.parquet import (
     split_names,
     write_split,
 )
-from benchnav.datagen.files.hdf5 import held
+from benchnav.datagen.files.hdf5 import exclusive_output
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import (
     load_recipe,
@@ -50,12 +50,11 @@ PAPER = """@misc{endo2024benchnav,
 
 Node = dict[str, Any]  # of JSON-LD
 
-# The context that readers of version 1.0 look for, whether or not a term is used.
-_OWN_TERMS = (
+# Readers of version 1.0 expect this context, even if a term is not used.
+_CROISSANT_TERMS = (
     "citeAs column extract field fileProperty fileObject fileSet format includes "
-    "isLiveDataset jsonPath key md5 "
-    "parentField path recordSet references regex repeated replace samplingRate "
-    "separator source subField transform "
+    "isLiveDataset jsonPath key md5 parentField path recordSet references regex "
+    "repeated replace samplingRate separator source subField transform "
     "equivalentProperty"
 )
 _CONTEXT: Node = {
@@ -69,19 +68,19 @@ _CONTEXT: Node = {
     "data": {"@id": "cr:data", "@type": "@json"},
     "examples": {"@id": "cr:examples", "@type": "@json"},
     "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
-    **{term: f"cr:{term}" for term in _OWN_TERMS.split()},
+    **{term: f"cr:{term}" for term in _CROISSANT_TERMS.split()},
 }
 
 
 @dataclass(frozen=True, kw_only=True)
 class Publication:
-    """What a dataset does not know of itself.
+    """Data of a publication that a dataset does not contain.
 
     Args:
         license: name in the SPDX list, such as CC-BY-4.0, or a URL.
-        creator: who made it.
-        url: where it is to be found; empty where it is nowhere yet.
-        date: of publication, YYYY-MM-DD; that of today when empty.
+        creator: person or organisation that created the dataset.
+        url: address of the dataset; empty if it is not published yet.
+        date: date of publication, YYYY-MM-DD. If empty, today.
     """
 
     license: str = "MIT"
@@ -90,7 +89,7 @@ class Publication:
     date: str = ""
 
     def __post_init__(self) -> None:
-        """Checks what programs read."""
+        """Check the values that programs read."""
         from packaging.licenses import (
             InvalidLicenseExpression,
             canonicalize_license_expression,
@@ -102,14 +101,16 @@ class Publication:
             listed = str(canonicalize_license_expression(self.license))
         except InvalidLicenseExpression:
             listed = ""
-        near = f" Did you mean {listed!r}?" if listed not in ("", self.license) else ""
+        advice = ""
+        if listed not in ("", self.license):
+            advice = f" Did you mean {listed!r}?"
         is_listed = listed == self.license and re.fullmatch(
             r"(?!LicenseRef-)[A-Za-z0-9.+-]+", listed
         )
         expect(
             self.is_url or is_listed,
             "`license` as a name of the SPDX list, such as CC-BY-4.0, or a URL, got "
-            f"{self.license!r}.{near}",
+            f"{self.license!r}.{advice}",
         )
         expect(
             _URL.fullmatch(self.url) or not self.url,
@@ -124,17 +125,15 @@ class Publication:
 
     @property
     def is_url(self) -> bool:
-        """Whether the licence is a URL, and no name."""
+        """Whether the licence is a URL instead of a name."""
         return _URL.fullmatch(self.license) is not None
 
     @property
     def license_url(self) -> str:
-        """Where the licence is to be read."""
-        return (
-            self.license
-            if self.is_url
-            else f"https://spdx.org/licenses/{self.license}.html"
-        )
+        """Address of the licence's text."""
+        if self.is_url:
+            return self.license
+        return f"https://spdx.org/licenses/{self.license}.html"
 
 
 def export(
@@ -143,110 +142,101 @@ def export(
     publication: Publication,
     splits: Sequence[str] | None = None,
     fields: Sequence[str] | None = None,
-    maps_a_file: int = 0,
+    maps_per_file: int = 0,
     overwrite: bool = False,
 ) -> Iterator[tuple[int, int]]:
-    """Exports a dataset, yielding (maps done, maps in all) as it goes; to be iterated
-    to the end.
+    """Export a dataset; yield (maps done, total maps). Iterate to the end.
 
     Args:
-        dataset: what to export.
-        out: the folder, which takes its name when it is whole.
-        publication: licence, creator, place and date; without a date that of today.
-        splits: which splits, in the dataset's order; None for all.
-        fields: which of its fields, in their order; None for all.
-        maps_a_file: most maps of a file; 0 for as many as make a file of a few hundred
-            MB at most.
-        overwrite: replace an exported dataset that is there.
+        dataset: dataset to export.
+        out: the folder, which gets this name when it is complete.
+        publication: licence, creator, address and date.
+        splits: names of splits, in the dataset's order; None for all.
+        fields: names of fields, in the dataset's order; None for all.
+        maps_per_file: maximum number of maps of a file; 0 limits files to a few hundred
+            MB.
+        overwrite: whether to replace an exported dataset.
 
     Raises:
-        DatasetError: the dataset is damaged, or `out` cannot be written.
-        ConfigError: no such split or field, or `out` is taken.
+        DatasetError: If the dataset is damaged, or `out` cannot be written.
+        ConfigError: If there is no such split or field, or `out` exists.
     """
     names = split_names(choose("splits", splits, dataset.splits))
     columns = choose("fields", fields, dataset.fields)
-    expect(maps_a_file >= 0, f"`maps_per_file` ≥ 0, got {maps_a_file}.")
+    expect(maps_per_file >= 0, f"`maps_per_file` ≥ 0, got {maps_per_file}.")
     out = out.resolve()
-    done, total = 0, sum(dataset.map_count(split) for split in names)
-    with held(out, overwrite, _foreign), building(out) as folder:
-        (folder / FOLDER).mkdir()
+    done = 0
+    total = sum(dataset.map_count(split) for split in names)
+    with exclusive_output(out, overwrite, _foreign), building(out) as folder:
+        data_folder = folder / FOLDER
+        data_folder.mkdir()
         yield done, total
         for split, name in names.items():
             for maps in write_split(
-                folder / FOLDER, name, dataset, split, columns, maps_a_file
+                data_folder, name, dataset, split, columns, maps_per_file
             ):
                 done += maps
                 yield done, total
-        about = metadata(dataset, names, columns, publication, folder)
-        (folder / METADATA).write_text(
-            json.dumps(about, indent=1, ensure_ascii=False) + "\n"
-        )
+        node = metadata(dataset, names, columns, publication, folder)
+        text = json.dumps(node, indent=1, ensure_ascii=False)
+        (folder / METADATA).write_text(f"{text}\n")
         (folder / CARD).write_text(card(dataset, names, publication))
         take_place(folder, out)
 
 
 def _foreign(out: Path) -> str:
-    return "" if (out / METADATA).is_file() else "is no exported dataset"
+    return "" if (out / METADATA).is_file() else "is not an exported dataset"
 
 
 def is_ours(dataset: TerrainDataset, splits: Iterable[str]) -> bool:
-    """Whether all maps of some splits were made by shipped recipes as they are, but for
-    their seed and splits.
+    """Return whether shipped recipes generated all maps of some splits.
+
+    Only seed and splits may differ from the shipped recipes.
     """
-    used = {
-        part.get("recipe")
-        for split in splits
-        for part in dataset.splits[split]["parts"]
-    }
-    if None in used:  # some were imported
+    parts = [part for split in splits for part in dataset.splits[split]["parts"]]
+    indices = {part.get("recipe") for part in parts}
+    if None in indices:  # some maps were imported
         return False
-    for number in used:
-        recipe = recipe_from_dict(
-            dataset.manifest["recipes"][number], f"in {dataset.path}"
-        )
+    for index in indices:
+        data = dataset.manifest["recipes"][index]
+        recipe = recipe_from_dict(data, f"in {dataset.path}")
         shipped_id = recipe.id.removesuffix(f"-seed{recipe.seed}")
         if shipped_id not in shipped_recipes():
             return False
         shipped = load_recipe(shipped_id)
-        if (
-            replace(recipe, id=shipped.id, seed=shipped.seed, splits=shipped.splits)
-            != shipped
-        ):
+        recipe = replace(
+            recipe, id=shipped.id, seed=shipped.seed, splits=shipped.splits
+        )
+        if recipe != shipped:
             return False
     return True
 
 
 def describe(dataset: TerrainDataset, splits: Collection[str]) -> str:
-    """One sentence or two on what the maps are and where they come from."""
-    grid, maps = dataset.grid, sum(dataset.map_count(split) for split in splits)
+    """Return one or two sentences on the maps and their origin."""
+    grid = dataset.grid
+    maps = sum(dataset.map_count(split) for split in splits)
     generator = dataset.manifest["generator"]
-    parts = [part for split in splits for part in dataset.splits[split]["parts"]]
-    recipes = [
-        dataset.manifest["recipes"][part["recipe"]]
-        for part in parts
-        if "recipe" in part
-    ]
-    origins = sorted(
-        {f"recipe {recipe['id']}, seed {recipe['seed']}" for recipe in recipes}
-    )
-    origins += sorted(
-        {f"file {part['source']['file']}" for part in parts if "source" in part}
-    )
-    units = {name: dataset.fields[name].unit for name in dataset.layer_names}
-    layers = [
-        name if unit == "1" else f"{name} [{unit}]" for name, unit in units.items()
-    ]
-    with_layers = (
-        f"; layers {', '.join(layers)}, NaN where nothing is known" if layers else ""
-    )
+    recipes: set[str] = set()
+    files: set[str] = set()
+    for part in [part for split in splits for part in dataset.splits[split]["parts"]]:
+        if "recipe" in part:
+            recipe = dataset.manifest["recipes"][part["recipe"]]
+            recipes.add(f"recipe {recipe['id']}, seed {recipe['seed']}")
+        if "source" in part:
+            files.add(f"file {part['source']['file']}")
+    origins = "; ".join(sorted(recipes) + sorted(files))
+    layers = []
+    for name in dataset.layer_names:
+        unit = dataset.fields[name].unit
+        layers.append(name if unit == "1" else f"{name} [{unit}]")
+    with_layers = f"; layers {', '.join(layers)}, NaN where missing" if layers else ""
     return (
         f"{maps} maps of off-road terrain, {grid.height} × {grid.width} cells of "
-        f"{grid.resolution_m:g} m: colour "
-        "image, terrain class, elevation, slope, and traversability in [0, 1], of "
-        "which higher is better; with start, "
-        f"goal and reference time{with_layers}. "
-        f"Written by {generator['package']} {generator['version']} from "
-        f"{'; '.join(origins)}."
+        f"{grid.resolution_m:g} m: colour image, terrain class, elevation, slope, and "
+        "traversability in [0, 1] (higher is better); with start, goal and reference "
+        f"time{with_layers}. Written by {generator['package']} {generator['version']} "
+        f"from {origins}."
     )
 
 
@@ -257,19 +247,18 @@ def metadata(
     publication: Publication,
     folder: Path,
 ) -> Node:
-    """Makes the metadata of files that are written.
+    """Return the metadata of exported files.
 
     Args:
-        dataset: what was exported.
-        names: of its splits, as files are called, by their names in the dataset.
-        fields: which fields were exported.
-        publication: licence, creator, place and date.
-        folder: where the files are.
+        dataset: exported dataset.
+        names: names of its splits in names of files, by their names in the dataset.
+        fields: exported fields.
+        publication: licence, creator, address and date.
+        folder: folder of the files.
     """
-    content = hashlib.sha256(
-        ",".join(dataset.splits[split]["digest"] for split in names).encode()
-    )
-    found = re.search(r"-v(\d+)", dataset.id)
+    digests = ",".join(dataset.splits[split]["digest"] for split in names)
+    content = hashlib.sha256(digests.encode())
+    version = re.search(r"-v(\d+)", dataset.id)
     return {
         "@context": _CONTEXT,
         "@type": "sc:Dataset",
@@ -281,7 +270,7 @@ def metadata(
         "url": publication.url or f"urn:sha256:{content.hexdigest()}",
         "datePublished": publication.date
         or datetime.datetime.now(datetime.UTC).date().isoformat(),
-        **({"version": f"{found[1]}.0.0"} if found else {}),
+        **({"version": f"{version[1]}.0.0"} if version else {}),
         "keywords": ["robotics", "off-road navigation", "traversability", "terrain"],
         **({"citeAs": PAPER} if is_ours(dataset, names) else {}),
         "distribution": [
@@ -294,18 +283,14 @@ def metadata(
     }
 
 
-def _node(kind: str, node_id: str, **about: Any) -> Node:
-    """A node of Croissant's own, named by the last part of its id."""
-    return {
-        "@type": f"cr:{kind}",
-        "@id": node_id,
-        "name": node_id.rpartition("/")[2],
-        **about,
-    }
+def _node(kind: str, node_id: str, **properties: Any) -> Node:
+    """Return a node of a Croissant type, named by the last part of its id."""
+    name = node_id.rpartition("/")[2]
+    return {"@type": f"cr:{kind}", "@id": node_id, "name": name, **properties}
 
 
 def _distribution(name: str, folder: Path) -> Iterator[Node]:
-    """The files of a split, and all of them as a set."""
+    """Yield the files of a split, then the set of them."""
     pattern = f"{FOLDER}/{name}-*-of-*.parquet"
     for path in sorted(folder.glob(pattern)):
         yield _node(
@@ -327,19 +312,23 @@ def _distribution(name: str, folder: Path) -> Iterator[Node]:
 def _maps(
     dataset: TerrainDataset, split: str, name: str, fields: Sequence[str]
 ) -> Node:
-    """The rows of a split, and what its columns are."""
+    """Return the record set of a split's maps, with its columns."""
     columns = []
-    for of, field in columns_of(dataset, fields).items():
+    for column, field in columns_of(dataset, fields).items():
         shape = field.entry_shape(*dataset.grid.shape)
-        words = [field.meaning] + ([f"in {field.unit}"] if field.unit != "1" else [])
-        words += [f"nested lists of shape {list(shape)}"] if shape else []
-        about = {
-            "description": "; ".join(words),
+        description = field.meaning
+        if field.unit != "1":
+            description += f"; in {field.unit}"
+        if shape:
+            description += f"; nested lists of shape {list(shape)}"
+        source = {"fileSet": {"@id": f"{name}-files"}, "extract": {"column": column}}
+        properties = {
+            "description": description,
             "dataType": "sc:Float" if "f" in field.dtype else "sc:Integer",
             **({"repeated": True} if shape else {}),
-            "source": {"fileSet": {"@id": f"{name}-files"}, "extract": {"column": of}},
+            "source": source,
         }
-        columns.append(_node("Field", f"{name}/{of}", **about))
+        columns.append(_node("Field", f"{name}/{column}", **properties))
     entry = dataset.splits[split]
     description = (
         f"Split {split}: {entry['maps']} maps of scenario {entry['scenario']}."
@@ -349,11 +338,12 @@ def _maps(
 
 
 def _classes(dataset: TerrainDataset) -> Node:
-    """The class table, whose numbers give the latent traversability of a cell."""
+    """Return the record set of the class table, with parameters of latent functions."""
     rows: list[Node] = []
     layers = [spec.available for spec in dataset.recipe.layers]
-    for number, item in enumerate(dataset.recipe.classes):
-        row = {"id": number, **asdict(item), "colour": f"#{bytes(item.colour).hex()}"}
+    for class_id, item in enumerate(dataset.recipe.classes):
+        colour = f"#{bytes(item.colour).hex()}"
+        row = {"id": class_id, **asdict(item), "colour": colour}
         soft = row.pop("soft") or {}
         row |= {f"soft_{key}": soft.get(key, 0.0) for key in ("weight", "mean", "std")}
         for layer in filter(None, layers):
@@ -367,10 +357,9 @@ def _classes(dataset: TerrainDataset) -> Node:
     fields = [_node("Field", key, dataType=kind) for key, kind in kinds.items()]
     meaning = (
         "Terrain classes. At a slope of ψ degrees traversability is normal with mean "
-        "1 − (scale·10⁻³·ψ^exponent + "
-        "offset), clipped to [0, 1], and standard deviation noise; with probability "
-        "soft_weight it is normal with "
-        "soft_mean and soft_std instead. It is clipped to [0, 1]."
+        "1 − (scale·10⁻³·ψ^exponent + offset), clipped to [0, 1], and standard "
+        "deviation noise; with probability soft_weight it is normal with soft_mean and "
+        "soft_std instead. It is clipped to [0, 1]."
     )
     identity = {"@id": "classes/id"}
     return _node(
@@ -386,13 +375,12 @@ def _classes(dataset: TerrainDataset) -> Node:
 def card(
     dataset: TerrainDataset, names: Mapping[str, str], publication: Publication
 ) -> str:
-    """Writes the card of the exported dataset: Markdown, with what hubs read at its
-    head.
+    """Return the card of an exported dataset: Markdown with front matter for hubs.
 
     Args:
-        dataset: what was exported.
-        names: of its splits, as files are called, by their names in the dataset.
-        publication: licence, creator, place and date.
+        dataset: exported dataset.
+        names: names of its splits in names of files, by their names in the dataset.
+        publication: licence, creator, address and date.
     """
     ours = is_ours(dataset, names)
     title = f"BenchNav {dataset.id}" if ours else dataset.id
@@ -418,9 +406,9 @@ def card(
             f"# {title}\n",
             f"{describe(dataset, names)}\n",
             f"A row is a map; arrays are nested lists. `{METADATA}` describes the "
-            "columns and holds the SHA-256 of",
-            "each file. The metadata of each Parquet file holds the recipes that make "
-            "the maps again.\n",
+            "columns and contains the SHA-256 of",
+            "each file. The metadata of each Parquet file contain the recipes that "
+            "generate the maps.\n",
             "| split here | split of the dataset | maps | digest of the dataset's "
             "maps |\n|---|---|---|---|",
             *rows,

@@ -1,9 +1,8 @@
-"""Maps as rows of Parquet files: a column a field, arrays as nested lists of fixed
-size.
+"""Maps as rows of Parquet files, with a column for each field.
 
-Any reader of Parquet takes them. The values are those of the dataset, bit for bit; NaN
-stays NaN and nothing is null. The first column, `map`, is the number of the map in its
-split. Letters in shapes: B maps.
+Arrays are nested lists of fixed size. The values are those of the dataset, bit for bit;
+NaN is stored as NaN, and no value is null. The first column, `map`, is the index of the
+map in its split. Letters in shapes: B maps.
 """
 
 import json
@@ -22,25 +21,24 @@ from benchnav.datagen.files.reader import TerrainDataset
 
 MAP = "map"
 FOLDER = "data"
-CELLS_A_FILE = 2**25
-_CELLS_A_ROW_GROUP = 2**20
+CELLS_PER_FILE = 2**25
+_CELLS_PER_ROW_GROUP = 2**20
 
 
 def split_names(splits: Iterable[str]) -> dict[str, str]:
-    """Gives splits names that readers allow, of letters, digits and `_`: `test/std` is
-    `test_std`.
+    """Return names of splits of letters, digits and `_`: `test/std` is `test_std`.
 
     Raises:
-        DatasetError: two of them would have one name.
+        DatasetError: If two splits have the same name.
     """
     names = {split: re.sub(r"\W", "_", split, flags=re.ASCII) for split in splits}
     for split, name in names.items():
-        alike = [other for other in names if names[other] == name]
-        if len(alike) > 1:
+        same = [candidate for candidate in names if names[candidate] == name]
+        if len(same) > 1:
             raise DatasetError(
                 "Expected splits that differ in letters and digits, got "
-                f"{' and '.join(alike)}, both {name!r} "
-                f"in Parquet. Export them apart, with `splits` [{split}]."
+                f"{' and '.join(same)}, both {name!r} in Parquet. Export them "
+                f"separately, with `splits` [{split}]."
             )
     return names
 
@@ -48,7 +46,7 @@ def split_names(splits: Iterable[str]) -> dict[str, str]:
 def columns_of(
     dataset: TerrainDataset, fields: Iterable[str]
 ) -> dict[str, schema.Field]:
-    """The columns of a split: the number of the map, and some of the dataset's fields."""
+    """Return the columns of a split: the index of the map, and some fields."""
     columns = {
         MAP: schema.Field("<i8", (), "1", 0, np.inf, "number of the map in its split")
     }
@@ -58,16 +56,18 @@ def columns_of(
 def table_schema(
     dataset: TerrainDataset, split: str, fields: Sequence[str]
 ) -> pa.Schema:
-    """The columns of a split, with shape, unit and meaning of each, and the dataset's
-    recipes, as metadata.
+    """Return the schema of a split's table.
+
+    Metadata are shape, unit and meaning of each column, and the dataset's recipes.
 
     Args:
-        dataset: where the split is.
-        split: its name there.
-        fields: which fields, in the order of the columns.
+        dataset: dataset of the split.
+        split: name of the split.
+        fields: names of fields, in the order of the columns.
     """
-    manifest, entry = dataset.manifest, dataset.splits[split]
-    about = {
+    manifest = dataset.manifest
+    entry = dataset.splits[split]
+    metadata = {
         "format": schema.FORMAT,
         "id": dataset.id,
         "generator": manifest["generator"],
@@ -80,19 +80,17 @@ def table_schema(
     }
     columns = []
     for name, field in columns_of(dataset, fields).items():
-        kind, shape = (
-            pa.from_numpy_dtype(np.dtype(field.dtype)),
-            field.entry_shape(*dataset.grid.shape),
-        )
+        shape = field.entry_shape(*dataset.grid.shape)
+        kind = pa.from_numpy_dtype(np.dtype(field.dtype))
         for size in reversed(shape):
             kind = pa.list_(pa.field("element", kind, False), size)
-        words = {
+        column_metadata = {
             "shape": json.dumps(list(shape)),
             "unit": field.unit,
             "meaning": field.meaning,
         }
-        columns.append(pa.field(name, kind, False, words))
-    return pa.schema(columns, {"benchnav": json.dumps(about)})
+        columns.append(pa.field(name, kind, False, column_metadata))
+    return pa.schema(columns, {"benchnav": json.dumps(metadata)})
 
 
 def write_split(
@@ -101,34 +99,33 @@ def write_split(
     dataset: TerrainDataset,
     split: str,
     fields: Sequence[str],
-    maps_a_file: int,
+    maps_per_file: int,
 ) -> Iterator[int]:
-    """Writes a split as one file or several, some maps at a time.
+    """Write a split to one or more files, in chunks.
 
     Args:
-        folder: where to.
-        name: of the split, as files are called.
-        dataset: where the split is.
-        split: its name there.
-        fields: which fields, in the order of the columns.
-        maps_a_file: most maps of a file; 0 for as many as `CELLS_A_FILE` allow.
+        folder: folder of the files.
+        name: name of the split in names of files.
+        dataset: dataset of the split.
+        split: name of the split in the dataset.
+        fields: names of fields, in the order of the columns.
+        maps_per_file: maximum number of maps of a file; 0 for the number that
+            `CELLS_PER_FILE` allows.
 
     Yields:
-        How many maps were written in each step.
+        Number of maps written in each step.
     """
-    most = maps_a_file or dataset.grid.maps_in(CELLS_A_FILE)
-    step = dataset.grid.maps_in(_CELLS_A_ROW_GROUP)
-    every, columns = (
-        range(dataset.map_count(split)),
-        table_schema(dataset, split, fields),
-    )
-    files = -(-len(every) // most)
-    for number in range(files):
-        own = every[number * most :][:most]
-        path = folder / f"{name}-{number:05d}-of-{files:05d}.parquet"
+    maximum = maps_per_file or dataset.grid.maps_in(CELLS_PER_FILE)
+    step = dataset.grid.maps_in(_CELLS_PER_ROW_GROUP)
+    n_maps = dataset.map_count(split)
+    columns = table_schema(dataset, split, fields)
+    n_files = -(-n_maps // maximum)
+    for number in range(n_files):
+        indices = range(n_maps)[number * maximum :][:maximum]
+        path = folder / f"{name}-{number:05d}-of-{n_files:05d}.parquet"
         with pq.ParquetWriter(path, columns, compression="zstd") as writer:
-            for place in range(0, len(own), step):
-                rows = own[place : place + step]
+            for start in range(0, len(indices), step):
+                rows = indices[start : start + step]
                 maps = {MAP: np.array(rows), **dataset.read(split, rows, fields)}
                 arrays = [
                     _nested_array(maps[column.name], column.type) for column in columns
@@ -138,7 +135,7 @@ def write_split(
 
 
 def _nested_array(values: np.ndarray, kind: pa.DataType) -> pa.Array:
-    """Lists within lists, of values of shape [B, *entry shape]."""
+    """Return nested lists of values of shape [B, *entry shape]."""
     if not pa.types.is_fixed_size_list(kind):
         return pa.array(np.ascontiguousarray(values))
     inner = _nested_array(values.reshape(-1, *values.shape[2:]), kind.value_type)

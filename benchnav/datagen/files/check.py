@@ -1,6 +1,4 @@
-"""Checks a whole dataset: schema, per-chunk checksums, entry digests, ranges, split
-digests.
-"""
+"""Complete check of a dataset: schema, checksums, entry digests, ranges, digests."""
 
 from collections.abc import Collection, Iterator
 from contextlib import suppress
@@ -21,14 +19,14 @@ _MISSING = "is missing or cannot be opened"
 
 
 class Fault(NamedTuple):
-    """Something wrong with a dataset.
+    """Fault of a dataset.
 
     Args:
-        split: where it is.
-        map: which map; −1 where it is not one map.
-        field: which array of the split; empty where it is none of them.
-        problem: what is wrong with it.
-        file: name of the shard that holds it; empty where the dataset is one file.
+        split: name of the split.
+        map: index of the map; −1 if the fault is not of one map.
+        field: array of the split; empty if the fault is not of one array.
+        problem: description of the fault.
+        file: name of the shard; empty if the dataset is one file.
     """
 
     split: str
@@ -38,16 +36,16 @@ class Fault(NamedTuple):
     file: str = ""
 
     def __str__(self) -> str:
-        """One line."""
+        """Return the fault in one line."""
         return next(summarise([self]))
 
 
 def summarise(faults: list[Fault]) -> Iterator[str]:
-    """Writes a line a fault, consecutive maps with the same fault in one."""
+    """Yield a line for each fault; consecutive maps with the same fault share one."""
 
     def run_of(item: tuple[int, Fault]) -> Fault:
-        place, fault = item
-        return fault._replace(map=fault.map - place)
+        position, fault = item
+        return fault._replace(map=fault.map - position)
 
     order = sorted(faults, key=attrgetter("split", "field", "problem", "file", "map"))
     for _, items in groupby(enumerate(order), run_of):
@@ -55,104 +53,96 @@ def summarise(faults: list[Fault]) -> Iterator[str]:
         maps = f"map {first.map}" if first.map >= 0 else ""
         if others:
             maps = f"maps {first.map}–{first.map + len(others)}"
-        problem = (
-            f"field {first.field!r} {first.problem}" if first.field else first.problem
-        )
-        where = f" ({first.file})" if first.file else ""
-        yield ": ".join(word for word in (first.split, maps, problem) if word) + where
+        field = f"field {first.field!r} " if first.field else ""
+        file = f" ({first.file})" if first.file else ""
+        parts = (first.split, maps, f"{field}{first.problem}")
+        yield ": ".join(filter(None, parts)) + file
 
 
 def find_faults(path: str | Path) -> list[Fault]:
-    """Reads everything in a dataset and names what is wrong.
+    """Read a complete dataset and return its faults.
 
     Args:
         path: the file or folder.
 
     Returns:
-        The faults, every damaged map and field among them; empty when the file is
-        sound.
+        All faults, including each damaged map and field; empty if the dataset is sound.
 
     Raises:
-        DatasetError: the file or its manifest cannot be read at all.
+        DatasetError: If the file or its manifest cannot be read.
     """
     dataset = TerrainDataset(path)
-    return [
-        Fault(split, *about)
-        for split in dataset.splits
-        for about in _split_faults(dataset, split)
-    ]
+    faults: list[Fault] = []
+    for split in dataset.splits:
+        faults += [Fault(split, *fault) for fault in _split_faults(dataset, split)]
+    return faults
 
 
 def _split_faults(
     dataset: TerrainDataset, split: str
 ) -> Iterator[tuple[int, str, str, str]]:
-    """The faults of a split: map, field, problem and file of each."""
+    """Yield map, field, problem and file of each fault of a split."""
     fields = list(dataset.fields)
-    stored = np.ma.masked_all(
-        (dataset.map_count(split), len(fields), schema.DIGEST_BYTES), np.uint8
-    )
+    shape = (dataset.map_count(split), len(fields), schema.DIGEST_BYTES)
+    stored = np.ma.masked_all(shape, np.uint8)
     computed = stored.copy()
     files: list[str] = []  # of each map
     for piece in dataset.pieces[split]:
-        own = piece.path.name if piece.path != dataset.path else ""
-        files += [own] * piece.maps
+        shard = piece.path.name if piece.path != dataset.path else ""
+        files += [shard] * piece.maps
         try:
             file = open_file(piece.path)
         except DatasetError:
-            yield -1, "", _MISSING, own
+            yield -1, "", _MISSING, shard
             continue
         with file:
             for name in (*fields, schema.ENTRY_DIGESTS):
                 try:
                     array = dataset.stored_array(file, split, name, piece.maps)
                 except (*READ_ERRORS, TypeError, AttributeError) as error:
-                    is_other = type(error) is ValueError
-                    yield (
-                        -1,
-                        name,
-                        str(error).removeprefix("it ") if is_other else _MISSING,
-                        own,
-                    )
+                    problem = _MISSING
+                    if type(error) is ValueError:
+                        problem = str(error).removeprefix("it ")
+                    yield -1, name, problem, shard
                     continue
-                for place, values in _read_some(array):
-                    first = piece.first + place
+                for start, values in _read_some(array):
+                    first = piece.first + start
                     if values is None:
-                        yield first, name, "is damaged", own
+                        yield first, name, "is damaged", shard
                         continue
                     maps = slice(first, first + len(values))
                     if name == schema.ENTRY_DIGESTS:
                         stored[maps] = values
                         continue
                     for index in _out_of_range(dataset, split, name, values):
-                        yield first + index, name, "is out of range", own
+                        yield first + index, name, "is out of range", shard
                     digests = schema.entry_digests(
                         {name: values}, {name: dataset.fields[name]}
                     )
                     computed[maps, fields.index(name)] = digests[:, 0]
             for name in _damaged_scales(file, split, (*fields, schema.ENTRY_DIGESTS)):
-                yield -1, name, "is damaged", own
+                yield -1, name, "is damaged", shard
     is_readable = not np.ma.is_masked(computed)
-    unlike = (computed != stored).filled(False).any(axis=2)
+    differs = (computed != stored).filled(False).any(axis=2)
     digest = schema.split_digest(computed.data, *dataset.grid.shape, dataset.fields)
     if is_readable and digest == dataset.splits[split]["digest"]:
-        # The maps are what the manifest says, so it is the digests beside them that
-        # differ.
-        for index in np.flatnonzero(unlike.any(axis=1)).tolist():
+        # The maps match the manifest, so the stored digests are damaged.
+        for index in np.flatnonzero(differs.any(axis=1)).tolist():
             yield index, schema.ENTRY_DIGESTS, "does not match the map", files[index]
         return
-    for index, column in np.argwhere(unlike).tolist():
+    for index, column in np.argwhere(differs).tolist():
         yield index, fields[column], "does not match its digest", files[index]
-    if is_readable and not unlike.any():
+    if is_readable and not differs.any():
         yield -1, "", "the maps do not match the digest in the manifest", ""
 
 
 def _damaged_scales(
-    file: h5py.File, split: str, known: Collection[str]
+    file: h5py.File, split: str, names: Collection[str]
 ) -> Iterator[str]:
-    """Name what else lies in a split, such as dimension scales, and cannot be read."""
+    """Yield unreadable arrays of a split besides `names`, such as dimension scales."""
     others: list[str] = []
     with suppress(*READ_ERRORS):
-        others = sorted(set(file[split]) - set(known))
+        others = sorted(set(file[split]) - set(names))
     for name in others:
         try:
             file[split][name][()]
@@ -161,8 +151,9 @@ def _damaged_scales(
 
 
 def _read_some(array: h5py.Dataset) -> Iterator[tuple[int, np.ndarray | None]]:
-    """Reads some maps at a time, from the first given on; each one, or None, of those
-    that cannot be read together.
+    """Yield chunks of maps with the index of the first map.
+
+    Maps of a damaged chunk are read one by one; None is a damaged map.
     """
     step = max(1, CHUNK_CELLS * len(array) // max(1, array.size))
     for start in range(0, len(array), step):
@@ -179,15 +170,15 @@ def _read_some(array: h5py.Dataset) -> Iterator[tuple[int, np.ndarray | None]]:
 def _out_of_range(
     dataset: TerrainDataset, split: str, name: str, values: np.ndarray
 ) -> list[int]:
-    """Which maps have a value that may not be."""
+    """Return the indices of maps with an invalid value."""
     field = dataset.fields[name]
-    most = len(dataset.recipe.classes) - 1 if name == "class_id" else field.most
-    allowed = (values >= field.least) & (values <= most)
+    maximum = len(dataset.recipe.classes) - 1 if name == "class_id" else field.maximum
+    is_valid = (values >= field.minimum) & (values <= maximum)
     if name == "class_id" and schema.has_unlabelled(dataset.splits[split]):
-        allowed |= values == schema.UNLABELLED
-    # Not asked for; not observed; of one row; what a field that is not ours means by
-    # it, it may mean.
-    gaps = ("reference_time_s", "traversability", "drive_std")
-    if name in gaps or name not in (*schema.KNOWN, *schema.TRUTH):
-        allowed |= np.isnan(values)
-    return np.flatnonzero(~allowed.reshape(len(values), -1).all(axis=1)).tolist()
+        is_valid |= values == schema.UNLABELLED
+    # NaN is a time that was not requested, unobserved λ, or a std of one row. Fields
+    # that this package does not define may contain NaN.
+    may_be_nan = ("reference_time_s", "traversability", "drive_std")
+    if name in may_be_nan or name not in (*schema.KNOWN, *schema.TRUTH):
+        is_valid |= np.isnan(values)
+    return np.flatnonzero(~is_valid.reshape(len(values), -1).all(axis=1)).tolist()

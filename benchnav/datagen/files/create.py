@@ -1,10 +1,10 @@
-"""Making datasets: shard by shard, in parallel, gone on with after a kill.
+"""Creation of datasets: shard by shard, in parallel, resumed after an interruption.
 
-A shard is a pure function of the recipe and of which maps it holds, so that any process
-on any machine may make it, and one that is lost is made anew. A dataset of one file is
-made in the folder `.NAME.partial` beside it, whose shards are joined at the end. One of
-many files is made where it is to be, and is finished when its manifest is written;
-where it replaces a finished one it is made in such a folder too.
+A shard is a pure function of the recipe and of its maps' indices. Any process on any
+machine may generate it, and lost shards are generated again. A dataset of one file is
+built in the folder `.NAME.partial` next to it, whose shards are joined at the end. A
+dataset of many files is built in its final folder, and is finished when its manifest is
+written. If it replaces a finished dataset, it is built in a folder `.NAME.partial` too.
 """
 
 import platform
@@ -23,12 +23,12 @@ from benchnav.core.workers import run_calls
 from benchnav.datagen.files.hdf5 import (
     ShardFile,
     assemble,
-    check_place,
+    check_output,
+    contents_of_recipe,
     is_one_file,
     named_errors,
     pack,
     recipe_entry,
-    whole,
 )
 from benchnav.datagen.files.manifest import FOLDER_MANIFEST, read_manifest
 from benchnav.datagen.recipe.recipe import Recipe
@@ -46,28 +46,26 @@ def create(
     overwrite: bool = False,
     shard_cells: int = SHARD_CELLS,
 ) -> Iterator[tuple[int, int]]:
-    """Makes a dataset, yielding (maps done, maps in all) as it goes; to be iterated to
-    the end.
+    """Create a dataset; yield (maps done, total maps). Iterate to the end.
 
-    What comes first is told before anything is made: the maps that are there already,
-    and those in all.
+    The first pair is yielded before any map is generated: it counts existing maps.
 
     Args:
-        recipe: what to make.
+        recipe: recipe of the dataset.
         path: file to write, of suffix `.h5` or `.hdf5`; else a folder.
-        jobs: processes to make maps in.
-        scheduler: address of a Dask cluster's scheduler, whose workers take their
-            place; empty for none.
-        shard: which of the shards are made here; None for all.
-        overwrite: replace what is there.
-        shard_cells: cells of a shard; of a single file it changes nothing.
+        jobs: number of processes that generate maps.
+        scheduler: address of a Dask cluster's scheduler, whose workers replace the
+            processes; empty for no cluster.
+        shard: part of the shards to generate; None for all.
+        overwrite: whether to replace an existing dataset.
+        shard_cells: cells of a shard; a single file does not depend on it.
 
     Raises:
-        DatasetError: it cannot be written, or workers have another version of this
+        DatasetError: If it cannot be written, or workers have another version of this
             package.
-        ConfigError: the recipe cannot be met, `out` is taken, or the cluster cannot be
-            reached.
-        BenchnavError: another run is writing it, a worker was killed, or the cluster
+        ConfigError: If the recipe yields no valid maps, `out` exists, or the cluster
+            cannot be reached.
+        BenchnavError: If another run is writing it, a worker was killed, or the cluster
             was lost.
     """
     path = real_place(path)
@@ -83,75 +81,81 @@ def create(
         for split, spec in recipe.splits.items()
         for first in range(0, spec.maps, size)
     ]
-    own = shards if shard is None else shards[shard.index - 1 :: shard.of]
-    # Of a folder several shards may be made at once, each by one process.
-    held = path.with_name(f"{path.name}.{shard.index}-of-{shard.of}") if shard else path
+    requested = shards
+    locked = path
+    if shard is not None:
+        # Several processes may write to a folder, each its own part of the shards.
+        requested = shards[shard.index - 1 :: shard.of]
+        locked = path.with_name(f"{path.name}.{shard.index}-of-{shard.of}")
     with (
         named_errors(path),
         sole_writer(path, str(path), shared=True) if shard else nullcontext(),
-        sole_writer(held, str(path)),
+        sole_writer(locked, str(path)),
     ):
         restore(path)
-        # Of a folder, shards of this recipe are gone on with.
-        check_place(
-            path, overwrite or not is_one_file(path), [file.name for file in shards]
-        )
+        # Shards of this recipe in a folder are resumed.
+        names = [file.name for file in shards]
+        check_output(path, overwrite or not is_one_file(path), names)
         folder = path
         if is_one_file(path) or (overwrite and (path / FOLDER_MANIFEST).exists()):
             expect(
                 shard is None,
-                f"no finished dataset in place of a shard, got {path}. Remove it "
+                f"no finished dataset where a shard is made, got {path}. Remove it "
                 "first.",
             )
             folder = path.with_name(f".{path.name}.partial")
         folder.mkdir(parents=True, exist_ok=True)
-        missing = _missing(
-            folder, recipe, shards, own, may_replace=overwrite or folder != path
-        )
+        may_replace = overwrite or folder != path
+        missing = _missing(folder, recipe, shards, requested, may_replace=may_replace)
         manifest = folder / FOLDER_MANIFEST
         if manifest.exists() and not missing:
-            check_place(path, overwrite)
-        manifest.unlink(missing_ok=True)  # until what was lost is there again
-        total = sum(shard.maps for shard in own)
-        begun = done = total - sum(shard.maps for shard in missing)
+            check_output(path, overwrite)
+        manifest.unlink(missing_ok=True)  # until lost shards are complete again
+        total = sum(file.maps for file in requested)
+        n_existing = total - sum(file.maps for file in missing)
+        done = n_existing
         yield done, total
+        version = benchnav.__version__
         try:
-            calls = [
-                partial(make, recipe, file, benchnav.__version__) for file in missing
-            ]
+            calls = [partial(make_shard, recipe, file, version) for file in missing]
             for file, content in run_calls(calls, jobs, scheduler):
                 with replacing(folder / file.name) as unfinished:
                     unfinished.write_bytes(content)
                 done += file.maps
                 yield done, total
         except ConfigError:
-            # Where this run made maps the recipe cannot be met, and there is nothing to
-            # go on to.
-            if folder != path and (done > begun or not any(folder.iterdir())):
+            # If this run generated maps, the recipe itself fails: nothing can be
+            # resumed.
+            if folder != path and (done > n_existing or not any(folder.iterdir())):
                 shutil.rmtree(folder, ignore_errors=True)
             raise
         if shard is None or not _missing(
             folder, recipe, shards, (), may_replace=overwrite
         ):
-            files = {
-                name: [folder / shard.name for shard in shards if shard.split == name]
-                for name in recipe.splits
-            }
-            contents = whole(recipe, files)
-            assemble(contents, folder, path)
+            files: dict[str, list[Path]] = {name: [] for name in recipe.splits}
+            for file in shards:
+                files[file.split].append(folder / file.name)
+            assemble(contents_of_recipe(recipe, files), folder, path)
             if is_one_file(path):
                 shutil.rmtree(folder)
 
 
-def make(recipe: Recipe, shard: ShardFile, version: str) -> tuple[ShardFile, bytes]:
-    """Makes a shard, perhaps in a process on another machine.
+def make_shard(
+    recipe: Recipe, shard: ShardFile, version: str
+) -> tuple[ShardFile, bytes]:
+    """Generate a shard, perhaps in a process on another machine.
+
+    Args:
+        recipe: recipe of the maps.
+        shard: the shard.
+        version: expected version of this package.
 
     Returns:
-        The shard, and what its file holds.
+        The shard, and the bytes of its file.
 
     Raises:
-        DatasetError: another version of this package is installed there.
-        ConfigError: the recipe cannot be met.
+        DatasetError: If another version of this package is installed there.
+        ConfigError: If the recipe yields no valid maps.
     """
     if benchnav.__version__ != version:
         raise DatasetError(
@@ -159,13 +163,12 @@ def make(recipe: Recipe, shard: ShardFile, version: str) -> tuple[ShardFile, byt
             f"with {benchnav.__version__}."
         )
     maps = generate(recipe, shard.split, np.arange(shard.first, shard.stop))
-    return shard, pack(
-        recipe, shard.split, recipe_entry(recipe, shard), maps, recipe.fields
-    )
+    entry = recipe_entry(recipe, shard)
+    return shard, pack(recipe, shard.split, entry, maps, recipe.fields)
 
 
-def is_there(path: Path, recipe: Recipe, shard: ShardFile) -> bool:
-    """Tells whether a file is this shard of this recipe, made by this version."""
+def is_current(path: Path, recipe: Recipe, shard: ShardFile) -> bool:
+    """Return whether a file is this shard of this recipe, made by this version."""
     try:
         manifest = read_manifest(path)
     except DatasetError:
@@ -182,50 +185,54 @@ def _missing(
     folder: Path,
     recipe: Recipe,
     shards: Sequence[ShardFile],
-    own: Sequence[ShardFile],
+    requested: Sequence[ShardFile],
     may_replace: bool,
 ) -> list[ShardFile]:
-    """Which shards are not there; of another recipe, cut or version those that `own`
-    replaces are removed.
+    """Return missing shards, and remove outdated files that they replace.
+
+    Outdated files are of another recipe, shard size or version.
 
     Args:
-        folder: where they are made.
-        recipe: what is made.
-        shards: all of them.
-        own: those that are to be made here; none to ask for all.
-        may_replace: whether others may be there.
+        folder: folder of the shards.
+        recipe: recipe of the dataset.
+        shards: all shards of the dataset.
+        requested: shards to generate here; if empty, all are checked, and no file is
+            removed.
+        may_replace: whether outdated files are allowed.
 
     Raises:
-        ConfigError: there are others, and they may not be.
+        ConfigError: If there are outdated files, and they are not allowed.
     """
-    known = {shard.name: shard for shard in shards}
-    every = sorted(folder.glob("*.h5"))
-    there = {
-        file.name
-        for file in every
-        if file.name in known and is_there(file, recipe, known[file.name])
-    }
-    foreign = [file for file in every if file.name not in there]
-    for file in foreign:
+    by_name = {shard.name: shard for shard in shards}
+    current: set[str] = set()
+    outdated: list[Path] = []
+    for file in sorted(folder.glob("*.h5")):
+        shard = by_name.get(file.name)
+        if shard is not None and is_current(file, recipe, shard):
+            current.add(file.name)
+        else:
+            outdated.append(file)
+    for file in outdated:
         expect(
             may_replace,
             f"`out` to be new or to hold shards of one recipe and version, got {file} "
-            "of another. Choose another "
-            "`out`, or pass --overwrite with the recipe, settings and version of the "
-            "other shards.",
+            "of another. Choose another `out`, or pass --overwrite with the recipe, "
+            "settings and version of the other shards.",
         )
-    # Those of other shards are for these to replace; what is half-written of these is
-    # of a killed run.
-    mine = {shard.name for shard in own}
-    half = [
+    requested_names = {shard.name for shard in requested}
+    # Other processes replace their own outdated shards.
+    replaced = [
+        file
+        for file in outdated
+        if file.name in requested_names or file.name not in by_name
+    ]
+    # Partial files of requested shards are left from an interrupted run.
+    partial_files = [
         file
         for file in folder.glob(".*.partial")
-        if any(f".{name}." in file.name for name in mine)
+        if any(f".{name}." in file.name for name in requested_names)
     ]
-    for file in [
-        file
-        for file in foreign
-        if own and (file.name in mine or file.name not in known)
-    ] + half:
-        file.unlink(missing_ok=True)
-    return [shard for shard in own or shards if shard.name not in there]
+    if requested:
+        for file in replaced + partial_files:
+            file.unlink(missing_ok=True)
+    return [shard for shard in requested or shards if shard.name not in current]

@@ -1,7 +1,8 @@
-"""What a dataset holds, as plain data, as tables and, of a new one, as lines."""
+"""Description of a dataset as plain data, as tables and, if it is new, as lines."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict
+from itertools import compress
 from pathlib import Path
 
 from benchnav.core.settings import plain
@@ -20,18 +21,23 @@ _DIGESTS = {
 
 
 def describe(dataset: TerrainDataset) -> schema.Json:
-    """Gathers what `show` shows, ready for JSON."""
-    manifest, recipe = dataset.manifest, dataset.recipe
-    about, stored = plain(recipe) | {"classes": recipe.class_rows}, recipe.to_dict()
-    made_by = (
-        "environments",
-        "stuck_threshold",
-        "synthesis",
-        "places",
-        "correlation_m",
-    )
-    of_vegetation = {
-        name: stored[name] for name in ("vegetation_period_m",) if name in stored
+    """Return the contents of `show` as data for JSON."""
+    manifest = dataset.manifest
+    recipe = dataset.recipe
+    settings = plain(recipe)
+    stored = recipe.to_dict()
+    names = ("environments", "stuck_threshold", "synthesis", "places", "correlation_m")
+    shown = {name: settings[name] for name in names}
+    if "vegetation_period_m" in stored:
+        shown["vegetation_period_m"] = stored["vegetation_period_m"]
+    splits = {
+        name: {
+            **entry,
+            "stored_bytes": _stored_bytes(dataset, name),
+            "truth": dataset.truth_of(name),
+            "recorded_digest": dataset.split_digest(name),
+        }
+        for name, entry in dataset.splits.items()
     }
     return {
         "path": str(dataset.path),
@@ -41,28 +47,20 @@ def describe(dataset: TerrainDataset) -> schema.Json:
         "format_version": manifest["format_version"],
         "generator": manifest["generator"],
         "grid": asdict(dataset.grid),
-        **{name: about[name] for name in made_by},
-        **of_vegetation,
-        "classes": about["classes"],
+        **shown,
+        "classes": recipe.class_rows,
         "drawn_layers": [
             _describe_layer(spec, recipe.classes) for spec in recipe.layers
         ],
-        "splits": {
-            name: {
-                **entry,
-                "stored_bytes": _stored_bytes(dataset, name),
-                "truth": dataset.truth_of(name),
-                "recorded_digest": dataset.split_digest(name),
-            }
-            for name, entry in dataset.splits.items()
-        },
+        "splits": splits,
         "fields": manifest["fields"],
         "recipes": manifest["recipes"],
     }
 
 
 def _stored_bytes(dataset: TerrainDataset, split: str) -> int:
-    total, name = 0, ""
+    total = 0
+    name = ""
     for piece in dataset.pieces[split]:
         with open_file(piece.path) as file:
             try:
@@ -74,46 +72,44 @@ def _stored_bytes(dataset: TerrainDataset, split: str) -> int:
 
 
 def tables(described: schema.Json) -> Iterator[Table | str]:
-    """Lays out what `describe` gathered, for a terminal."""
-    grid, generator = described["grid"], described["generator"]
+    """Yield the lines and tables of `describe`'s data, for a terminal."""
+    grid = described["grid"]
+    generator = described["generator"]
     files = f" in {described['files']} files" if described["files"] > 1 else ""
     yield (
         f"{described['path']}: {described['id']}, format "
-        f"{described['format_version']}, "
-        f"{described['bytes'] / 1e6:.1f} MB{files}, written by {generator['package']} "
-        f"{generator['version']}"
+        f"{described['format_version']}, {described['bytes'] / 1e6:.1f} MB{files}, "
+        f"written by {generator['package']} {generator['version']}"
     )
     yield (
         f"maps of {grid['height']} × {grid['width']} cells of "
-        f"{grid['resolution_m']:g} m, "
-        f"{described['environments']} environments, λ_stuck "
-        f"{described['stuck_threshold']:g}"
+        f"{grid['resolution_m']:g} m, {described['environments']} environments, "
+        f"λ_stuck {described['stuck_threshold']:g}"
     )
-    making, places = f"synthesis {described['synthesis']}", described["places"]
-    if places:
-        making += (
+    generation = f"synthesis {described['synthesis']}"
+    if places := described["places"]:
+        generation += (
             ", start and goal drawn for each map, at least "
-            f"{places['least_distance_m']:g} m apart and "
-            f"{places['margin_m']:g} m from the edges"
+            f"{places['least_distance_m']:g} m apart and {places['margin_m']:g} m from "
+            "the edges"
         )
-    making += "".join(f", {layer['words']}" for layer in described["drawn_layers"])
+    for layer in described["drawn_layers"]:
+        generation += f", {layer['words']}"
     if described["correlation_m"]:
-        making += f", λ correlated over {described['correlation_m']:g} m"
-    yield making
+        generation += f", λ correlated over {described['correlation_m']:g} m"
+    yield generation
+    split_rows = []
+    for name, entry in described["splits"].items():
+        size = f"{entry['stored_bytes'] / 1e6:.1f}"
+        origins = ", ".join(_origin(described, part) for part in entry["parts"])
+        maps = str(entry["maps"])
+        split_rows.append(
+            (name, entry["scenario"], maps, size, entry["truth"], origins)
+        )
     yield Table(
         title="splits",
         headings=("split", "scenario", "maps", "MB", "truth of λ", "made from"),
-        rows=tuple(
-            (
-                name,
-                entry["scenario"],
-                str(entry["maps"]),
-                f"{entry['stored_bytes'] / 1e6:.1f}",
-                entry["truth"],
-                ", ".join(_origin(described, part) for part in entry["parts"]),
-            )
-            for name, entry in described["splits"].items()
-        ),
+        rows=tuple(split_rows),
     )
     fields = schema.read_field_table(described["fields"])
     layers = schema.layer_names(fields)
@@ -140,41 +136,34 @@ def tables(described: schema.Json) -> Iterator[Table | str]:
     columns = {layer["name"]: layer["classes"] for layer in described["drawn_layers"]}
     headings = ["id", "class", "colour", "a", "b", "o", "σ", "soft spots", *columns]
     rows = []
-    for number, item in enumerate(described["classes"]):
+    for class_id, item in enumerate(described["classes"]):
         colour = f"#{bytes(item['colour']).hex()}"
         numbers = [f"{item[key]:g}" for key in ("scale", "exponent", "offset", "noise")]
-        soft = (
-            "{weight:.0%} N({mean:g}, {std:g})".format(**item["soft"])
-            if item["soft"]
-            else ""
-        )
-        drawn = (words[item["name"]] for words in columns.values())
-        rows.append((str(number), item["name"], colour, *numbers, soft, *drawn))
-    # What no class has is left out.
-    shown = [place for place, cells in enumerate(zip(*rows, strict=True)) if any(cells)]
-    title = "classes: f(ψ) = 1 − (a·10⁻³·ψ^b + o)"
+        soft = ""
+        if item["soft"]:
+            soft = "{weight:.0%} N({mean:g}, {std:g})".format(**item["soft"])
+        layer_cells = (texts[item["name"]] for texts in columns.values())
+        rows.append((str(class_id), item["name"], colour, *numbers, soft, *layer_cells))
+    # Empty columns are omitted.
+    filled = [any(column) for column in zip(*rows, strict=True)]
     yield Table(
-        title=title,
-        headings=tuple(headings[place] for place in shown),
-        rows=tuple(tuple(row[place] for place in shown) for row in rows),
+        title="classes: f(ψ) = 1 − (a·10⁻³·ψ^b + o)",
+        headings=tuple(compress(headings, filled)),
+        rows=tuple(tuple(compress(row, filled)) for row in rows),
     )
 
 
 def _describe_layer(spec: LayerSpec, classes: ClassTable) -> schema.Json:
-    """Describe a layer of a recipe; what it is on each class only where its code is
-    here.
-    """
+    """Return the description of a layer; without its code, texts on classes are empty."""
     layer = spec.available
+    names = [item.name for item in classes]
+    texts = [layer.describe_class(name) if layer else "" for name in names]
+    source = f"{spec.source}, digest {spec.digest[:12]}" if spec.source else "benchnav"
     return {
         "name": spec.name,
         "words": spec.words,
-        "source": f"{spec.source}, digest {spec.digest[:12]}"
-        if spec.source
-        else "benchnav",
-        "classes": {
-            item.name: layer.describe_class(item.name) if layer else ""
-            for item in classes
-        },
+        "source": source,
+        "classes": dict(zip(names, texts, strict=True)),
     }
 
 
@@ -186,24 +175,18 @@ def _origin(described: schema.Json, part: schema.Json) -> str:
 
 
 def widest(names: Iterable[str]) -> int:
-    """Characters of the longest of some names, at least 12, so that what follows them
-    stands in one column.
-    """
+    """Return the width of a column of names in characters, at least 12."""
     return max([12, *map(len, names)])
 
 
 def written(path: Path) -> TerrainDataset:
-    """Gives a new dataset and prints where it is, its size, its splits and their
-    digests.
-    """
+    """Return a new dataset, and print its path, size, splits and their digests."""
     from rich.filesize import decimal
 
     dataset = TerrainDataset(path)
-    size, files = (
-        decimal(sum(file.stat().st_size for file in dataset.files)),
-        len(dataset.files),
-    )
-    print(f"wrote {path} ({size}{f' in {files} files' if files > 1 else ''})")
+    size = decimal(sum(file.stat().st_size for file in dataset.files))
+    n_files = len(dataset.files)
+    print(f"wrote {path} ({size}{f' in {n_files} files' if n_files > 1 else ''})")
     wide = widest(dataset.splits)
     for name, split in dataset.splits.items():
         print(f"  {name:{wide}} {split['maps']:6} maps  {split['digest']}")

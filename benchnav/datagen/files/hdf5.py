@@ -1,5 +1,4 @@
-"""Writing datasets (HDF5), whole or not at all: a file, or a folder of such files with
-one manifest.
+"""Atomic writing of datasets: an HDF5 file, or a folder of such files.
 
 HDF5's own filters compress and checksum: byte shuffle, deflate, Fletcher-32. Letters in
 shapes: B maps.
@@ -36,34 +35,31 @@ from benchnav.datagen.recipe.recipe import Recipe
 
 FOLDER_FORMAT_VERSION = "1.2"  # at least
 
-# Structures of HDF5 1.10 carry checksums of their own, so that damage to them is found
-# as well.
+# Structures of HDF5 1.10 have checksums, which detect damage to them.
 _LIBRARY = ("v110", "v110")
 
-_VALUES_A_CHUNK = 1024
-# Room for what is not maps: HDF5's structures, small fields, digests, manifest.
+_VALUES_PER_CHUNK = 1024
+# Space for HDF5's structures, small fields, digests and the manifest.
 _SPARE_BYTES = 1 << 18
-_SPARE_BYTES_A_MAP = 1024
+_SPARE_BYTES_PER_MAP = 1024
 
 _SHARD = re.compile(r".+-\d{8}-\d{8}\.h5")
-_HALF = re.compile(r"\..+\.partial")  # of a shard or of the manifest
+_PARTIAL = re.compile(r"\..+\.partial")  # of a shard or of the manifest
 
-Source = Mapping[
-    str, Any
-]  # stored arrays, or those to be stored, by name, `ENTRY_DIGESTS` among them
+# Arrays by name, stored or to be stored, including `ENTRY_DIGESTS`.
+Source = Mapping[str, Any]
 
 
 class Contents(NamedTuple):
-    """What a dataset is to hold, and the files that hold it.
+    """Contents of a dataset to be written, and the files with its maps.
 
     Args:
         id: name and version of the dataset.
-        recipes: what the splits' parts refer to by number. The first gives grid and
-            class table.
-        splits: by name, the manifest's entry of each split without its digest.
-        files: by split the files that hold its maps, in their order, each under the
-            split's name.
-        fields: what every map has.
+        recipes: recipes, to which parts of splits refer by index. The first determines
+            grid and class table.
+        splits: manifest entry of each split by name, without its digest.
+        files: files with the maps of each split, in order, each under the split's name.
+        fields: fields of each map.
     """
 
     id: str
@@ -73,37 +69,37 @@ class Contents(NamedTuple):
     fields: schema.Fields = schema.FIELDS
 
     def manifest(self, entry_digests: Mapping[str, ndarray]) -> schema.Json:
-        """The manifest, by the digests of all maps' entries, `schema.entry_digests`, of
-        each split.
+        """Return the manifest.
+
+        Args:
+            entry_digests: digests of each split's entries from `schema.entry_digests`.
         """
-        recipes, shape = (
-            [recipe.to_dict() for recipe in self.recipes],
-            self.recipes[0].grid.shape,
-        )
+        recipes = [recipe.to_dict() for recipe in self.recipes]
+        shape = self.recipes[0].grid.shape
+        version = schema.version_of(recipes, self.splits.values(), self.fields)
+        splits = {}
+        for name, entry in self.splits.items():
+            digests = entry_digests[name]
+            digest = schema.split_digest(digests, *shape, self.fields)
+            splits[name] = {**entry, "digest": digest}
         return {
             "format": schema.FORMAT,
-            "format_version": schema.version_of(
-                recipes, self.splits.values(), self.fields
-            ),
+            "format_version": version,
             "id": self.id,
             "generator": {"package": "benchnav", "version": benchnav.__version__},
             "fields": schema.field_table(*shape, self.fields),
-            "splits": {
-                name: {
-                    **entry,
-                    "digest": schema.split_digest(
-                        entry_digests[name], *shape, self.fields
-                    ),
-                }
-                for name, entry in self.splits.items()
-            },
+            "splits": splits,
             "recipes": recipes,
         }
 
 
 class ShardFile(NamedTuple):
-    """Consecutive maps of a recipe's split, in a file that is a dataset by itself: from
-    one on, to before another.
+    """File of consecutive maps of a recipe's split, which is a dataset too.
+
+    Args:
+        split: name of the split.
+        first: index of the first map.
+        stop: index after the last map.
     """
 
     split: str
@@ -121,8 +117,13 @@ class ShardFile(NamedTuple):
         return f"{self.split.replace('/', '+')}-{self.first:08d}-{self.stop:08d}.h5"
 
 
-def whole(recipe: Recipe, files: Mapping[str, Sequence[Path]]) -> Contents:
-    """All maps of a recipe, by split the files that hold them."""
+def contents_of_recipe(recipe: Recipe, files: Mapping[str, Sequence[Path]]) -> Contents:
+    """Return the contents of a dataset of all maps of a recipe.
+
+    Args:
+        recipe: the recipe.
+        files: files with the maps of each split, in order.
+    """
     splits = {
         name: recipe_entry(recipe, ShardFile(name, 0, spec.maps))
         for name, spec in recipe.splits.items()
@@ -131,9 +132,7 @@ def whole(recipe: Recipe, files: Mapping[str, Sequence[Path]]) -> Contents:
 
 
 def recipe_entry(recipe: Recipe, shard: ShardFile) -> schema.Json:
-    """The manifest's entry of consecutive maps of a recipe's split, without their
-    digest.
-    """
+    """Return the manifest entry of a shard's maps, without their digest."""
     part = {"maps": shard.maps, "recipe": 0, "split": shard.split, "first": shard.first}
     return {
         "scenario": recipe.splits[shard.split].scenario,
@@ -145,26 +144,21 @@ def recipe_entry(recipe: Recipe, shard: ShardFile) -> schema.Json:
 def _fill(
     file: h5py.File, contents: Contents, sources: Mapping[str, Iterable[Source]]
 ) -> None:
-    """Fills an empty file with a dataset: with all arrays of each split's sources, end
-    to end.
-    """
+    """Fill an empty file with a dataset: the concatenated arrays of its sources."""
     kinds = schema.stored_arrays(contents.fields, *contents.recipes[0].grid.shape)
-    # Made at first and kept until all is written: HDF5 writes an array out when it is
-    # let go.
-    arrays: dict[str, dict[str, h5py.Dataset]] = {
-        split: {} for split in contents.splits
-    }
-    for split, own in arrays.items():
-        group, maps = file.create_group(split), contents.splits[split]["maps"]
+    # Arrays are referenced until all is written: HDF5 writes an array when it is freed.
+    arrays: dict[str, dict[str, h5py.Dataset]] = {}
+    for split, split_entry in contents.splits.items():
+        arrays[split] = {}
+        group = file.create_group(split)
+        maps = split_entry["maps"]
         for name, (dtype, entry) in kinds.items():
             field = contents.fields.get(name)
-            # Of cells, a map a chunk.
-            chunk = (
-                1
-                if field and "H" in field.shape
-                else max(1, min(maps, _VALUES_A_CHUNK))
-            )
-            own[name] = group.create_dataset(
+            # Fields of cells have one map per chunk.
+            chunk = max(1, min(maps, _VALUES_PER_CHUNK))
+            if field and "H" in field.shape:
+                chunk = 1
+            array = group.create_dataset(
                 name,
                 (maps, *entry),
                 dtype,
@@ -175,42 +169,44 @@ def _fill(
                 fletcher32=True,
             )
             if field:
-                own[name].attrs.update(unit=field.unit, meaning=field.meaning)
+                array.attrs.update(unit=field.unit, meaning=field.meaning)
+            arrays[split][name] = array
         _add_scales(group, contents)
-    for split, several in sources.items():
+    for split, split_sources in sources.items():
         first = 0
-        for source in several:
+        for source in split_sources:
             for name, target in arrays[split].items():
                 _put(source[name], target, first)
             first += len(source[schema.ENTRY_DIGESTS])
-    digests = {split: own[schema.ENTRY_DIGESTS][:] for split, own in arrays.items()}
+    digests = {
+        split: by_name[schema.ENTRY_DIGESTS][:] for split, by_name in arrays.items()
+    }
     text = seal(contents.manifest(digests)).encode()
-    file.create_dataset(
-        schema.MANIFEST, data=text, dtype=h5py.string_dtype("utf-8", len(text))
-    )
+    dtype = h5py.string_dtype("utf-8", len(text))
+    file.create_dataset(schema.MANIFEST, data=text, dtype=dtype)
     file.flush()
 
 
 def _add_scales(group: h5py.Group, contents: Contents) -> None:
-    """Name the dimensions of a split's arrays by HDF5 dimension scales: map_index, y_m,
-    x_m, and axis_N of N others.
+    """Name the dimensions of a split's arrays by HDF5 dimension scales.
+
+    They are map_index, y_m, x_m, and axis_N for other dimensions of length N.
     """
     recipe = contents.recipes[0]
     for name, array in list(group.items()):
-        shape = (
-            contents.fields[name].shape if name in contents.fields else array.shape[1:]
-        )
+        field = contents.fields.get(name)
+        shape = field.shape if field else array.shape[1:]
         labels = ({"H": "y_m", "W": "x_m"}.get(str(n), f"axis_{n}") for n in shape)
-        for at, label in enumerate(("map_index", *labels)):
+        for dimension, label in enumerate(("map_index", *labels)):
             if label in contents.fields:
                 continue
             if label not in group:
-                values = np.arange(array.shape[at])
+                values = np.arange(array.shape[dimension])
                 if label in ("y_m", "x_m"):
                     values = recipe.resolution_m * (values + 0.5)
                 group.create_dataset(label, data=values, fletcher32=True)
                 group[label].make_scale(label)
-            array.dims[at].attach_scale(group[label])
+            array.dims[dimension].attach_scale(group[label])
 
 
 def pack(
@@ -220,15 +216,15 @@ def pack(
     maps: schema.Maps,
     fields: schema.Fields = schema.KNOWN,
 ) -> bytes:
-    """Makes what a file of a few maps of one split holds, in memory.
+    """Return the bytes of a file of a few maps of one split.
 
     Args:
-        recipe: by which they were made, with the dataset's id.
+        recipe: recipe of the maps, with the dataset's id.
         split: name of the split.
-        entry: the manifest's entry of the split without its digest.
-        maps: every field of `schema.FIELDS`, and others that the dataset has, of shape
-            [B, *entry shape].
-        fields: what maps may have; those that they have are stored, in this order.
+        entry: manifest entry of the split without its digest.
+        maps: arrays by field, each of shape [B, *entry shape]: all of `schema.FIELDS`,
+            and others of the dataset.
+        fields: fields that maps may have; those in `maps` are stored, in this order.
     """
     fields = {name: field for name, field in fields.items() if name in maps}
     contents = Contents(recipe.id, [recipe], {split: entry}, fields=fields)
@@ -241,74 +237,74 @@ def pack(
 
 
 def is_one_file(path: Path) -> bool:
-    """Whether a dataset of this name is one file; else it is a folder of shards."""
+    """Return whether a dataset of this name is a file rather than a folder of shards."""
     return path.suffix in (".h5", ".hdf5")
 
 
 def name_of(path: Path) -> str:
-    """What a dataset at a place is called where nobody says."""
+    """Return the default id of a dataset at a path."""
     return path.stem if is_one_file(path) else path.name
 
 
-def check_place(path: Path, overwrite: bool, names: Collection[str] = ()) -> None:
-    """Refuses a place for a dataset that is taken.
+def check_output(path: Path, overwrite: bool, names: Collection[str] = ()) -> None:
+    """Check that a dataset may be written to a path.
 
     Args:
         path: file or folder.
         overwrite: whether a dataset, or any file of this name, may be replaced.
-        names: of shards that are to be made in the folder, which may be damaged.
+        names: names of shards to be made in the folder; existing ones may be damaged.
 
     Raises:
-        ConfigError: it is.
+        ConfigError: If it may not.
     """
     refuse_taken(path, overwrite, partial(foreign_in, names=names))
 
 
 def foreign_in(path: Path, names: Collection[str] = ()) -> str:
-    """Says what of another kind a place holds; a folder may hold shards and their
-    manifest alone.
+    """Return what a path contains other than a dataset; empty if nothing.
+
+    A folder may contain only shards and their manifest.
     """
     if is_one_file(path) or not path.is_dir():
-        return (
-            ""
-            if is_one_file(path) == path.is_file()
-            else f"is a {'folder' if path.is_dir() else 'file'}"
-        )
-    ours = set(names)
-    with suppress(DatasetError):  # a damaged manifest is one where shards lie beside it
-        ours |= {file.name for file in TerrainDataset(path).files}
+        if is_one_file(path) == path.is_file():
+            return ""
+        return f"is a {'folder' if path.is_dir() else 'file'}"
+    expected = set(names)
+    # A damaged manifest counts as a manifest if there are shards next to it.
+    with suppress(DatasetError):
+        expected |= {file.name for file in TerrainDataset(path).files}
     files = sorted(file.name for file in path.iterdir())
-    ours |= {name for name in files if name not in ours and _is_shard(path / name)}
+    unexpected = [name for name in files if name not in expected]
+    expected |= {name for name in unexpected if _is_shard(path / name)}
+    if not expected.isdisjoint(files):
+        expected.add(FOLDER_MANIFEST)
     for name in files:
-        if name not in ours and not (name == FOLDER_MANIFEST and ours & set(files)):
+        if name not in expected:
             return f"holds {name}"
     return ""
 
 
 def _is_shard(file: Path) -> bool:
-    """Tells whether a file is a shard, of whatever dataset, or what is half-written of
-    one.
-    """
+    """Return whether a file is a shard of any dataset, or a partial one."""
+    if _PARTIAL.fullmatch(file.name):
+        return True
     try:
-        return bool(
-            _HALF.fullmatch(file.name)
-            or (_SHARD.fullmatch(file.name) and read_manifest(file))
-        )
+        return bool(_SHARD.fullmatch(file.name) and read_manifest(file))
     except DatasetError:
         return False
 
 
 def assemble(contents: Contents, folder: Path, out: Path) -> None:
-    """Makes a dataset of files, each of which is one by itself.
+    """Assemble a dataset from files that are datasets themselves.
 
     Args:
-        contents: what it holds. For a folder all files lie in `folder`.
-        folder: beside `out`, whose place it takes; or `out` itself. Of a file it
-            changes nothing.
+        contents: its contents. If `out` is a folder, all files lie in `folder`.
+        folder: `out`, or a folder next to it, which replaces it. If `out` is a file,
+            this is not used.
         out: file or folder.
 
     Raises:
-        ConfigError: something else has come to be in the folder that is replaced.
+        ConfigError: If the folder to be replaced now contains anything else.
     """
     if is_one_file(out):
         _join(out, contents)
@@ -319,48 +315,39 @@ def assemble(contents: Contents, folder: Path, out: Path) -> None:
         entries = [source[schema.ENTRY_DIGESTS][:] for source in _opened(split, files)]
         digests[split] = np.concatenate(entries)
         shards[split] = [
-            {"file": path.name, "maps": len(own)}
-            for path, own in zip(files, entries, strict=True)
+            {"file": path.name, "maps": len(file_digests)}
+            for path, file_digests in zip(files, entries, strict=True)
         ]
     manifest = contents.manifest(digests)
     version = max(manifest["format_version"], FOLDER_FORMAT_VERSION)
-    write_text(
-        folder / FOLDER_MANIFEST,
-        seal(manifest | {"format_version": version, "shards": shards}),
-    )
+    manifest |= {"format_version": version, "shards": shards}
+    write_text(folder / FOLDER_MANIFEST, seal(manifest))
     if folder != out:
-        check_place(out, True)  # others may have put something there meanwhile
+        check_output(out, True)  # another program may have written there meanwhile
         take_place(folder, out)
 
 
 def _opened(split: str, files: Iterable[Path]) -> Iterator[h5py.Group]:
-    """What files hold of a split, each open while it is used."""
+    """Yield the group of a split in each file, which is open while it is used."""
     for path in files:
         with open_file(path) as file:
             yield file[split]
 
 
 def _join(path: Path, contents: Contents) -> None:
-    """Writes one file of many."""
-    stored = sum(
-        file.stat().st_size for files in contents.files.values() for file in files
-    )
-    maps = sum(entry["maps"] for entry in contents.splits.values())
+    """Write one file from many."""
+    files = [file for paths in contents.files.values() for file in paths]
+    n_maps = sum(entry["maps"] for entry in contents.splits.values())
+    n_bytes = sum(file.stat().st_size for file in files)
+    n_bytes += _SPARE_BYTES + _SPARE_BYTES_PER_MAP * n_maps
+    sources = {split: _opened(split, paths) for split, paths in contents.files.items()}
     with replacing(path) as unfinished:
         with h5py.File(unfinished, "w", libver=_LIBRARY) as file:
-            # HDF5 crashes if it meets a full disk, so room is taken ahead of it.
+            # HDF5 crashes on a full disk, so space is allocated first.
             if hasattr(os, "posix_fallocate"):
                 with open(unfinished, "rb+") as raw:
-                    os.posix_fallocate(
-                        raw.fileno(),
-                        0,
-                        stored + _SPARE_BYTES + _SPARE_BYTES_A_MAP * maps,
-                    )
-            _fill(
-                file,
-                contents,
-                {split: _opened(split, own) for split, own in contents.files.items()},
-            )
+                    os.posix_fallocate(raw.fileno(), 0, n_bytes)
+            _fill(file, contents, sources)
             size = file.id.get_filesize()
         os.truncate(unfinished, size)
         if path.exists():
@@ -369,27 +356,28 @@ def _join(path: Path, contents: Contents) -> None:
 
 @contextmanager
 def named_errors(path: Path) -> Iterator[None]:
-    """Tells which dataset could not be written.
+    """Convert write errors of a dataset to errors that name it.
 
     Raises:
-        DatasetError: the system, or HDF5, could not write.
+        DatasetError: If the system, or HDF5, could not write.
     """
     try:
         yield
     except (OSError, RuntimeError) as error:
         reason = getattr(error, "strerror", None) or " ".join(str(error).split())
         raise out_of_memory(error) or DatasetError(
-            f"Could not write {path}: {reason}. When that is mended, give the same "
+            f"Could not write {path}: {reason}. Correct this, then run the same "
             "command again."
         ) from error
 
 
 @contextmanager
-def held(
+def exclusive_output(
     out: Path, overwrite: bool, foreign: Callable[[Path], str] = foreign_in
 ) -> Iterator[None]:
-    """Holds the place of what is made whole, for one process; see `refuse_taken` and
-    `named_errors`.
+    """Acquire an output path for one process, after a check; convert write errors.
+
+    See `refuse_taken` and `named_errors`.
     """
     with named_errors(out), sole_writer(out, str(out)):
         restore(out)
@@ -398,14 +386,12 @@ def held(
 
 
 def _put(source: ndarray | h5py.Dataset, target: h5py.Dataset, first: int) -> None:
-    """Writes maps as those from one on; stored ones that are packed alike, a map a
-    chunk, are not unpacked.
+    """Write maps to consecutive indices from `first`.
+
+    Stored maps with the same filters, one per chunk, are copied without decompression.
     """
-    if (
-        target.chunks[0] > 1
-        or isinstance(source, ndarray)
-        or _packing(source) != _packing(target)
-    ):
+    is_copyable = target.chunks[0] <= 1 and not isinstance(source, ndarray)
+    if not is_copyable or _packing(source) != _packing(target):
         target[first : first + len(source)] = source[:]
         return
     within = (0,) * (source.ndim - 1)
@@ -415,9 +401,7 @@ def _put(source: ndarray | h5py.Dataset, target: h5py.Dataset, first: int) -> No
 
 
 def _packing(array: h5py.Dataset) -> tuple[object, ...]:
-    """What has to be alike for a chunk of one array to be one of another; the level of
-    deflate need not be.
-    """
+    """Return what must be equal to copy chunks; the level of deflate may differ."""
     return (
         array.dtype.str,
         array.chunks,

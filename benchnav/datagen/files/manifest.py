@@ -1,6 +1,4 @@
-"""Opens the files of datasets, and reads the manifest of one file or of a folder of
-shards.
-"""
+"""Opening of dataset files, and manifests of files and folders of shards."""
 
 import errno
 import json
@@ -14,62 +12,61 @@ from benchnav.core.store import unseal
 from benchnav.core.touched import note_file
 from benchnav.datagen import schema
 
-_TAKEN = (errno.EAGAIN, errno.EACCES)  # of a file that another program has locked
-# What HDF5 and h5py raise where a file is damaged, by where the damage lies.
+_LOCKED = (errno.EAGAIN, errno.EACCES)  # of a file that another program has locked
+# Errors that HDF5 and h5py raise for damaged files, depending on the damage.
 READ_ERRORS = (OSError, KeyError, RuntimeError, ValueError)
 
-FOLDER_MANIFEST = "manifest.json"  # beside the shards of a finished dataset
+FOLDER_MANIFEST = "manifest.json"  # next to the shards of a finished dataset
 
 
 def is_dataset(path: Path) -> bool:
-    """Whether there is a file, or a folder with the manifest of a finished dataset."""
+    """Return whether a path is a file, or a folder with a finished dataset."""
     return path.is_file() or (path / FOLDER_MANIFEST).is_file()
 
 
 def open_file(path: Path) -> h5py.File:
-    """Opens a file for reading.
+    """Open a file for reading.
 
     Raises:
-        DatasetError: it is not there, is locked, is no HDF5 file, or its structure is
-            damaged.
+        DatasetError: If it does not exist, is locked, is not an HDF5 file, or its
+            structure is damaged.
     """
     try:
         note_file(path)
         return h5py.File(path, "r")
     except FileNotFoundError as error:
         raise DatasetError(
-            f"Expected a dataset file, got {path}, which is not there. "
-            "Make one with `benchnav-datagen create`."
+            f"Expected a dataset file, got {path}, which does not exist. Make one with "
+            "`benchnav-datagen create`."
         ) from error
     except OSError as error:
         if "unable to lock file" in str(error):
-            free = "Close what writes to it."
-            if error.errno not in _TAKEN:
-                free = (
+            remedy = "Close the program that writes to it."
+            if error.errno not in _LOCKED:
+                remedy = (
                     "If its file system cannot lock, set HDF5_USE_FILE_LOCKING=FALSE."
                 )
             raise DatasetError(
-                f"{path} is locked: {os.strerror(error.errno or 0)}. {free}"
+                f"{path} is locked: {os.strerror(error.errno or 0)}. {remedy}"
             ) from error
         raise DatasetError(
-            f"{path} is no readable HDF5 file: {error}. Make it again."
+            f"{path} is not a readable HDF5 file: {error}. Make it again."
         ) from error
 
 
 def read_manifest(path: Path) -> schema.Json:
-    """Reads the manifest of a file or a folder.
+    """Return the checked manifest of a file or a folder.
 
     Raises:
-        DatasetError: there is none, or it is damaged, foreign, or of a newer format.
+        DatasetError: If it is missing, damaged, or of another or a newer format.
     """
     try:
         text = _manifest_text(path)
         manifest = json.loads(text)
-        kind, version = manifest["format"], manifest["format_version"]
-        if (
-            kind == schema.FORMAT
-            and tuple(map(int, version.split("."))) <= schema.FORMAT_VERSION
-        ):
+        kind = manifest["format"]
+        version = manifest["format_version"]
+        numbers = tuple(map(int, version.split("."))) if kind == schema.FORMAT else ()
+        if numbers and numbers <= schema.FORMAT_VERSION:
             manifest = unseal(text)
             schema.check(manifest)
             return manifest
@@ -82,11 +79,10 @@ def read_manifest(path: Path) -> schema.Json:
         raise DatasetError(
             f"Expected format {schema.FORMAT!r} in {path}, got {kind!r}."
         )
+    newest = ".".join(map(str, schema.FORMAT_VERSION))
     raise DatasetError(
-        f"Expected format version at most {'.'.join(map(str, schema.FORMAT_VERSION))} "
-        f"in {path}, "
-        f"got {version}. Read it with a newer benchnav: pip install --upgrade "
-        "benchnav."
+        f"Expected format version at most {newest} in {path}, got {version}. Read it "
+        "with a newer benchnav: pip install --upgrade benchnav."
     )
 
 
@@ -95,9 +91,8 @@ def _manifest_text(path: Path) -> str | bytes:
         if not is_dataset(path):
             raise DatasetError(
                 f"Expected a folder with a finished dataset, got {path} without "
-                f"{FOLDER_MANIFEST}. "
-                "Finish it by the command that began it, or by `benchnav-datagen "
-                "merge` of its shares."
+                f"{FOLDER_MANIFEST}. Finish it by the command that began it, or by "
+                "`benchnav-datagen merge` of its shards."
             )
         return (path / FOLDER_MANIFEST).read_text()
     with open_file(path) as file:

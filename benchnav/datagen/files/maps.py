@@ -1,4 +1,4 @@
-"""A split as a map-style PyTorch dataset, for training loops of one's own."""
+"""A split as a map-style PyTorch dataset, for custom training loops."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,20 +13,20 @@ from benchnav.datagen.files.reader import TerrainDataset
 
 
 class TerrainMaps(Dataset[dict[str, Tensor]]):
-    """The maps of a split, each a dict of tensors by field.
+    """Maps of a split, each a dict of tensors by field.
 
-    Safe under DataLoader workers, forked or spawned: each process opens files for
-    itself, at the first map of each. Only the fields asked for are read.
+    Safe under DataLoader workers, forked or spawned: each process opens files itself,
+    at the first map of each. Only the requested fields are read.
 
     Args:
-        path: dataset file or folder, or the id of one at hand.
+        path: dataset file or folder, or the id of a local dataset.
         split: name of one of its splits.
         fields: names among `TerrainDataset.field_names`.
-        in_memory: read all maps at once, here; worth it for what is read many times.
+        in_memory: whether to read all maps now; faster if maps are read many times.
 
     Raises:
-        DatasetError: no such file, split or field; when a map is read: its data are
-            damaged.
+        DatasetError: If there is no such file, split or field, or, when a map is read,
+            its data are damaged.
     """
 
     def __init__(
@@ -36,7 +36,7 @@ class TerrainMaps(Dataset[dict[str, Tensor]]):
         fields: Sequence[str] = ("rgb", "class_id"),
         in_memory: bool = False,
     ) -> None:
-        """Checks split and fields, and reads the maps where that is asked for."""
+        """Check split and fields; read all maps if they are kept in memory."""
         self.dataset = TerrainDataset(find_dataset(path).resolve(), keep_open=True)
         self.split, self.fields = split, self.dataset.check_fields(tuple(fields))
         if not fields:
@@ -53,27 +53,27 @@ class TerrainMaps(Dataset[dict[str, Tensor]]):
         return self._maps
 
     def __getitem__(self, index: int) -> dict[str, Tensor]:
-        """Reads a map; negative indices count from the end.
+        """Return a map; negative indices count from the end.
 
         Returns:
             Tensors by field, each of the field's entry shape.
 
         Raises:
-            IndexError: there is no such map.
+            IndexError: If there is no such map.
         """
         if not -len(self) <= index < len(self):
             raise IndexError(f"Expected a map index in 0–{len(self) - 1}, got {index}.")
-        return {
-            name: values[0]
-            for name, values in self.read([int(index) % len(self)]).items()
-        }
+        maps = self.read([int(index) % len(self)])
+        return {name: values[0] for name, values in maps.items()}
 
     def read(self, indices: Sequence[int]) -> dict[str, Tensor]:
-        """Reads maps by their indices ≥ 0, in any order; tensors by field, each of
-        shape [B, *entry shape].
+        """Return maps by field, each tensor of shape [B, *entry shape].
+
+        Args:
+            indices: indices of the maps, ≥ 0, in any order.
         """
         if self._memory is None:
-            read = self.dataset.read(self.split, indices, self.fields)
-            return {name: torch.from_numpy(values) for name, values in read.items()}
-        which = torch.as_tensor(indices)
-        return {name: values[which] for name, values in self._memory.items()}
+            maps = self.dataset.read(self.split, indices, self.fields)
+            return {name: torch.from_numpy(values) for name, values in maps.items()}
+        index = torch.as_tensor(indices)
+        return {name: values[index] for name, values in self._memory.items()}

@@ -1,8 +1,7 @@
-"""Combines datasets: splits side by side, those of one name end to end; and the shards
-of one dataset.
+"""Merging of datasets, and of the shards of one dataset.
 
-What is merged is packed already: files are copied into a folder, or their chunks into
-    one file.
+Splits of the same name are concatenated. Compressed data are copied as they are: files
+into a folder, or their chunks into one file.
 """
 
 import json
@@ -22,16 +21,16 @@ from benchnav.datagen.files.check import find_faults
 from benchnav.datagen.files.hdf5 import (
     Contents,
     assemble,
-    held,
+    contents_of_recipe,
+    exclusive_output,
     is_one_file,
     name_of,
-    whole,
 )
 from benchnav.datagen.files.manifest import is_dataset
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import Recipe, check_name, recipe_from_dict
 
-# What a map's meaning rests on: alike in all files of a merge.
+# Settings that determine the meaning of maps: identical in all files of a merge.
 _SHARED = (
     "height",
     "width",
@@ -50,39 +49,41 @@ _SHARED = (
 def merge(
     paths: Sequence[Path], out: Path, dataset_id: str = "", overwrite: bool = False
 ) -> Iterator[tuple[int, int]]:
-    """Writes the maps of several datasets, or of the shards of one, to one; yields
-    (maps done, maps in all).
+    """Merge datasets, or the shards of one; yield (maps done, total maps).
+
+    Iterate to the end.
 
     Args:
-        paths: two or more datasets, of which the first fixes the order of splits; or
-            folders of shards.
+        paths: two or more datasets, the first of which determines the order of splits;
+            or folders of shards.
         out: file to write, of suffix `.h5` or `.hdf5`; else a folder.
-        dataset_id: id of the new dataset; the name of `out` when empty. Shares keep
-            that of their recipe.
-        overwrite: replace what is there.
+        dataset_id: id of the new dataset; if empty, the name of `out`. Shards keep the
+            id of their recipe.
+        overwrite: whether to replace an existing dataset.
 
     Raises:
-        DatasetError: the datasets are unlike, with every reason; one is damaged; or
+        DatasetError: If the datasets differ (with all reasons), one is damaged, or
             shards are missing.
-        ConfigError: `out` is taken.
+        ConfigError: If `out` exists and may not be replaced.
     """
     out = real_place(out)
     finished = [path for path in paths if is_dataset(path) or not path.is_dir()]
     if finished and len(finished) < len(paths):
         raise DatasetError(
-            "Expected datasets, or shards of one dataset, got both. Merge them apart."
+            "Expected datasets, or shards of one dataset, got both. Merge them "
+            "separately."
         )
     name = dataset_id or name_of(out)
     contents = _of_datasets(finished, name) if finished else _of_shards(paths)
-    total, done = sum(entry["maps"] for entry in contents.splits.values()), 0
+    total = sum(entry["maps"] for entry in contents.splits.values())
+    done = 0
     sources = dict.fromkeys(chain(*contents.files.values()))
-    with held(out, overwrite):
+    with exclusive_output(out, overwrite):
         for path in sources:
             if faults := find_faults(path):
                 raise DatasetError(
                     f"{path} is damaged: {faults[0]}. Run `benchnav-datagen validate` "
-                    "on it, which says how to make "
-                    "it anew."
+                    "on it, which explains how to make it again."
                 )
             done += sum(entry["maps"] for entry in TerrainDataset(path).splits.values())
             yield done, total
@@ -92,17 +93,14 @@ def merge(
         with building(out) as folder:
             copies: dict[Path, Path] = {}
             for path in sources:
-                # Under its own name where that is free.
-                name = (
-                    f"{len(copies)}-{path.name}"
-                    if (folder / path.name).exists()
-                    else path.name
-                )
-                copies[path] = folder / name
-                shutil.copy2(path, copies[path])
+                copy = folder / path.name
+                if copy.exists():
+                    copy = folder / f"{len(copies)}-{path.name}"
+                copies[path] = copy
+                shutil.copy2(path, copy)
             files = {
-                split: [copies[path] for path in own]
-                for split, own in contents.files.items()
+                split: [copies[path] for path in split_files]
+                for split, split_files in contents.files.items()
             }
             assemble(contents._replace(files=files), folder, out)
 
@@ -120,47 +118,38 @@ def _of_datasets(paths: Sequence[Path], dataset_id: str) -> Contents:
         raise DatasetError(
             f"Expected datasets that can be merged, got: {'; '.join(reasons)}."
         )
-    # The recipes, each once, and of each split the parts that refer to them and the
-    # files.
     recipes: list[Recipe] = []
     splits: dict[str, schema.Json] = {}
     files: dict[str, list[Path]] = {}
     for dataset in datasets:
-        own = [
+        dataset_recipes = [
             recipe_from_dict(data, f"in {dataset.path}")
             for data in dataset.manifest["recipes"]
         ]
-        recipes += [recipe for recipe in own if recipe not in recipes]
+        recipes += [recipe for recipe in dataset_recipes if recipe not in recipes]
         for name, entry in dataset.splits.items():
-            files.setdefault(name, []).extend(
-                piece.path for piece in dataset.pieces[name]
-            )
-            gathered = splits.setdefault(
-                name, {"scenario": entry["scenario"], "maps": 0, "parts": []}
-            )
-            gathered["maps"] += entry["maps"]
+            paths_of_split = [piece.path for piece in dataset.pieces[name]]
+            files.setdefault(name, []).extend(paths_of_split)
+            empty = {"scenario": entry["scenario"], "maps": 0, "parts": []}
+            merged = splits.setdefault(name, empty)
+            merged["maps"] += entry["maps"]
             for part in entry["parts"]:
-                number = (
-                    {"recipe": recipes.index(own[part["recipe"]])}
-                    if "recipe" in part
-                    else {}
-                )
-                gathered["parts"].append({**part, **number})
+                if "recipe" in part:
+                    recipe = dataset_recipes[part["recipe"]]
+                    part = {**part, "recipe": recipes.index(recipe)}
+                merged["parts"].append(part)
     return Contents(dataset_id, recipes, splits, files, datasets[0].fields)
 
 
 def _of_shards(folders: Sequence[Path]) -> Contents:
-    """Gathers the shards that lie in folders.
+    """Return the dataset of the shards in some folders.
 
     Raises:
-        DatasetError: there are none, they are of several recipes or versions, or some
-            are missing.
+        DatasetError: If there are no shards, they are of several recipes or versions,
+            or some are missing.
     """
-    shards = [
-        TerrainDataset(path)
-        for folder in folders
-        for path in sorted(folder.glob("*.h5"))
-    ]
+    paths = [path for folder in folders for path in sorted(folder.glob("*.h5"))]
+    shards = [TerrainDataset(path) for path in paths]
     if not shards:
         raise DatasetError(
             "Expected datasets, or folders with shards of one, got "
@@ -170,36 +159,36 @@ def _of_shards(folders: Sequence[Path]) -> Contents:
         if shard.manifest[name] != shards[0].manifest[name]:
             raise DatasetError(
                 f"Expected shards of one dataset, got {shards[0].path} and "
-                f"{shard.path} with unlike {name}."
+                f"{shard.path} with different {name}."
             )
     recipe = shards[0].recipe
     files: dict[str, list[Path]] = {}
-    lacking = []
+    missing = []
     for name, spec in recipe.splits.items():
-        own = {
+        by_first = {
             shard.splits[name]["parts"][0]["first"]: shard
             for shard in shards
             if name in shard.splits
         }
-        place, files[name] = 0, []
-        for begin in (*sorted(own), spec.maps):
-            if begin != place:
-                lacking.append(f"maps {place}–{begin - 1} of {name}")
-            if begin in own:
-                files[name].append(own[begin].path)
-                place = begin + own[begin].splits[name]["maps"]
-    if lacking:
+        files[name] = []
+        expected_first = 0
+        for first in (*sorted(by_first), spec.maps):
+            if first != expected_first:
+                missing.append(f"maps {expected_first}–{first - 1} of {name}")
+            if first in by_first:
+                shard = by_first[first]
+                files[name].append(shard.path)
+                expected_first = first + shard.splits[name]["maps"]
+    if missing:
         raise DatasetError(
-            f"Expected all shards of {recipe.id}, got none with {'; '.join(lacking)}. "
+            f"Expected all shards of {recipe.id}, got none with {'; '.join(missing)}. "
             "Make the missing shards first."
         )
-    return whole(recipe, files)
+    return contents_of_recipe(recipe, files)
 
 
 def why_unlike(datasets: Sequence[TerrainDataset]) -> Iterator[str]:
-    """Gives every reason why datasets cannot be one: a sentence a pair of them, which
-    names both once.
-    """
+    """Yield the reasons why datasets cannot be merged, one sentence per pair."""
     prints = [(dataset, _fingerprints(dataset)) for dataset in datasets]
     for (first, ours), (second, theirs) in combinations(prints, 2):
         reasons = list(_differences(first, second))
@@ -211,60 +200,48 @@ def why_unlike(datasets: Sequence[TerrainDataset]) -> Iterator[str]:
 
 
 def _differences(first: TerrainDataset, second: TerrainDataset) -> Iterator[str]:
-    if extra := sorted(set(first.fields) ^ set(second.fields)):
-        hint = (
-            ": import both with overlap or both without, by --stride"
-            if extra == ["group"]
-            else ""
-        )
-        yield f"unlike fields ({', '.join(extra)} of one alone{hint})"
-    elif list(first.fields.items()) != list(second.fields.items()):
-        changed = [
-            name for name in first.fields if first.fields[name] != second.fields[name]
-        ]
-        yield (
-            f"fields of unlike dtype, unit or meaning ({', '.join(changed)})"
-            if changed
-            else (
-                f"unlike order of fields ({', '.join(first.fields)} / "
-                f"{', '.join(second.fields)})"
-            )
-        )
-    ours, theirs = plain(first.recipe), plain(second.recipe)
+    fields = first.fields
+    if extra := sorted(set(fields) ^ set(second.fields)):
+        hint = ""
+        if extra == ["group"]:
+            hint = ": import both with overlap or both without, by --stride"
+        yield f"different fields ({', '.join(extra)} only in one{hint})"
+    elif list(fields.items()) != list(second.fields.items()):
+        changed = [name for name in fields if fields[name] != second.fields[name]]
+        if changed:
+            yield f"fields of different dtype, unit or meaning ({', '.join(changed)})"
+        else:
+            orders = f"{', '.join(fields)} / {', '.join(second.fields)}"
+            yield f"different order of fields ({orders})"
+    ours = plain(first.recipe)
+    theirs = plain(second.recipe)
     for name in _SHARED:
         if ours[name] != theirs[name]:
             is_long = name in ("classes", "layers")
-            yield f"unlike {name}" + (
-                "" if is_long else f" ({ours[name]} / {theirs[name]})"
-            )
+            values = "" if is_long else f" ({ours[name]} / {theirs[name]})"
+            yield f"different {name}{values}"
     for split in sorted(set(first.splits) & set(second.splits)):
         if len(_kinds(first, split) | _kinds(second, split)) > 1:
-            yield f"unlike scenarios or `solvable` in split {split!r}"
+            yield f"different scenarios or `solvable` in split {split!r}"
 
 
 def _kinds(dataset: TerrainDataset, split: str) -> set[str]:
-    """What the maps of a split are by their recipes: scenario, and whether all can be
-    solved.
-    """
+    """Return scenario and `solvable` of the parts of a split, as JSON texts."""
     kinds = set()
     for part in dataset.splits[split]["parts"]:
         kind: Any = "imported"
         if "recipe" in part:
             recipe = dataset.manifest["recipes"][part["recipe"]]
             spec = recipe["splits"][part["split"]]
-            kind = [
-                spec["scenario"],
-                recipe["scenarios"][spec["scenario"]],
-                spec["solvable"],
-            ]
+            scenario = spec["scenario"]
+            kind = [scenario, recipe["scenarios"][scenario], spec["solvable"]]
         kinds.add(json.dumps(kind, sort_keys=True))
     return kinds
 
 
 def _fingerprints(dataset: TerrainDataset) -> np.ndarray:
-    """The digests of all elevation maps, shape [N]."""
+    """Return the digests of all elevation maps, shape [N]."""
     column = dataset.field_names.index("elevation_m")
     digests = np.concatenate([dataset.entry_digests(split) for split in dataset.splits])
-    return (
-        np.ascontiguousarray(digests[:, column]).view(f"S{schema.DIGEST_BYTES}").ravel()
-    )
+    digests = np.ascontiguousarray(digests[:, column])
+    return digests.view(f"S{schema.DIGEST_BYTES}").ravel()

@@ -1,8 +1,7 @@
-"""Reading datasets of formats 1.0 to 1.4: a file (HDF5), or a folder of such files with
-one manifest.
+"""Reader of datasets of formats 1.0 to 1.4: an HDF5 file, or a folder of such files.
 
-All that reads maps goes through `TerrainDataset.read`, which may be passed to other
-processes. PyTorch is imported where Terrain is asked for. Letters in shapes: B maps.
+All maps are read by `TerrainDataset.read`. A `TerrainDataset` may be sent to other
+processes. PyTorch is imported only for Terrain. Letters in shapes: B maps.
 """
 
 import hashlib
@@ -30,22 +29,21 @@ if TYPE_CHECKING:
     from benchnav.core.terrain import Terrain
 
 CHUNK_CELLS = 2**17
-_MOST_OPEN = 128  # files that a process keeps open; far fewer than systems allow
+_MAX_OPEN = 128  # files that a process keeps open; far fewer than systems allow
 
-Opened = tuple[
-    h5py.File, dict[tuple[str, str], h5py.Dataset]
-]  # a file, and its arrays by split and name
+# A file, and its arrays by split and name.
+Opened = tuple[h5py.File, dict[tuple[str, str], h5py.Dataset]]
 
 _SHOWN_SPLITS = 8
 
 
 class Piece(NamedTuple):
-    """What one file holds of a split: all maps under the split's name.
+    """Maps of a split in one file.
 
     Args:
         path: the file.
-        first: place of its first map in the split.
-        maps: how many it holds.
+        first: index of its first map in the split.
+        maps: number of its maps.
     """
 
     path: Path
@@ -55,50 +53,50 @@ class Piece(NamedTuple):
 
 @lru_cache(maxsize=16)
 def _read_recipe(text: str, origin: str) -> Recipe:
-    """The recipe in a manifest, checked; kept, since to check it takes longer than to
-    read a map.
+    """Return the checked recipe of a manifest.
+
+    It is cached, since checking it takes longer than reading a map.
     """
     return recipe_from_dict(json.loads(text), origin)
 
 
 class TerrainDataset:
-    """Reads a dataset.
+    """Dataset in a file or a folder.
 
     Args:
         path: the file, or the folder.
-        keep_open: keep files open from call to call, for many reads of few maps. Each
-            process opens them for itself, forked or spawned. Otherwise they are open
-            during a call alone, and may be changed in between.
+        keep_open: whether to keep files open between calls, for many reads of few maps.
+            Each process opens them itself, forked or spawned. Otherwise, files are open
+            only during a call, and may change between calls.
 
     Raises:
-        DatasetError: there is no such file, or it is damaged, foreign, or of a newer
-            format.
+        DatasetError: If there is no such file, or it is damaged, or of another or a
+            newer format.
     """
 
     def __init__(self, path: str | Path, keep_open: bool = False) -> None:
-        """Reads and checks the manifest."""
-        self.path, self.keep_open = Path(path), keep_open
+        """Read and check the manifest."""
+        self.path = Path(path)
+        self.keep_open = keep_open
         self.manifest: schema.Json = read_manifest(self.path)
-        self._opened: dict[
-            tuple[int, Path], Opened
-        ] = {}  # by process, since one's files are not for another
+        # By process, since processes must not share open files.
+        self._opened: dict[tuple[int, Path], Opened] = {}
 
     def __getstate__(self) -> schema.Json:
-        """Leaves out the open files, so that it may be sent to other processes."""
+        """Omit open files, which cannot be sent to other processes."""
         return self.__dict__ | {"_opened": {}}
 
     def __repr__(self) -> str:
         """Return id, path, cells and the maps of each split, in up to six lines."""
         height, width = self.grid.shape
-        splits = [f"{name} {about['maps']}" for name, about in self.splits.items()]
-        shown = ", ".join(splits[:_SHOWN_SPLITS]) + (
-            ", …" if len(splits) > _SHOWN_SPLITS else ""
-        )
+        splits = [f"{name} {entry['maps']}" for name, entry in self.splits.items()]
+        if len(splits) > _SHOWN_SPLITS:
+            splits = [*splits[:_SHOWN_SPLITS], "…"]
         return (
             f"TerrainDataset {self.id} in {self.path}\n"
             f"  {height} × {width} cells of {self.grid.resolution_m:g} m, fields "
             f"{', '.join(self.field_names)}\n"
-            f"  maps: {shown}"
+            f"  maps: {', '.join(splits)}"
         )
 
     @property
@@ -113,9 +111,7 @@ class TerrainDataset:
 
     @cached_property
     def recipe(self) -> Recipe:
-        """The recipe that the file was made by; of the first part where it was made
-        from several.
-        """
+        """Recipe of the dataset; of its first part, if it has several recipes."""
         return _read_recipe(json.dumps(self.manifest["recipes"][0]), f"in {self.path}")
 
     @property
@@ -125,13 +121,10 @@ class TerrainDataset:
 
     @cached_property
     def fields(self) -> dict[str, schema.Field]:
-        """What every map has, by name: those of `schema.FIELDS`, and others that this
-        dataset lists.
-        """
-        drawn = {spec.name: spec.stored_field for spec in self.recipe.layers}
-        return schema.read_field_table(
-            self.manifest["fields"], shipped_fields() | drawn
-        )
+        """Fields of the maps by name: `schema.FIELDS`, and others of this dataset."""
+        layers = shipped_fields()
+        layers |= {spec.name: spec.stored_field for spec in self.recipe.layers}
+        return schema.read_field_table(self.manifest["fields"], layers)
 
     @property
     def field_names(self) -> tuple[str, ...]:
@@ -140,9 +133,7 @@ class TerrainDataset:
 
     @property
     def layer_names(self) -> tuple[str, ...]:
-        """Names of the layers among `fields`: what a model may see of the ground beside
-        colour and shape.
-        """
+        """Names of the layers among `fields`, which models may use as inputs."""
         return schema.layer_names(self.fields)
 
     @property
@@ -151,84 +142,78 @@ class TerrainDataset:
         return tuple(name for name in schema.TRUTH if name in self.fields)
 
     def truth_of(self, split: str) -> Literal["generated", "unknown"]:
-        """Return whether the distribution of λ in each cell of a split is known.
+        """Return whether the true distribution of λ of a split is known.
 
         Returns:
-            "generated" where a recipe made all its maps, λ by its class table;
-            "unknown" where some were imported: the class table says nothing of real
-            ground, whether or not λ was measured there.
-
-        Raises:
-            DatasetError: there is no such split.
-        """
-        self.map_count(split)
-        # Files before 1.3 do not say it of what they import.
-        known = all(
-            "recipe" in part or part["source"].get("truth") == "generated"
-            for part in self.splits[split]["parts"]
-        )
-        return "generated" if known else "unknown"
-
-    @property
-    def truth(self) -> Literal["generated", "unknown"]:
-        """Knowledge of the distribution of λ in each cell, over all splits; see
-        `truth_of`.
-        """
-        known = all(self.truth_of(name) == "generated" for name in self.splits)
-        return "generated" if known else "unknown"
-
-    def has_photo(self, split: str) -> bool:
-        """Return whether the colours of some maps of a split are those of a photo,
-        which is lit from one direction.
+            "generated" if recipes generated all its maps, λ by their class tables;
+            "unknown" if some were imported: the class table does not describe real
+            terrain, even if λ was measured there.
 
         Raises:
             DatasetError: If there is no such split.
         """
         self.map_count(split)
-        return any(
-            part.get("source", {}).get("photo") for part in self.splits[split]["parts"]
+        # Files before 1.3 do not record it for imported maps.
+        is_known = all(
+            "recipe" in part or part["source"].get("truth") == "generated"
+            for part in self.splits[split]["parts"]
         )
+        return "generated" if is_known else "unknown"
 
-    def about_digest(self, split: str) -> str:
-        """SHA-256 of what numbers on a split rest on beside its maps.
+    @property
+    def truth(self) -> Literal["generated", "unknown"]:
+        """Whether the true distribution of λ of all splits is known; see `truth_of`."""
+        is_known = all(self.truth_of(name) == "generated" for name in self.splits)
+        return "generated" if is_known else "unknown"
 
-        These are class table, layers of the recipe, λ_stuck, resolution and kind of
-        truth.
+    def has_photo(self, split: str) -> bool:
+        """Return whether some maps of a split have the colours of a photo.
+
+        A photo is lit from one direction.
 
         Raises:
-            DatasetError: there is no such split.
+            DatasetError: If there is no such split.
+        """
+        self.map_count(split)
+        sources = [part.get("source", {}) for part in self.splits[split]["parts"]]
+        return any(source.get("photo") for source in sources)
+
+    def about_digest(self, split: str) -> str:
+        """Return the SHA-256 of the properties of a split besides its maps.
+
+        They are class table, layers of the recipe, λ_stuck, resolution and kind of
+        truth. Results depend on them.
+
+        Raises:
+            DatasetError: If there is no such split.
         """
         recipe = self.recipe
-        drawn = [
-            spec.meaning_of_maps for spec in recipe.layers if not spec.is_vegetation
-        ]
-        about = {
-            **({"layers": drawn} if drawn else {}),
+        properties: schema.Json = {
             "classes": recipe.class_rows,
             "stuck_threshold": recipe.stuck_threshold,
             "resolution_m": recipe.resolution_m,
             "truth": self.truth_of(split),
         }
-        text = json.dumps(about, sort_keys=True)
+        specs = [spec for spec in recipe.layers if not spec.is_vegetation]
+        if specs:
+            properties["layers"] = [spec.meaning_of_maps for spec in specs]
+        text = json.dumps(properties, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 
     def split_digest(self, split: str) -> str:
-        """SHA-256 of a split's maps and of what they mean, which models and results
-        record: `about_digest` too.
+        """Return the SHA-256 of a split that models and results record.
+
+        It covers the maps' digest and `about_digest`.
 
         Raises:
-            DatasetError: there is no such split.
+            DatasetError: If there is no such split.
         """
-        about = self.about_digest(split)
-        return hashlib.sha256(
-            f"{self.splits[split]['digest']} {about}".encode()
-        ).hexdigest()
+        text = f"{self.splits[split]['digest']} {self.about_digest(split)}"
+        return hashlib.sha256(text.encode()).hexdigest()
 
     @property
     def digest(self) -> str:
-        """One digest for the dataset, as `split:split_digest` joined in the manifest's
-        order.
-        """
+        """Digest of the dataset: `split:split_digest`, joined in the manifest's order."""
         return ",".join(f"{name}:{self.split_digest(name)}" for name in self.splits)
 
     def read(
@@ -237,18 +222,19 @@ class TerrainDataset:
         indices: Sequence[int] | None = None,
         fields: Collection[str] | None = None,
     ) -> Maps:
-        """Reads stored arrays.
+        """Return stored arrays.
 
         Args:
             split: name of a split.
-            indices: which maps, in any order; None for all.
-            fields: which of `field_names`; None for all.
+            indices: indices of the maps, in any order; None for all.
+            fields: names among `field_names`; None for all.
 
         Returns:
             Arrays by field, each of shape [B, *entry shape].
 
         Raises:
-            DatasetError: no such split or map, or a stored chunk is damaged.
+            DatasetError: If there is no such split or map, or a stored chunk is
+                damaged.
         """
         size = self.map_count(split)
         names = self.field_names if fields is None else self.check_fields(fields)
@@ -259,37 +245,37 @@ class TerrainDataset:
                 f"{chosen}."
             )
 
-        pieces, firsts = self.pieces[split], self._firsts[split]
-        # In the order of the files, each of which is asked once for maps that follow
-        # one another in it.
-        places = sorted(range(len(chosen)), key=chosen.__getitem__)
+        pieces = self.pieces[split]
+        firsts = self._firsts[split]
+        # In the order of the files, one read for each run of consecutive maps.
+        order = sorted(range(len(chosen)), key=chosen.__getitem__)
 
         def run_of(item: tuple[int, int]) -> tuple[int, int]:
-            rank, place = item
-            return bisect_right(firsts, chosen[place]) - 1, chosen[place] - rank
+            rank, position = item
+            index = chosen[position]
+            return bisect_right(firsts, index) - 1, index - rank
 
-        read = {
-            name: np.empty((len(chosen), *self._stored[name][1]), self._stored[name][0])
-            for name in names
-        }
-        for (piece, _), items in groupby(enumerate(places), run_of):
-            own = [place for _, place in items]
-            run = range(chosen[own[0]], chosen[own[-1]] + 1)
-            part = self._read_run(split, pieces[piece], run, names)
-            if own == list(range(len(chosen))):
-                return part
-            for name, values in part.items():
-                read[name][own] = values
-        return read
+        arrays = {}
+        for name in names:
+            dtype, entry = self._stored[name]
+            arrays[name] = np.empty((len(chosen), *entry), dtype)
+        for (piece, _), items in groupby(enumerate(order), run_of):
+            positions = [position for _, position in items]
+            run = range(chosen[positions[0]], chosen[positions[-1]] + 1)
+            maps = self._read_run(split, pieces[piece], run, names)
+            if positions == list(range(len(chosen))):
+                return maps
+            for name, values in maps.items():
+                arrays[name][positions] = values
+        return arrays
 
     def entry_digests(
         self, split: str, indices: Sequence[int] | None = None
     ) -> np.ndarray:
-        """Reads the stored SHA-256 of every entry, as `schema.entry_digests` gives
-        them.
+        """Return the stored SHA-256 of all entries, as `schema.entry_digests` does.
 
         Raises:
-            DatasetError: no such split, or a stored chunk is damaged.
+            DatasetError: If there is no such split, or a stored chunk is damaged.
         """
         return self.read(split, indices, (schema.ENTRY_DIGESTS,))[schema.ENTRY_DIGESTS]
 
@@ -299,35 +285,35 @@ class TerrainDataset:
         fields: Collection[str] | None = None,
         cells: int = CHUNK_CELLS,
     ) -> Iterator[tuple[range, Maps]]:
-        """Reads a split from its first map to its last, some maps at a time.
+        """Read a split in chunks, from its first map to its last.
 
         Args:
             split: name of a split.
-            fields: which fields; None for all.
-            cells: most cells at a time, but for one map that has more.
+            fields: names among `field_names`; None for all.
+            cells: maximum number of cells of a chunk; a chunk has at least one map.
 
         Yields:
-            Which maps, and what `read` gives of them.
+            Indices of the maps, and their arrays as from `read`.
         """
-        size, count = self.grid.maps_in(cells), self.map_count(split)
+        size = self.grid.maps_in(cells)
+        count = self.map_count(split)
         for first in range(0, count, size):
             indices = range(first, min(first + size, count))
             yield indices, self.read(split, indices, fields)
 
     def terrain_chunks(self, split: str) -> "Iterator[Terrain]":
-        """Reads a split as Terrain, some maps at a time, as `chunks` does."""
+        """Read a split as Terrain in chunks, as `chunks` does."""
         for indices, _ in self.chunks(split, fields=()):
             yield self.terrain(split, indices)
 
     def check_fields(self, names: Collection[str]) -> Collection[str]:
-        """Gives names of fields back.
+        """Return names of fields, after a check.
 
         Raises:
-            DatasetError: maps have no such field.
+            DatasetError: If maps have no such field.
         """
-        unknown = [
-            name for name in names if name not in (*self.fields, schema.ENTRY_DIGESTS)
-        ]
+        known_names = {*self.fields, schema.ENTRY_DIGESTS}
+        unknown = [name for name in names if name not in known_names]
         if unknown:
             raise DatasetError(
                 f"Expected `fields` among {list(self.fields)}, got {unknown}."
@@ -336,13 +322,15 @@ class TerrainDataset:
 
     @cached_property
     def pieces(self) -> dict[str, list[Piece]]:
-        """By split the files that hold its maps, in their order."""
-        pieces: dict[str, list[Piece]] = {split: [] for split in self.splits}
-        for split, own in pieces.items():
-            one = [{"file": "", "maps": self.splits[split]["maps"]}]
+        """Files that contain the maps of each split, in order."""
+        pieces: dict[str, list[Piece]] = {}
+        for split, entry in self.splits.items():
+            pieces[split] = []
+            single = [{"file": "", "maps": entry["maps"]}]
             first = 0
-            for shard in self.manifest.get("shards", {}).get(split, one):
-                own.append(Piece(self.path / shard["file"], first, shard["maps"]))
+            for shard in self.manifest.get("shards", {}).get(split, single):
+                path = self.path / shard["file"]
+                pieces[split].append(Piece(path, first, shard["maps"]))
                 first += shard["maps"]
         return pieces
 
@@ -359,69 +347,80 @@ class TerrainDataset:
 
     @cached_property
     def files(self) -> set[Path]:
-        """The files that hold maps."""
+        """Files that contain maps."""
         return {piece.path for pieces in self.pieces.values() for piece in pieces}
 
     def _read_run(
         self, split: str, piece: Piece, run: range, names: Collection[str]
     ) -> Maps:
-        """Reads maps that follow one another in a file, as `read` does."""
+        """Return consecutive maps of a file, as `read` does."""
         file, arrays = self._open(piece.path)
-        read, most = Maps(), len(self.recipe.classes) - 1
-        which = slice(run.start - piece.first, run.stop - piece.first)
+        maps = Maps()
+        max_class = len(self.recipe.classes) - 1
+        selection = slice(run.start - piece.first, run.stop - piece.first)
         try:
             for name in names:
                 if (split, name) not in arrays:
                     arrays[split, name] = self.stored_array(
                         file, split, name, piece.maps
                     )
-                read[name] = values = _values(arrays[split, name], which)
-                # The greatest is looked at first, since that is quicker than to compare
-                # each.
-                is_beyond = name == "class_id" and values.max(initial=0) > most
-                if (
-                    is_beyond
-                    and ((values > most) & (values != schema.UNLABELLED)).any()
-                ):
-                    raise ValueError(f"it has classes beyond {most}")
+                values = _values(arrays[split, name], selection)
+                maps[name] = values
+                # The maximum first, which is faster than comparing all values.
+                if name == "class_id" and values.max(initial=0) > max_class:
+                    is_beyond = (values > max_class) & (values != schema.UNLABELLED)
+                    if is_beyond.any():
+                        raise ValueError(f"it has classes beyond {max_class}")
         except READ_ERRORS as error:
             raise damage(piece.path, split, name, error) from error
         finally:
             if not self.keep_open:
                 file.close()
-        return read
+        return maps
 
     def _open(self, path: Path) -> Opened:
-        """A file, and those of its arrays that were read before, by split and name."""
+        """Return an open file, and its previously read arrays by split and name."""
         if not self.keep_open:
             return open_file(path), {}
-        place = os.getpid(), path
-        if place not in self._opened:
-            if len(self._opened) == _MOST_OPEN:
-                # Let go, which closes it: h5py's own `close` looks through all that is
-                # open, of any file.
+        key = os.getpid(), path
+        if key not in self._opened:
+            if len(self._opened) == _MAX_OPEN:
+                # Deleting the last reference closes the file. h5py's `close` is slow:
+                # it searches all open objects of all files.
                 del self._opened[next(iter(self._opened))]
-            self._opened[place] = open_file(path), {}
-        return self._opened[place]
+            self._opened[key] = open_file(path), {}
+        return self._opened[key]
 
     def stored_array(
         self, file: h5py.File, split: str, name: str, maps: int
     ) -> h5py.Dataset:
-        """An array of so many maps in a file; refuses, by a ValueError, one that is not
-        what the manifest says.
+        """Return an array of a file, after a check.
+
+        Args:
+            file: the open file.
+            split: name of a split.
+            name: name of a field.
+            maps: expected number of maps.
+
+        Raises:
+            ValueError: If dtype or shape differ from the manifest.
         """
         array = file[f"{split}/{name}"]
-        kind, entry = self._stored[name]
-        if (array.dtype.str, array.shape) != (kind, (maps, *entry)):
+        dtype, entry = self._stored[name]
+        shape = (maps, *entry)
+        if (array.dtype.str, array.shape) != (dtype, shape):
             raise ValueError(
-                f"it is {array.dtype.str} {list(array.shape)}, not {kind} "
-                f"{[maps, *entry]}"
+                f"it is {array.dtype.str} {list(array.shape)}, not {dtype} "
+                f"{list(shape)}"
             )
         return array
 
     def terrain(self, split: str, indices: Sequence[int] | None = None) -> "Terrain":
-        """Reads maps as Terrain, float32 on the CPU, the latent functions evaluated on
-        what is stored.
+        """Return maps as Terrain, float32 on the CPU, with the true distribution of λ.
+
+        Args:
+            split: name of a split.
+            indices: indices of the maps, in any order; None for all.
         """
         from benchnav.datagen.files.stored_terrain import terrain_of
 
@@ -432,7 +431,7 @@ class TerrainDataset:
         """Number of maps of a split.
 
         Raises:
-            DatasetError: there is no such split.
+            DatasetError: If there is no such split.
         """
         if split not in self.splits:
             raise DatasetError(
@@ -443,21 +442,18 @@ class TerrainDataset:
 
 
 def damage(path: Path, split: str, field: str, error: Exception) -> DatasetError:
-    """Says that a field cannot be read, and what to do."""
+    """Return an error that names a damaged field, with a remedy."""
     return DatasetError(
         f"Field {field!r} of split {split!r} in {path} is damaged: {error}. Run "
-        "`benchnav-datagen validate` "
-        "on the dataset, which says how to make it anew."
+        "`benchnav-datagen validate` on the dataset, which explains how to make it "
+        "again."
     )
 
 
-def _values(array: h5py.Dataset, which: slice) -> np.ndarray:
-    """Some maps of an array; one at a time where they cannot be read together, which
-    may be for want of memory.
-    """
+def _values(array: h5py.Dataset, selection: slice) -> np.ndarray:
+    """Return some maps of an array; map by map if one read fails for lack of memory."""
     try:
-        return array[which]
+        return array[selection]
     except OSError:
-        return np.concatenate(
-            [array[index : index + 1] for index in range(which.start, which.stop)]
-        )
+        indices = range(selection.start, selection.stop)
+        return np.concatenate([array[index : index + 1] for index in indices])

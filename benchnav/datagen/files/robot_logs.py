@@ -1,7 +1,7 @@
-"""Tables that a robot logged, a row each time: CSV or TSV, packed or not, or Parquet.
+"""Tables that robots logged, a row for each time: CSV, TSV (also .gz), or Parquet.
 
-Text is read as text, so that a class may be called NA and a bad number is found in its
-row.
+Text is read as text. A class may therefore be named NA, and an invalid number is
+reported with its row.
 """
 
 import warnings
@@ -27,29 +27,29 @@ _MISSING = ["", "NA", "N/A", "nan", "NaN", "null", "None"]
 def require_columns(
     rows: pd.DataFrame, columns: Collection[str], path: Path, remedy: str = ""
 ) -> None:
-    """Require columns of a log.
+    """Check that a log has all required columns.
 
     Args:
-        rows: of the log.
-        columns: that are required.
-        path: of the log.
-        remedy: what helps where the name of no other column is near, a sentence.
+        rows: rows of the log.
+        columns: required columns.
+        path: path of the log.
+        remedy: remedy if no column has a similar name, a sentence.
 
     Raises:
         DatasetError: If one is missing.
     """
     names = [str(name) for name in rows.columns]
     if missing := [name for name in columns if name not in names]:
-        near = hint(missing[0], [name for name in names if name not in columns])
-        near = near or (remedy and f" {remedy}")
+        advice = hint(missing[0], [name for name in names if name not in columns])
+        advice = advice or (remedy and f" {remedy}")
         if len(names) == 1 and any(separator in names[0] for separator in ",;\t| "):
-            near = f" {_SEPARATE}"
+            advice = f" {_SEPARATE}"
         elif any(_is_number(name) for name in names):
-            near = " Begin the file with a line of column names."
+            advice = " Begin the file with a line of column names."
         raise DatasetError(
             f"Expected columns {', '.join(columns)} in {path}, got no "
-            f"{' and no '.join(missing)}. "
-            f"It has {', '.join(names) or 'none'}.{near}"
+            f"{' and no '.join(missing)}. It has {', '.join(names) or 'no columns'}."
+            f"{advice}"
         )
 
 
@@ -61,7 +61,7 @@ def _is_number(text: str) -> bool:
 
 
 def read_log(path: Path) -> pd.DataFrame:
-    """Read a log, a file that ends in one of `ENDINGS`.
+    """Return the rows of a log, a file that ends in one of `ENDINGS`.
 
     Raises:
         DatasetError: If there is no such file, or it cannot be read.
@@ -88,24 +88,22 @@ def read_log(path: Path) -> pd.DataFrame:
         zlib.error,
         pd.errors.ParserWarning,
     ) as error:
-        why = [*str(error).strip().splitlines(), type(error).__name__]
-        is_text = isinstance(error, pd.errors.ParserWarning | pd.errors.ParserError)
-        remedy = (
-            f". {_SEPARATE} Remove lines above the column names." if is_text else ""
-        )
-        if isinstance(error, UnicodeDecodeError):
+        lines = [*str(error).strip().splitlines(), type(error).__name__]
+        remedy = ""
+        if isinstance(error, pd.errors.ParserWarning | pd.errors.ParserError):
+            remedy = f". {_SEPARATE} Remove lines above the column names."
+        elif isinstance(error, UnicodeDecodeError):
             remedy = ". Save it as UTF-8."
         elif isinstance(error, pd.errors.EmptyDataError):
             remedy = ". Write a line of column names and a row for each time."
+        kind = path.suffix.removeprefix(".").upper()
         raise DatasetError(
-            f"Expected a {path.suffix.removeprefix('.').upper()} table in {path}, got "
-            "one that cannot be read: "
-            f"{why[0].removesuffix('.')}{remedy}"
+            f"Expected a {kind} table in {path}, got one that cannot be read: "
+            f"{lines[0].removesuffix('.')}{remedy}"
         ) from error
     for name in rows.columns:
-        first, dot, number = str(name).rpartition(
-            "."
-        )  # pandas numbers the second of two columns of one name
+        # pandas numbers the second of two columns of one name.
+        first, dot, number = str(name).rpartition(".")
         if dot and number.isdigit() and first in rows.columns and not _is_number(first):
             raise DatasetError(
                 f"Expected one column `{first}` in {path}, got several. Rename or "
@@ -122,40 +120,39 @@ def read_numbers(
     remedy: str = "",
     number: str = "Convert the column to numbers.",
 ) -> np.ndarray:
-    """Return the numbers of a column, float64, NaN where missing, shape [N].
+    """Return the numbers of a column, float64, NaN if missing, shape [N].
 
     Args:
-        rows: of a log.
-        name: of the column.
-        path: of the log.
+        rows: rows of a log.
+        name: name of the column.
+        path: path of the log.
         limits: minimum and maximum.
-        remedy: what helps where all numbers are beyond the limits, a sentence.
-        number: what helps where no value is a number, a sentence.
+        remedy: remedy if all numbers are beyond the limits, a sentence.
+        number: remedy if all values are not numbers, a sentence.
 
     Raises:
-        DatasetError: If a value is no finite number, or beyond the limits.
+        DatasetError: If a value is not a finite number, or is beyond the limits.
     """
     column, (minimum, maximum) = rows[name], limits
     text = column if is_numeric_dtype(column) else column.astype("string").str.strip()
     values = pd.to_numeric(text, errors="coerce").to_numpy(np.float64, na_value=np.nan)
-    is_given = (text.notna() & ~text.isin(_MISSING)).to_numpy(bool)
+    is_present = (text.notna() & ~text.isin(_MISSING)).to_numpy(bool)
     is_number = np.isfinite(values)
     is_within = (values >= minimum) & (values <= maximum)
-    for expected, is_good, everywhere in (
+    expected_range = f"within [{minimum:g}, {maximum:g}]"
+    remedy = remedy or "Convert the column."
+    for expected, is_valid, advice in (
         ("to be numbers", is_number, number),
-        (
-            f"within [{minimum:g}, {maximum:g}]",
-            ~is_number | is_within,
-            remedy or "Convert the column.",
-        ),
+        (expected_range, ~is_number | is_within, remedy),
     ):
-        bad = np.flatnonzero(is_given & ~is_good)
-        if len(bad):
-            is_everywhere = len(bad) == is_given.sum()
+        invalid = np.flatnonzero(is_present & ~is_valid)
+        if len(invalid):
+            if len(invalid) < is_present.sum():
+                advice = "Correct that row, or leave the value out."
+            row = invalid[0]
             raise DatasetError(
-                f"Expected `{name}` {expected} in {path}, got {column.iloc[bad[0]]!s} "
-                f"in row {bad[0] + 1} below the "
-                f"header. {everywhere if is_everywhere else 'Mend that row, or leave the value out.'}"
+                f"Expected `{name}` {expected} in {path}, got {column.iloc[row]!s} in "
+                f"row {row + 1} below the header. {advice}"
             )
     return values
 
@@ -165,14 +162,13 @@ def read_names(rows: pd.DataFrame, name: str, path: Path) -> np.ndarray:
     [N].
 
     Raises:
-        DatasetError: If a row has none.
+        DatasetError: If a row has no name.
     """
     text = rows[name].astype("string").str.strip().fillna("")
     absent = text.index[text == ""]
     if len(absent):
         raise DatasetError(
-            f"Expected a `{name}` in every row of {path}, got none in row "
-            f"{absent[0] + 1} below the header. "
-            "Fill it in, or leave the row out."
+            f"Expected a `{name}` in every row of {path}, got an empty one in row "
+            f"{absent[0] + 1} below the header. Fill it in, or leave the row out."
         )
     return text.to_numpy(str)

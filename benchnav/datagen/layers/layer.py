@@ -1,10 +1,9 @@
-"""The base class of layers: what is stored, how it is drawn, how it looks, and what it
-does to λ.
+"""Base class of layers: stored map, drawing, appearance, and effect on λ.
 
-A layer is a frozen dataclass. Its fields are its settings; its class attributes
-describe the map that is stored, float32 and NaN-free. Only `draw` is required: by
-default a layer shows nothing and leaves λ as it is. All methods are pure functions of
-their arguments, for any batch of maps. Letters in shapes: B maps, H×W cells, C classes.
+A layer is a frozen dataclass. Its fields are its settings. Its class attributes
+describe the stored map, float32 without NaN. Only `draw` is required: by default, a
+layer is invisible and does not change λ. All methods are pure functions of their
+arguments, for any batch of maps. Letters in shapes: B maps, H×W cells, C classes.
 """
 
 from collections.abc import Mapping
@@ -24,17 +23,17 @@ from benchnav.datagen.schema import Field
 
 @dataclass(frozen=True)
 class Streams:
-    """Random streams of a layer: the numbers of a map are the same in any batch, order
-    or process.
+    """Random streams of a layer.
 
-    Draws of one kind and one name are the same numbers, so a layer that draws several
-    times names each draw.
+    The numbers of a map are the same in any batch, order or process. Draws of one kind
+    and one name return the same numbers, so a layer that draws several times must name
+    each draw.
 
     Args:
         seed: root seed of the recipe.
-        names: of the split, the layer and the number of rejected draws before.
-        indices: which maps of the split, shape [B].
-        grid: size and resolution.
+        names: split, layer and number of previously rejected draws.
+        indices: indices of the maps in the split, shape [B].
+        grid: size and resolution of the maps.
     """
 
     seed: int
@@ -43,19 +42,22 @@ class Streams:
     grid: Grid
 
     def noise(self, *periods_m: float, name: str = "") -> ndarray:
-        """Smooth noise in about [−0.7, 0.7] with a lattice spacing an octave, in
-        metres; shape [B, H, W].
+        """Return smooth noise in about [−0.7, 0.7], shape [B, H, W].
+
+        Args:
+            periods_m: lattice spacing of each octave in metres.
+            name: name of the draw.
         """
         names = (*self.names, name) if name else self.names
         periods = [period / self.grid.resolution_m for period in periods_m]
         return fractal_perlin(self.seed, names, self.indices, self.grid.shape, periods)
 
     def normal(self, name: str) -> ndarray:
-        """Standard normal numbers, one a cell, shape [B, H, W]."""
+        """Return standard normal numbers, one per cell, shape [B, H, W]."""
         return rng.normal(self._key(name), self.indices, self.grid.shape)
 
     def uniform(self, name: str, shape: tuple[int, ...] = ()) -> ndarray:
-        """Numbers in (0, 1), shape [B, *shape]; one a map by default."""
+        """Return numbers in (0, 1), shape [B, *shape]; by default, one per map."""
         return rng.uniform(self._key(name), self.indices, shape)
 
     def _key(self, name: str) -> int:
@@ -64,14 +66,14 @@ class Streams:
 
 @dataclass(frozen=True)
 class DrawnMaps:
-    """What is known of maps when their layers are drawn.
+    """Terrain of maps below their layers.
 
     Args:
-        class_id: index into the class table; 255 where the class is not known, as in
-            imported maps. Shape [B, H, W].
-        elevation_m: shape [B, H, W].
-        slope_deg: shape [B, H, W].
-        grid: size and resolution.
+        class_id: index into the class table; 255 is unlabelled, as in imported maps;
+            shape [B, H, W].
+        elevation_m: elevation in metres, shape [B, H, W].
+        slope_deg: slope in degrees, shape [B, H, W].
+        grid: size and resolution of the maps.
         classes: the class table.
     """
 
@@ -82,28 +84,29 @@ class DrawnMaps:
     classes: ClassTable
 
     def cells_of(self, *names: str) -> ndarray:
-        """Cells of some classes, bool, shape [B, H, W].
+        """Return a mask of the cells of some classes, bool, shape [B, H, W].
 
         Raises:
-            ConfigError: If the table has no class of a name.
+            ConfigError: If a name is not in the class table.
         """
-        numbers = {item.name: number for number, item in enumerate(self.classes)}
+        ids = {item.name: class_id for class_id, item in enumerate(self.classes)}
         for name in names:
-            check_known("a class of the recipe", name, numbers)
-        return np.isin(self.class_id, [numbers[name] for name in names])
+            check_known("a class of the recipe", name, ids)
+        return np.isin(self.class_id, [ids[name] for name in names])
 
 
 class Layer:
-    """A map of the terrain that a recipe draws, and that models may see.
+    """Map of a property of the terrain, drawn by a recipe and available to models.
 
     Attributes:
-        name: of the stored field and the input of models: letters, digits and `_`,
-            beginning with no digit. A name that ends in `_azimuth_deg` is a direction.
+        name: name of the stored field and of the input of models: letters, digits and
+            `_`, not beginning with a digit. A name that ends in `_azimuth_deg` is a
+            direction.
         unit: SI unit, or "1".
-        minimum: smallest value allowed.
-        maximum: largest value allowed.
+        minimum: smallest valid value.
+        maximum: largest valid value.
         meaning: one line for readers of the dataset.
-        stream: names of its random streams; the default is its own name.
+        stream: names of its random streams; by default, its name.
     """
 
     name: ClassVar[str] = ""
@@ -119,45 +122,51 @@ class Layer:
         """Check that the settings fit a recipe.
 
         Args:
-            grid: size and resolution of maps.
+            grid: size and resolution of the maps.
             classes: the class table.
-            colours: by scenario, the colours of the classes in full light after tints,
+            colours: for each scenario, the tinted colours of the classes in full light,
                 0–255, shape [C, 3].
 
         Raises:
-            ConfigError: If they do not.
+            ConfigError: If they do not fit.
         """
 
     def draw(self, streams: Streams, maps: DrawnMaps) -> ndarray:
-        """Draw the values of B maps, in `unit`, shape [B, H, W]; stored in single
-        precision.
+        """Return drawn values of B maps, in `unit`, shape [B, H, W].
+
+        Args:
+            streams: random numbers of the maps.
+            maps: the terrain below.
+
+        Returns:
+            Values, which are stored in single precision.
         """
         raise NotImplementedError
 
     def look(self, rgb: ndarray, values: ndarray, maps: DrawnMaps) -> ndarray:
-        """Return the colours in full light that the terrain has with the layer.
+        """Return the colours of the terrain with the layer, in full light.
 
         Args:
-            rgb: without it, after tints and earlier layers, 0–255, float64, shape [B,
-                3, H, W].
-            values: as stored, float64, shape [B, H, W].
-            maps: what lies below.
+            rgb: colours without it, after tints and earlier layers, 0–255, float64,
+                shape [B, 3, H, W].
+            values: values as stored, float64, shape [B, H, W].
+            maps: the terrain below.
         """
         return rgb
 
     def affect(
         self, mean: ndarray, std: ndarray, values: ndarray, maps: DrawnMaps
     ) -> tuple[ndarray, ndarray]:
-        """Return the distribution of λ that the terrain has with the layer.
+        """Return the distribution of λ with the layer.
 
         Called once for the latent function of the class and once for its soft spots.
 
         Args:
-            mean: of the normal distribution that λ is clipped from, without the layer,
-                in [0, 1], shape [B, H, W].
+            mean: mean of the normal distribution of λ before clipping, without the
+                layer, in [0, 1], shape [B, H, W].
             std: its standard deviation, in (0, 1], shape [B, H, W].
-            values: as stored, float64, shape [B, H, W].
-            maps: what lies below.
+            values: values as stored, float64, shape [B, H, W].
+            maps: the terrain below.
 
         Returns:
             Mean in [0, 1] and standard deviation in (0, 1], each of shape [B, H, W].
@@ -167,41 +176,42 @@ class Layer:
     def class_weights(
         self, weights: ndarray, values: ndarray, maps: DrawnMaps
     ) -> ndarray:
-        """Return the probability of each class by what a picture shows at best, for the
-        model `ideal`.
+        """Return class probabilities given an image with the layer, for model `ideal`.
 
         A layer that hides the colour of classes overrides this; weights need not sum to
         1.
 
         Args:
-            weights: of each class by colour without the layer, shape [B, C, H, W].
-            values: as stored, float64, shape [B, H, W].
-            maps: what lies below.
+            weights: class probabilities given the colours without the layer, shape [B,
+                C, H, W].
+            values: values as stored, float64, shape [B, H, W].
+            maps: the terrain below.
         """
         return weights
 
     def describe(self) -> str:
-        """Return a few words on the layer and its settings, for `show`."""
-        settings = ", ".join(
-            f"{name} {value}" for name, value in self.settings().items()
-        )
-        return f"layer {self.name}" + (f" ({settings})" if settings else "")
+        """Return a short description of the layer and its settings, for `show`."""
+        settings = [f"{name} {value}" for name, value in self.settings().items()]
+        suffix = f" ({', '.join(settings)})" if settings else ""
+        return f"layer {self.name}{suffix}"
 
     def describe_class(self, name: str) -> str:
-        """Return what the layer is on a class, in words; empty if there is nothing to
-        say.
-        """
+        """Return a description of the layer on a class; by default, it is empty."""
         return ""
 
     def class_columns(self, name: str) -> dict[str, float | str]:
-        """Return what an exported class table has of the layer, by column, the same
-        columns for all classes.
+        """Return the layer's columns of an exported class table, for one class.
+
+        All classes must have the same columns.
         """
         return {}
 
     def scaled(self, factor: float, resolution_m: float) -> Self:
-        """Return the layer for maps whose lengths are multiplied by a factor, with
-        cells of another width.
+        """Return the layer for maps of another size.
+
+        Args:
+            factor: factor of all lengths of the map.
+            resolution_m: new cell width in metres.
         """
         return self
 
@@ -212,18 +222,14 @@ class Layer:
 
     @classmethod
     def hides(cls) -> bool:
-        """Return whether it changes which classes a picture shows."""
+        """Return whether it changes the classes that an image shows."""
         return cls.class_weights is not Layer.class_weights
 
     def settings(self) -> dict[str, Any]:
-        """Return the values of its fields by name; a class that is no dataclass has
-        none.
-        """
-        return (
-            {each.name: getattr(self, each.name) for each in fields(self)}
-            if is_dataclass(self)
-            else {}
-        )
+        """Return the values of its dataclass fields by name."""
+        if not is_dataclass(self):
+            return {}
+        return {item.name: getattr(self, item.name) for item in fields(self)}
 
     @classmethod
     def field(cls) -> Field:

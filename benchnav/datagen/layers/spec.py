@@ -1,9 +1,8 @@
-"""What a recipe records of a layer, from which it is built again: part, options, stored
-field, digest of its code.
+"""Record of a layer in a recipe: part, options, stored field, digest of its code.
 
-A dataset with a layer of a user's is read without the layer's code; only generating
-maps, and what the colours of look-alike classes tell of λ where the layer changes it,
-need the code.
+The layer can be rebuilt from it. A dataset with a custom layer can be read without the
+layer's code. The code is needed to generate maps, and to predict λ from colours if the
+layer changes λ.
 """
 
 import sys
@@ -28,22 +27,23 @@ _OWN_PACKAGE = "benchnav."
 
 @dataclass(frozen=True, kw_only=True)
 class LayerSpec:
-    """A layer of a recipe, as its dataset records it.
+    """Layer of a recipe, as its dataset records it.
 
     Args:
         part: shipped name, entry point, `package.module:Name` or
             `path/to/file.py:Name`.
         options: all its settings, as plain data.
-        name: of the stored field.
-        unit: of the stored field.
-        minimum: smallest value allowed; None for any.
-        maximum: largest value allowed; None for any.
+        name: name of the stored field.
+        unit: unit of the stored field.
+        minimum: smallest valid value; None for any.
+        maximum: largest valid value; None for any.
         meaning: one line for readers of the dataset.
-        words: the layer and its settings, for `show`.
+        words: description of the layer and its settings, for `show`.
         affects: whether it changes the distribution of λ.
-        hides: whether it changes which classes a picture shows.
-        source: where its code was found; empty if it is shipped.
-        digest: SHA-256 of its code and of what that imports; empty if it is shipped.
+        hides: whether it changes the classes that an image shows.
+        source: origin of its code; empty if it is shipped.
+        digest: SHA-256 of its code and the code that it imports; empty if it is
+            shipped.
         files: digests of the files that its options name.
     """
 
@@ -66,26 +66,24 @@ class LayerSpec:
         check_layer_name(f"`name` of layer {self.part}", self.name)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out the object, whose class another process may have to load from a
-        file.
-        """
+        """Omit the layer itself, since another process may need to load its class."""
         return {name: value for name, value in vars(self).items() if name != "layer"}
 
     @property
     def stored_field(self) -> Field:
-        """The stored field."""
+        """Stored field, with its limits."""
         low = -np.inf if self.minimum is None else self.minimum
         high = np.inf if self.maximum is None else self.maximum
         return Field("<f4", ("H", "W"), self.unit, low, high, self.meaning)
 
     @property
     def is_vegetation(self) -> bool:
-        """Whether recipes write it by the keys of vegetation."""
+        """Whether recipes contain it under the keys of vegetation."""
         return self.part == "vegetation"
 
     @property
     def meaning_of_maps(self) -> dict[str, Any]:
-        """What the maps depend on, wherever the code lies."""
+        """Entries that determine the maps, independent of the location of the code."""
         return {
             "name": self.name,
             "options": self.options,
@@ -100,10 +98,10 @@ class LayerSpec:
 
     @cached_property
     def layer(self) -> Layer:
-        """The layer itself.
+        """The layer itself, built from the record.
 
         Raises:
-            ConfigError: If its code is not found, is other code than was recorded, or
+            ConfigError: If its code is not found, differs from the recorded code, or
                 rejects its options.
         """
         if self.is_vegetation:
@@ -112,26 +110,26 @@ class LayerSpec:
             part=self.part, label=self.name, options=self.options, kind=KIND
         )
         try:
-            layer, digest = part.create(), part.found.digest
+            layer = part.create()
+            digest = part.found.digest
             files = registry.option_files(part) if self.source else {}
         except BenchnavError as error:
             raise ConfigError(
                 f"The code of layer {self.name!r} is needed to generate maps or to "
-                f"tell what colours show: {error}"
+                f"predict from colours: {error}"
             ) from error
         expect(
             digest == self.digest,
             f"the code of layer {self.name!r} that the dataset records, of digest "
-            f"{self.digest[:12] or 'none'}, got "
-            f"{self.part} of digest {digest[:12] or 'none'}. Restore that code, or "
-            "make a new dataset.",
+            f"{self.digest[:12] or 'none'}, got {self.part} of digest "
+            f"{digest[:12] or 'none'}. Restore that code, or create a new dataset.",
         )
+        changed = ", ".join(sorted(dict(files.items() ^ self.files.items())))
         expect(
             files == self.files,
             f"the files that options of layer {self.name!r} name as the dataset "
-            "records them, got others: "
-            f"{', '.join(sorted(dict(files.items() ^ self.files.items())))}. Restore "
-            "them, or make a new dataset.",
+            f"records them, got others: {changed}. Restore them, or create a new "
+            "dataset.",
         )
         return layer
 
@@ -139,67 +137,67 @@ class LayerSpec:
         """Check that other processes can build the layer.
 
         Raises:
-            ConfigError: If its class is known in this process only.
+            ConfigError: If its class is registered in this process only.
         """
-        found = None if self.is_vegetation else registry.find(KIND, self.part)
+        entry = None if self.is_vegetation else registry.find(KIND, self.part)
         expect(
-            found is None or found.everywhere,
+            entry is None or entry.everywhere,
             f"one process with layer {self.name!r}, whose class is registered in this "
-            "process only, got more. Pass "
-            "`jobs` 1, or put the class in a file.",
+            "process only, got more. Pass `jobs` 1, or put the class in a file.",
         )
 
     @property
     def available(self) -> Layer | None:
-        """The layer itself, None if its code is not here."""
+        """The layer itself; None if its code is not available."""
         with suppress(BenchnavError):
             return self.layer
         return None
 
     def scaled(self, factor: float, resolution_m: float) -> Self:
-        """Return it for maps whose lengths are multiplied by a factor; see
-        `Layer.scaled`.
-        """
+        """Return the record for maps of another size; see `Layer.scaled`."""
         settings = plain(self.layer.scaled(factor, resolution_m).settings())
         return self if settings == self.options else replace(self, options=settings)
 
 
-def read_layer(given: Any) -> LayerSpec:
-    """Read a layer as a recipe has it.
+def read_layer(entry: Any) -> LayerSpec:
+    """Return the record of a layer in a recipe.
 
     Args:
-        given: `NAME`, `{part: NAME, options: {…}}`, a `LayerSpec` as plain data, or a
-            `Layer`.
+        entry: `NAME`, `{part: NAME, options: {…}}`, a `LayerSpec`, also as plain data,
+            or a `Layer`.
 
     Raises:
-        ConfigError: If it is none of these, or there is no such layer or option.
+        ConfigError: If it is of another type, or there is no such layer or option.
     """
-    if isinstance(given, LayerSpec):
-        return given
-    if isinstance(given, Layer):
-        options = plain(given.settings())
-        return _record(
-            registry.Part(part=_part_of(given), label="", options=options, kind=KIND),
-            given,
-        )
-    if isinstance(given, Mapping) and "name" in given:
-        return read(LayerSpec, given, of("a layer"))
+    if isinstance(entry, LayerSpec):
+        return entry
+    if isinstance(entry, Layer):
+        options = plain(entry.settings())
+        part = registry.Part(part=_part_of(entry), label="", options=options, kind=KIND)
+        return _record(part, entry)
+    is_mapping = isinstance(entry, Mapping)
+    if is_mapping and "name" in entry:
+        return read(LayerSpec, entry, of("a layer"))
     expect(
-        isinstance(given, str) or (isinstance(given, Mapping) and "label" not in given),
-        f"a layer as NAME or as {{part: NAME, options: {{…}}}}, got {given!r}.",
+        isinstance(entry, str) or (is_mapping and "label" not in entry),
+        f"a layer as NAME or as {{part: NAME, options: {{…}}}}, got {entry!r}.",
     )
-    part = registry.complete(KIND, registry.read_part(KIND, given))
+    part = registry.complete(KIND, registry.read_part(KIND, entry))
     return _record(part, part.create())
 
 
-def read_layers(given: Any) -> tuple[LayerSpec, ...]:
-    """Read the layers of a recipe, in the order in which they are drawn.
+def read_layers(entries: Any) -> tuple[LayerSpec, ...]:
+    """Return the records of a recipe's layers, in the order of being drawn.
+
+    Args:
+        entries: list of what `read_layer` reads.
 
     Raises:
-        ConfigError: If they are no list, two have one name, or as of `read_layer`.
+        ConfigError: If it is not a list, two layers have one name, or `read_layer`
+            raises.
     """
-    expect(isinstance(given, list | tuple), f"`layers` as a list, got {given!r}.")
-    specs = tuple(map(read_layer, given))
+    expect(isinstance(entries, list | tuple), f"`layers` as a list, got {entries!r}.")
+    specs = tuple(map(read_layer, entries))
     names = [spec.name for spec in specs]
     for name in names:
         expect(
@@ -217,11 +215,9 @@ def overrides_of(
     for old, new in zip(before, after, strict=True):
         key = "vegetation_" if old.is_vegetation else f"layers.{number}.options."
         number += not old.is_vegetation
-        changed |= {
-            key + name: value
-            for name, value in new.options.items()
-            if value != old.options[name]
-        }
+        for name, value in new.options.items():
+            if value != old.options[name]:
+                changed[key + name] = value
     return changed
 
 
@@ -232,7 +228,7 @@ def shipped_fields() -> dict[str, Field]:
 
 @cache
 def _shipped_fields(path: tuple[str, ...]) -> dict[str, Field]:
-    """See `shipped_fields`; asked again when the path has changed."""
+    """Return the fields of `shipped_fields`, cached for each search path."""
     layers: Iterable[type[Layer]] = (Vegetation, *_shipped_classes().values())
     return {layer.name: layer.field() for layer in layers}
 
@@ -244,39 +240,40 @@ def _shipped_classes() -> dict[str, type[Layer]]:
 
 
 def _part_of(layer: Layer) -> str:
-    """Name the class of a layer so that it can be found again."""
+    """Return the name by which the class of a layer can be found again."""
     kind = type(layer)
     if isinstance(layer, Vegetation):
         return "vegetation"
-    if kind.__module__.startswith(_OWN_PACKAGE):
-        return next(
-            name for name, target in _shipped_classes().items() if target is kind
-        )
-    is_file = kind.__module__.startswith("benchnav_file_")
-    place = sys.modules[kind.__module__].__file__ if is_file else kind.__module__
-    return f"{place}:{kind.__qualname__}"
+    module = kind.__module__
+    if module.startswith(_OWN_PACKAGE):
+        classes = _shipped_classes()
+        return next(name for name, target in classes.items() if target is kind)
+    is_file = module.startswith("benchnav_file_")
+    location = sys.modules[module].__file__ if is_file else module
+    return f"{location}:{kind.__qualname__}"
 
 
 def _record(part: registry.Part, layer: Layer) -> LayerSpec:
-    """Record a layer that was built."""
-    kind, is_vegetation = type(layer), isinstance(layer, Vegetation)
+    """Return the record of a layer that was built."""
+    kind = type(layer)
+    is_vegetation = isinstance(layer, Vegetation)
     stored = kind.field()
-    found = None if is_vegetation else part.found
-    is_own = found is not None and not found.shipped
+    entry = None if is_vegetation else part.found
+    is_custom = entry is not None and not entry.shipped
     spec = LayerSpec(
         part="vegetation" if is_vegetation else part.part,
         options=dict(part.options),
         name=kind.name,
         unit=stored.unit,
-        minimum=stored.least if np.isfinite(stored.least) else None,
-        maximum=stored.most if np.isfinite(stored.most) else None,
+        minimum=stored.minimum if np.isfinite(stored.minimum) else None,
+        maximum=stored.maximum if np.isfinite(stored.maximum) else None,
         meaning=stored.meaning,
         words=layer.describe(),
         affects=kind.affects(),
         hides=kind.hides(),
-        source=found.origin if found and is_own else "",
-        digest=found.digest if found and is_own else "",
-        files=registry.option_files(part) if is_own else {},
+        source=entry.origin if entry and is_custom else "",
+        digest=entry.digest if entry and is_custom else "",
+        files=registry.option_files(part) if is_custom else {},
     )
     vars(spec)["layer"] = layer
     return spec

@@ -1,4 +1,4 @@
-"""The layers of some maps, applied one after another; what a layer returns is checked.
+"""Layers of maps, applied in order, with checks of what each returns.
 
 Letters in shapes: B maps, H×W cells, C classes, K components.
 """
@@ -15,9 +15,8 @@ from benchnav.core.settings import one_line
 from benchnav.datagen.layers.layer import DrawnMaps, Layer, Streams
 from benchnav.datagen.recipe.classes import ClassTable
 
-Parameters = tuple[
-    ndarray, ndarray, ndarray
-]  # weights, means, standard deviations, each of shape [B, K, H, W]
+# Weights, means and standard deviations, each of shape [B, K, H, W].
+Parameters = tuple[ndarray, ndarray, ndarray]
 
 
 def check_layer(
@@ -34,21 +33,20 @@ def draw_layers(
     indices: ndarray,
     maps: DrawnMaps,
 ) -> dict[str, ndarray]:
-    """Draw the values of layers.
+    """Return drawn values of layers.
 
     Args:
-        layers: in their order.
+        layers: layers in their order.
         seed: root seed of the recipe.
-        names: the split, and the number of rejected draws before.
-        indices: which maps of the split, shape [B].
-        maps: what lies below.
+        names: the split, and the number of previously rejected draws.
+        indices: indices of the maps in the split, shape [B].
+        maps: the terrain below.
 
     Returns:
-        By layer, values as stored but in float64, shape [B, H, W].
+        Values by layer as stored, but in float64, shape [B, H, W].
 
     Raises:
-        ConfigError: If a layer raises, or returns another shape or a value that is not
-            allowed.
+        ConfigError: If a layer raises, or returns another shape or an invalid value.
     """
     split, attempt = names
     values = {}
@@ -68,14 +66,16 @@ def colour_layers(
     values: Mapping[str, ndarray],
     maps: DrawnMaps,
 ) -> ndarray:
-    """Return the colours in full light that the terrain has with all layers, 0–255,
-    shape [B, 3, H, W].
+    """Return the colours of the terrain with all layers, in full light.
 
     Args:
-        layers: in their order.
-        rgb: without them, float64, shape [B, 3, H, W].
-        values: by layer, shape [B, H, W].
-        maps: what lies below.
+        layers: layers in their order.
+        rgb: colours without them, 0–255, float64, shape [B, 3, H, W].
+        values: values by layer, shape [B, H, W].
+        maps: the terrain below.
+
+    Returns:
+        0–255, float64, shape [B, 3, H, W].
 
     Raises:
         ConfigError: If a layer raises, or returns another shape or a value beyond
@@ -95,13 +95,13 @@ def affect_layers(
 ) -> Parameters:
     """Return the true distribution of λ with all layers.
 
-    Components without weight, and cells whose class is not known, stay as they are.
+    Components without weight, and unlabelled cells, do not change.
 
     Args:
-        layers: in their order.
-        truth: without them.
-        values: by layer, shape [B, H, W].
-        maps: what lies below.
+        layers: layers in their order.
+        truth: distribution without them.
+        values: values by layer, shape [B, H, W].
+        maps: the terrain below.
 
     Raises:
         ConfigError: If a layer raises, or returns another shape, a mean beyond [0, 1]
@@ -114,21 +114,22 @@ def affect_layers(
     for component in range(weights.shape[1]):
         cells = (weights[:, component] > 0) & ~np.isnan(means[:, component])
         for layer in layers:
-            mean, std = means[:, component], stds[:, component]
-            result = _call(
-                layer, "affect", layer.affect, mean, std, values[layer.name], maps
-            )
+            mean = means[:, component]
+            std = stds[:, component]
+            arguments = mean, std, values[layer.name], maps
+            result = _call(layer, "affect", layer.affect, *arguments)
             is_pair = isinstance(result, tuple) and len(result) == 2
             expect(
                 is_pair,
                 f"mean and std of `affect` of layer {layer.name!r}, got "
                 f"{type(result).__name__}.",
             )
+            new_mean, new_std = result
             new_mean = _checked(
-                layer, "means of `affect`", result[0], mean.shape, (0, 1), cells
+                layer, "means of `affect`", new_mean, mean.shape, (0, 1), cells
             )
             new_std = _checked(
-                layer, "stds of `affect`", result[1], std.shape, (1e-6, 1), cells
+                layer, "stds of `affect`", new_std, std.shape, (1e-6, 1), cells
             )
             means[:, component] = np.where(cells, new_mean, mean)
             stds[:, component] = np.where(cells, new_std, std)
@@ -141,42 +142,39 @@ def weigh_layers(
     values: Mapping[str, ndarray],
     maps: DrawnMaps,
 ) -> ndarray:
-    """Return the probability of each class by what a picture shows with all layers,
-    shape [B, C, H, W].
+    """Return class probabilities given an image with all layers.
 
     Args:
-        layers: in their order.
-        weights: by colour without them, shape [B, C, H, W].
-        values: by layer, shape [B, H, W].
-        maps: what lies below.
+        layers: layers in their order.
+        weights: class probabilities given colours without them, shape [B, C, H, W].
+        values: values by layer, shape [B, H, W].
+        maps: the terrain below.
+
+    Returns:
+        Weights, float64, shape [B, C, H, W]; with a layer that hides colours, they sum
+        to 1 over C.
 
     Raises:
         ConfigError: If a layer raises, or returns another shape or a weight that is
-            negative or not finite.
+            negative or non-finite.
     """
     hiding = [layer for layer in layers if layer.hides()]
     for layer in hiding:
-        changed = _call(
-            layer,
-            "class_weights",
-            layer.class_weights,
-            weights,
-            values[layer.name],
-            maps,
-        )
+        arguments = weights, values[layer.name], maps
+        result = _call(layer, "class_weights", layer.class_weights, *arguments)
         weights = _checked(
-            layer, "weights of `class_weights`", changed, weights.shape, (0, np.inf)
+            layer, "weights of `class_weights`", result, weights.shape, (0, np.inf)
         )
     if not hiding:
         return weights
-    total = sum(weights[:, number] for number in range(weights.shape[1]))
+    total = sum(weights[:, class_id] for class_id in range(weights.shape[1]))
     return weights / np.maximum(total, np.finfo(np.float64).tiny)[:, None]
 
 
 def _call(
     layer: Layer, method: str, function: Callable[..., Any], *arguments: Any
 ) -> Any:
-    """Call a method of a layer; whatever it raises ends in one line."""
+    """Call a method of a layer; convert its exceptions to a message of one line."""
     try:
         return function(*arguments)
     except Exception as error:
@@ -195,15 +193,18 @@ def _checked(
     limits: tuple[float, float],
     cells: ndarray | None = None,
 ) -> ndarray:
-    """Return what a layer returned as float64.
+    """Return the result of a layer's method as float64, after checks.
 
     Args:
-        layer: which.
-        what: what it returned, for messages.
-        result: what it returned.
-        shape: the shape that it must have.
-        limits: the smallest and the largest value allowed.
-        cells: where values are used, bool; None for everywhere.
+        layer: the layer, for messages.
+        what: description of the result, for messages.
+        result: the result.
+        shape: expected shape.
+        limits: smallest and largest valid value.
+        cells: mask of the cells whose values are used; None for all.
+
+    Raises:
+        ConfigError: If the result is invalid.
     """
     try:
         array = np.asarray(result, dtype=np.float64)
@@ -218,15 +219,14 @@ def _checked(
         f"{list(array.shape)}.",
     )
     low, high = limits
-    wrong = ~((array >= low) & (array <= high) & np.isfinite(array))
+    invalid = ~((array >= low) & (array <= high) & np.isfinite(array))
     if cells is not None:
-        wrong &= cells
-    if wrong.any():
-        allowed = (
-            "finite" if np.isinf(low) and np.isinf(high) else f"in [{low:g}, {high:g}]"
-        )
+        invalid &= cells
+    if invalid.any():
+        is_unbounded = np.isinf(low) and np.isinf(high)
+        valid_range = "finite" if is_unbounded else f"in [{low:g}, {high:g}]"
         raise ConfigError(
-            f"Expected {what} of layer {layer.name!r} {allowed}, got "
-            f"{array[wrong][0]:g} in {wrong.sum()} cells."
+            f"Expected {what} of layer {layer.name!r} {valid_range}, got "
+            f"{array[invalid][0]:g} in {invalid.sum()} cells."
         )
     return array

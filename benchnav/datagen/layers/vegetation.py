@@ -1,7 +1,6 @@
-"""Vegetation: it hides the colour of the terrain on some cells of a class, and leaves λ
-as it is.
+"""Vegetation: a layer that hides the terrain's colour and does not change λ.
 
-Recipes write it as `vegetation` of a class and as `vegetation_period_m`. Letters in
+Recipes describe it by `vegetation` of a class and by `vegetation_period_m`. Letters in
 shapes: B maps, H×W cells, C classes.
 """
 
@@ -19,15 +18,16 @@ from benchnav.datagen.layers.layer import DrawnMaps, Layer, Streams
 from benchnav.datagen.recipe.classes import ClassTable, check_colour, look_alike_classes
 from benchnav.datagen.schema import quantise
 
-MIN_HEIGHT_M, MAX_HEIGHT_M = 0.01, 100.0
+MIN_HEIGHT_M = 0.01
+MAX_HEIGHT_M = 100.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Growth:
-    """What grows on some cells of a class.
+    """Vegetation on some cells of a class.
 
     Args:
-        height_m: least and greatest height, in metres; heights are uniform between
+        height_m: minimum and maximum height in metres; heights are uniform between
             them.
         cover: fraction of the class's cells that is overgrown, in (0, 1].
         colour: RGB in full light, 0–255.
@@ -43,8 +43,7 @@ class Growth:
         expect(
             MIN_HEIGHT_M <= low <= high <= MAX_HEIGHT_M,
             f"`height_m` of vegetation ordered and within [{MIN_HEIGHT_M:g}, "
-            f"{MAX_HEIGHT_M:g}], "
-            f"got {list(self.height_m)}.",
+            f"{MAX_HEIGHT_M:g}], got {list(self.height_m)}.",
         )
         expect(
             0 < self.cover <= 1, f"`cover` of vegetation in (0, 1], got {self.cover}."
@@ -53,18 +52,18 @@ class Growth:
 
     @property
     def appearance(self) -> str:
-        """What a picture shows of it: colour and cover."""
+        """Properties that an image shows, as text: colour and cover."""
         return f"{list(self.colour)} on {self.cover:.6g}"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Vegetation(Layer):
-    """Vegetation on classes, in patches by one noise for all of them.
+    """Vegetation in patches, by one noise for all classes.
 
     Args:
-        period_m: lattice spacing of the noise, at least two cells: a patch is about
-            half as wide.
-        classes: what grows, by class.
+        period_m: lattice spacing of the noise in metres, at least two cells; a patch is
+            about half as wide.
+        classes: vegetation by class.
     """
 
     period_m: float
@@ -80,127 +79,123 @@ class Vegetation(Layer):
     def check(
         self, grid: Grid, classes: ClassTable, colours: Mapping[str, ndarray]
     ) -> None:
-        """Check that it neither makes classes look alike nor tells look-alikes apart,
-        but by its height.
+        """Check that its colours neither create nor separate look-alike classes.
+
+        See `Layer.check`. Heights may separate them.
         """
         min_m = 2 * grid.resolution_m
         expect(
             min_m <= self.period_m < np.inf,
             f"`vegetation_period_m` of at least two cells, {min_m:g} m, where a class "
-            "has `vegetation`, "
-            f"got {self.period_m:g}.",
+            f"has `vegetation`, got {self.period_m:g}.",
         )
         names = [item.name for item in classes]
         for name in self.classes:
             check_known("classes of layer 'vegetation'", name, names)
         growths = [self.classes.get(name) for name in names]
         shown = [growth.appearance if growth else "none" for growth in growths]
-        for number, alike in enumerate(look_alike_classes(classes)):
-            if shown[alike[0]] != shown[number]:
+        for class_id, alike in enumerate(look_alike_classes(classes)):
+            first = alike[0]
+            if shown[first] != shown[class_id]:
                 raise ConfigError(
                     "Expected `vegetation` of one `colour` and `cover` on "
-                    f"{names[alike[0]]!r} and "
-                    f"{names[number]!r}, whose ground has one colour, got "
-                    f"{shown[alike[0]]} and {shown[number]}. "
-                    "Only `height_m` may tell them apart."
+                    f"{names[first]!r} and {names[class_id]!r}, whose terrain has one "
+                    f"colour, got {shown[first]} and {shown[class_id]}. Only "
+                    "`height_m` may differ."
                 )
-        for scenario, ground in colours.items():
+        for scenario, class_colours in colours.items():
             for name, growth in self.classes.items():
-                is_same = (ground == growth.colour).all(axis=1)
-                same = [repr(names[number]) for number in np.flatnonzero(is_same)]
+                is_same = (class_colours == growth.colour).all(axis=1)
+                same = [repr(names[class_id]) for class_id in np.flatnonzero(is_same)]
                 expect(
                     not same,
-                    f"vegetation on {name!r} of a `colour` that no ground has in "
-                    f"scenario {scenario!r}, "
-                    f"got that of {', '.join(same)}.",
+                    f"vegetation on {name!r} of a `colour` that no terrain has in "
+                    f"scenario {scenario!r}, got that of {', '.join(same)}.",
                 )
 
     def draw(self, streams: Streams, maps: DrawnMaps) -> ndarray:
-        """Draw heights in steps of 2⁻¹⁰ m, 0 on bare ground."""
+        """Return drawn heights in steps of 2⁻¹⁰ m, 0 on bare terrain."""
         return self.grow(streams.noise(self.period_m, self.period_m / 2), maps)
 
     def grow(self, noise: ndarray, maps: DrawnMaps) -> ndarray:
-        """Grow vegetation where the noise is greatest, the higher the greater it is.
+        """Return heights that increase with the noise, 0 on bare terrain.
 
-        On each map it covers the fraction `cover` of each class's cells, to within a
-        cell, and takes all heights of the class equally often. It goes by ranks within
-        the class, so where it grows does not show on which of two look-alike classes it
-        is.
+        On each map, vegetation covers the fraction `cover` of each class's cells, to
+        within a cell, and its heights are uniform. Both follow ranks within the class,
+        so patches do not reveal the class among look-alikes.
 
         Args:
-            noise: shape [B, H, W].
-            maps: what lies below.
+            noise: smooth noise, shape [B, H, W].
+            maps: the terrain below.
+
+        Returns:
+            Metres, float64, shape [B, H, W].
         """
-        flat_id, height_m = maps.class_id.reshape(len(noise), -1), np.zeros(noise.shape)
-        flat, heights = noise.reshape(len(noise), -1), height_m.reshape(len(noise), -1)
-        for number, item in enumerate(maps.classes):
+        flat_id = maps.class_id.reshape(len(noise), -1)
+        flat = noise.reshape(len(noise), -1)
+        height_m = np.zeros(noise.shape)
+        heights = height_m.reshape(len(noise), -1)
+        for class_id, item in enumerate(maps.classes):
             growth = self.classes.get(item.name)
             if growth is None:
                 continue
-            cells = flat_id == number
+            cells = flat_id == class_id
             n_overgrown = np.rint(growth.cover * cells.sum(axis=1, keepdims=True))
             order = np.argsort(np.where(cells, -flat, np.inf), axis=1, kind="stable")
             rank = np.empty_like(order)
             np.put_along_axis(rank, order, np.arange(flat.shape[1])[None], axis=1)
             low, high = growth.height_m
             fraction = 1 - (rank + 0.5) / np.maximum(n_overgrown, 1)
-            heights[:] = np.where(
-                cells & (rank < n_overgrown), low + (high - low) * fraction, heights
-            )
+            grown = low + (high - low) * fraction
+            heights[:] = np.where(cells & (rank < n_overgrown), grown, heights)
         return quantise(height_m, 10)
 
     def look(self, rgb: ndarray, values: ndarray, maps: DrawnMaps) -> ndarray:
-        """Hide the terrain below vegetation."""
+        """Return colours with the terrain hidden by vegetation; see `Layer.look`."""
         for name, growth in self.classes.items():
             cells = maps.cells_of(name) & (values > 0)
-            rgb = np.where(
-                cells[:, None],
-                np.array(growth.colour, dtype=np.float64)[:, None, None],
-                rgb,
-            )
+            colour = np.array(growth.colour, dtype=np.float64)[:, None, None]
+            rgb = np.where(cells[:, None], colour, rgb)
         return rgb
 
     def class_weights(
         self, weights: ndarray, values: ndarray, maps: DrawnMaps
     ) -> ndarray:
-        """Weigh the classes that may lie below vegetation of one colour by their cover.
+        """Return weights of the classes that may lie below vegetation of one colour.
 
-        An overgrown cell looks like those of all classes of its map on which the same
-        grows. Where these have one ground colour too, this is all that a whole picture
-        tells. Where they have not, bare ground next to a patch hints at the ground
-        within, so that a model that looks around can do better than this.
+        An overgrown cell looks like the overgrown cells of all classes of its map with
+        vegetation of the same colour. Their weights are their covers. If these classes
+        also share their terrain colour, an image contains no more information. If they
+        do not, bare terrain next to a patch indicates the class within it, and a model
+        that uses the neighbourhood can predict better.
         """
-        weights, overgrown = weights.copy(), values > 0
+        weights = weights.copy()
+        overgrown = values > 0
         growths = [self.classes.get(item.name) for item in maps.classes]
-        numbers = range(len(growths))
         is_shown = [
-            (maps.class_id == number).any(axis=(1, 2))[:, None, None]
-            for number in numbers
+            (maps.class_id == class_id).any(axis=(1, 2))[:, None, None]
+            for class_id in range(len(growths))
         ]
-        for number, growth in enumerate(growths):
-            cells = overgrown & (maps.class_id == number)
+        for class_id, growth in enumerate(growths):
+            cells = overgrown & (maps.class_id == class_id)
             if not cells.any():
                 continue
-            for other, candidate in enumerate(growths):
-                weight: ndarray | float = float(other == number)
-                if growth is not None:
-                    is_alike = (
-                        candidate is not None and candidate.colour == growth.colour
-                    )
-                    weight = (
-                        candidate.cover * is_shown[other]
-                        if candidate and is_alike
-                        else 0.0
-                    )
-                weights[:, other] = np.where(cells, weight, weights[:, other])
+            for candidate_id, candidate in enumerate(growths):
+                weight: ndarray | float = 0.0
+                if growth is None:
+                    weight = float(candidate_id == class_id)
+                elif candidate is not None and candidate.colour == growth.colour:
+                    weight = candidate.cover * is_shown[candidate_id]
+                old_weight = weights[:, candidate_id]
+                weights[:, candidate_id] = np.where(cells, weight, old_weight)
         return weights
 
     def describe(self) -> str:
-        """Return the size of its patches in words."""
+        """Return a description with the size of the patches."""
         return f"vegetation in patches with a period of {self.period_m:g} m"
 
     def describe_class(self, name: str) -> str:
-        """Return cover, colour and heights on a class, in words."""
+        """Return cover, colour and heights on a class, as text."""
         growth = self.classes.get(name)
         if growth is None:
             return ""
@@ -208,7 +203,7 @@ class Vegetation(Layer):
         return f"{growth.cover:.0%} #{bytes(growth.colour).hex()} {low:g}–{high:g} m"
 
     def class_columns(self, name: str) -> dict[str, float | str]:
-        """Return cover, heights and colour on a class, 0 and empty where nothing grows."""
+        """Return cover, heights and colour on a class; 0 and empty without vegetation."""
         growth = self.classes.get(name)
         low, high = growth.height_m if growth else (0.0, 0.0)
         return {
@@ -219,27 +214,26 @@ class Vegetation(Layer):
         }
 
     def scaled(self, factor: float, resolution_m: float) -> Self:
-        """Return it with patches on the same part of a map, of at least two cells."""
-        return replace(
-            self, period_m=max(2 * resolution_m, float(f"{self.period_m * factor:.6g}"))
-        )
+        """Return the layer with patches scaled with the map, of at least two cells."""
+        period_m = float(f"{self.period_m * factor:.6g}")
+        return replace(self, period_m=max(2 * resolution_m, period_m))
 
 
 def read_keys(data: Mapping[str, Any]) -> tuple[Vegetation | None, dict[str, Any]]:
-    """Read vegetation as recipes write it, `vegetation` of classes and
-    `vegetation_period_m`.
+    """Return the vegetation of a recipe: `vegetation` of classes, and its period.
 
     Args:
         data: a recipe as plain data.
 
     Returns:
-        The layer, None if the recipe has none; and the rest of the recipe.
+        The layer, or None without vegetation; and the recipe without its keys.
 
     Raises:
-        ConfigError: If it is not usable as given.
+        ConfigError: If the keys are invalid.
     """
-    rest, rows = dict(data), data.get("classes")
-    period_m = rest.pop("vegetation_period_m", 0.0)
+    recipe = dict(data)
+    rows = data.get("classes")
+    period_m = recipe.pop("vegetation_period_m", 0.0)
     growths = {}
     if isinstance(rows, list | tuple):
         items = [item for item in rows if isinstance(item, Mapping)]
@@ -248,7 +242,7 @@ def read_keys(data: Mapping[str, Any]) -> tuple[Vegetation | None, dict[str, Any
             for item in items
             if item.get("vegetation")
         }
-        rest["classes"] = [_without_vegetation(item) for item in rows]
+        recipe["classes"] = [_without_vegetation(item) for item in rows]
         names = {str(item.get("name")) for item in items}
         expect(
             not growths or len(names) == len(items),
@@ -256,30 +250,27 @@ def read_keys(data: Mapping[str, Any]) -> tuple[Vegetation | None, dict[str, Any
             "name. Rename one.",
         )
     if growths:
-        return read(
-            Vegetation, {"period_m": period_m, "classes": growths}, _key_of
-        ), rest
+        options = {"period_m": period_m, "classes": growths}
+        return read(Vegetation, options, _key_of), recipe
     expect(
         not period_m,
-        f"`vegetation_period_m` with `vegetation` of a class, got {period_m} and "
-        "none. Leave it out.",
+        f"`vegetation_period_m` only with `vegetation` of a class, got {period_m}. "
+        "Leave it out.",
     )
-    return None, rest
+    return None, recipe
 
 
 def write_classes(
     rows: list[dict[str, Any]], vegetation: Vegetation | None
 ) -> list[dict[str, Any]]:
-    """Return the rows of a class table, as plain data, with `vegetation` where
-    something grows.
-    """
+    """Return the rows of a class table as plain data, with their `vegetation`."""
     growths = vegetation.classes if vegetation else {}
-    return [
-        row | {"vegetation": plain(growths[row["name"]])}
-        if row["name"] in growths
-        else row
-        for row in rows
-    ]
+    written = []
+    for row in rows:
+        if row["name"] in growths:
+            row = row | {"vegetation": plain(growths[row["name"]])}
+        written.append(row)
+    return written
 
 
 def _without_vegetation(row: Any) -> Any:
@@ -289,7 +280,7 @@ def _without_vegetation(row: Any) -> Any:
 
 
 def _key_of(key: str) -> str:
-    """Name an option of the layer as a recipe's keys do."""
+    """Return the name of an option of the layer as a recipe's key."""
     head, _, tail = key.partition(".")
     name, _, inner = tail.partition(".")
     if head == "classes" and name:

@@ -1,5 +1,4 @@
-"""Terrain classes: their looks, and what their latent traversability (LT) functions are
-made of.
+"""Terrain classes: colours, and parameters of latent traversability (LT) functions.
 
 Beyond the paper, a class may have soft spots, a second mode of λ that neither colour
 nor slope shows, and classes may share a colour.
@@ -14,13 +13,12 @@ from benchnav.core.errors import check_label, expect
 
 @dataclass(frozen=True, kw_only=True)
 class SoftSpots:
-    """Ground of a class that is soft for no reason one could see: buried loose sand, a
-    wet patch.
+    """Second mode of λ of a class that no image shows, such as buried loose sand.
 
     Args:
-        weight: share of the class's ground, in (0, 1).
-        mean: λ there before clipping, at any slope.
-        std: its standard deviation, > 0.
+        weight: fraction of the class's cells, in (0, 1).
+        mean: mean of λ there before clipping, at any slope, in [0, 1].
+        std: its standard deviation, in (0, 1].
     """
 
     weight: float
@@ -28,7 +26,7 @@ class SoftSpots:
     std: float
 
     def __post_init__(self) -> None:
-        """Refuses values that make no distribution."""
+        """Reject values out of range."""
         expect(
             0 < self.weight < 1 and 0 <= self.mean <= 1 and 0 < self.std <= 1,
             "soft spots of `weight` in (0, 1), `mean` in [0, 1] and `std` in (0, 1], "
@@ -38,16 +36,16 @@ class SoftSpots:
 
 @dataclass(frozen=True, kw_only=True)
 class TerrainClass:
-    """A terrain class: its looks and its LT function.
+    """Terrain class: its colour and its LT function.
 
     Args:
-        name: what people call it.
+        name: name of the class.
         colour: RGB in full light, 0–255.
         scale: a_c, in [1, 9] in the shipped table.
         exponent: b_c, in [1.4, 2.0] in the shipped table.
         offset: o_c, loss on flat ground, in [0, 0.1] in the shipped table.
         noise: σ_c, in [0.1, 0.2] in the shipped table.
-        soft: its soft spots, if it has any.
+        soft: its soft spots; None if it has no soft spots.
     """
 
     name: str
@@ -59,15 +57,13 @@ class TerrainClass:
     soft: SoftSpots | None = None
 
     def __post_init__(self) -> None:
-        """Refuses values that make no LT function or no colour."""
+        """Reject an invalid name or colour, and parameters out of range."""
         check_label("`name` of a class", self.name)
         check_colour(f"class {self.name!r}", self.colour)
         numbers = self.scale, self.exponent, self.offset, self.noise
+        in_range = self.scale >= 0 and self.exponent > 0 and self.noise > 0
         expect(
-            np.isfinite(numbers).all()
-            and self.scale >= 0
-            and self.exponent > 0
-            and self.noise > 0,
+            np.isfinite(numbers).all() and in_range,
             f"`scale` ≥ 0, `exponent` > 0 and `noise` > 0 of class {self.name!r}, "
             f"got {self.scale}, {self.exponent} and {self.noise}.",
         )
@@ -77,20 +73,23 @@ ClassTable = tuple[TerrainClass, ...]
 
 
 def look_alike_classes(classes: ClassTable) -> list[tuple[int, ...]]:
-    """Classes that share a colour, by class: of each class those that look like it,
-    itself among them.
-    """
+    """Return, for each class, the indices of all classes of its colour with itself."""
+    colours = [item.colour for item in classes]
     return [
-        tuple(i for i, c in enumerate(classes) if c.colour == own.colour)
-        for own in classes
+        tuple(i for i, other_colour in enumerate(colours) if other_colour == colour)
+        for colour in colours
     ]
 
 
 def check_colour(of: str, colour: tuple[int, int, int]) -> None:
-    """Check that a colour is one of 8 bits a channel.
+    """Check that a colour has 8 bits per channel.
+
+    Args:
+        of: owner of the colour, for the message.
+        colour: RGB.
 
     Raises:
-        ConfigError: If it is not, with `of` in its message.
+        ConfigError: If a channel is not in 0–255.
     """
     expect(
         all(0 <= value <= 255 for value in colour),

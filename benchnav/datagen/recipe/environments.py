@@ -1,8 +1,8 @@
-"""Which classes an environment shows. Letters in shapes: E environments, M classes
-shown.
+"""Choice of the classes of each environment.
 
-Classes are dealt by units: a class, or all classes that share a colour. These are shown
-together or not at all, since the other colours would tell which one it must be.
+Classes are dealt by units: a class, or all classes of one colour. Look-alikes are shown
+together or not at all; otherwise, colour would identify the class. Letters in shapes: E
+environments, M classes shown.
 """
 
 import numpy as np
@@ -11,18 +11,16 @@ AlikeClasses = tuple[int, ...]
 
 
 def deal_classes(count: int, shown: int, environments: int) -> np.ndarray:
-    """The classes of all environments, each its own unit: consecutive deals from one
-    pack.
+    """Return the classes of all environments, dealt consecutively from one pack.
 
-    The pack is the class table taken with a stride, so that an environment shows
-    classes of some distance in colour; each time the deals come full circle the stride
-    changes.
+    Each class is a unit. The pack is the class table read with a stride, so that the
+    classes of an environment differ in colour. The stride changes whenever the deals
+    have gone through a whole number of packs.
 
     Args:
         count: number of classes.
-        shown: how many of them an environment shows, M.
-        environments: how many environments, E. More of them leave the first as they
-            are.
+        shown: M, number of classes of an environment.
+        environments: E, number of environments; more do not change the first.
 
     Returns:
         Class indices, distinct in each row, shape [E, M].
@@ -36,73 +34,76 @@ def deal_classes(count: int, shown: int, environments: int) -> np.ndarray:
 def deal_units(
     units: tuple[AlikeClasses, ...], shown: int, environments: int
 ) -> np.ndarray:
-    """The classes of all environments, dealt by units so that all are shown about
-    equally often.
+    """Return the classes of all environments, dealt by units about equally often.
 
-    Those shown least come first; among them the order is that of the pack, as in
-    `deal_classes`, with another stride for each time shown. A unit that does not fit in
-    what is left is passed over for the next that fits.
+    Units that were dealt least often come first. Among them, the order is that of the
+    pack in `deal_classes`, with another stride for each time dealt. A unit that does
+    not fit in the remaining room is skipped.
 
     Args:
         units: classes that are shown together, none of them in `never_shown`.
-        shown: how many classes an environment shows, M.
-        environments: how many environments, E. More of them leave the first as they
-            are.
+        shown: M, number of classes of an environment.
+        environments: E, number of environments; more do not change the first.
 
     Returns:
         Class indices, distinct in each row, shape [E, M].
     """
-    count, times = len(units), [0] * len(units)
-    # By stride, the place of each unit in the pack.
-    places = [
+    count = len(units)
+    times_dealt = [0] * count
+    # Positions of the units in the pack, for each stride.
+    positions = [
         np.argsort(stride * np.arange(count) % count)
         for stride in dict.fromkeys(strides(count))
     ]
+
+    def rank(unit: int) -> tuple[int, int]:
+        times = times_dealt[unit]
+        return times, positions[times % len(positions)][unit]
+
     table = []
     for _ in range(environments):
-        order = sorted(
-            range(count),
-            key=lambda unit: (times[unit], places[times[unit] % len(places)][unit]),
-        )
-        dealt = _fill(order, units, shown)
+        dealt = _fill(sorted(range(count), key=rank), units, shown)
+        classes: list[int] = []
         for unit in dealt:
-            times[unit] += 1
-        table.append([member for unit in dealt for member in units[unit]])
+            times_dealt[unit] += 1
+            classes += units[unit]
+        table.append(classes)
     return np.array(table)
 
 
 def never_shown(units: tuple[AlikeClasses, ...], shown: int) -> list[AlikeClasses]:
-    """The units that no choice of others fills an environment of `shown` classes with."""
+    """Return the units that other units cannot complete to `shown` classes."""
     sizes = [len(unit) for unit in units]
-    return [
-        unit
-        for number, unit in enumerate(units)
-        if shown - len(unit) not in _sums(sizes[:number] + sizes[number + 1 :])
-    ]
+    excluded = []
+    for index, unit in enumerate(units):
+        other_sizes = sizes[:index] + sizes[index + 1 :]
+        if shown - len(unit) not in _sums(other_sizes):
+            excluded.append(unit)
+    return excluded
 
 
 def strides(count: int) -> list[int]:
-    """Strides that visit all of a pack, 3 and 1 first; 3 stands twice, as maps of
-    synthesis 1 have it.
+    """Return strides that visit all of a pack: 3 and 1 first, then all, 3 again.
+
+    Maps of synthesis 1 depend on this order.
     """
     return [s for s in (3, 1, *range(2, count)) if np.gcd(s, count) == 1]
 
 
 def _fill(order: list[int], units: tuple[AlikeClasses, ...], room: int) -> list[int]:
-    """The first units in their order that fill the room exactly; those with which
-    nothing would are left out.
-    """
+    """Return the first units in their order that fill the room exactly."""
     dealt = []
     for position, unit in enumerate(order):
-        left = room - len(units[unit])
-        if left in _sums([len(units[other]) for other in order[position + 1 :]]):
+        remaining = room - len(units[unit])
+        later_sizes = [len(units[later]) for later in order[position + 1 :]]
+        if remaining in _sums(later_sizes):
             dealt.append(unit)
-            room = left
+            room = remaining
     return dealt
 
 
 def _sums(sizes: list[int]) -> set[int]:
-    """All sums of some of the sizes."""
+    """Return the sums of all subsets of the sizes."""
     sums = {0}
     for size in sizes:
         sums |= {total + size for total in sums}

@@ -1,7 +1,7 @@
-"""Recipes: everything that fixes a dataset, as data.
+"""Recipes: everything that determines a dataset, as data.
 
-A recipe is a YAML file. Shipped ones are named by id (`paper-v1`); a user's own is
-named by path.
+A recipe is a YAML file. Shipped recipes are loaded by id (`paper-v1`), custom ones by
+path.
 """
 
 import re
@@ -44,27 +44,25 @@ from benchnav.datagen.recipe.scenario import (
 )
 from benchnav.datagen.schema import FIELDS, UNLABELLED, Fields, truth_fields
 
-_MOST_CRATERED = 0.4  # share of a map; discs laid at random one by one jam at 0.55
-_LEAST_GAP = 0.3  # between classes of one colour, in E[λ] on flat ground
-REFERENCE_M = (
-    32.0  # side of the square that relief and crater counts of synthesis 2 are for
-)
+_MAX_CRATERED = 0.4  # fraction of a map; random sequential discs jam at 0.55
+_MIN_GAP = 0.3  # between classes of one colour, in E[λ] on flat terrain
+# In synthesis 2, relief and crater counts refer to a square of this side.
+REFERENCE_M = 32.0
 
-
-# More than a machine makes; a shard's name counts maps in eight digits.
+# The name of a shard has eight digits for maps; no machine generates more.
 MAX_MAPS = 10**8 - 1
 MAX_CELLS = 2**40
 
 
 @dataclass(frozen=True, kw_only=True)
 class Split:
-    """One split of a dataset.
+    """Split of a dataset.
 
     Args:
         scenario: name of one of the recipe's scenarios.
         maps: number of maps; map i shows environment i mod the number of environments.
-        solvable: keep only maps whose goal can be reached, and store the grid reference
-            time.
+        solvable: whether to keep only maps whose goal is reachable, and to store the
+            grid reference time.
     """
 
     scenario: str
@@ -72,7 +70,7 @@ class Split:
     solvable: bool = False
 
     def __post_init__(self) -> None:
-        """Refuses empty splits."""
+        """Reject empty splits."""
         expect(
             self.maps >= 1,
             f"`maps` ≥ 1 in every split, got {self.maps}. Leave the split out instead.",
@@ -81,35 +79,36 @@ class Split:
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """All that fixes a dataset: same recipe, same maps, on any machine.
+    """Everything that determines a dataset: the same recipe, the same maps.
+
+    This is true on any machine.
 
     Args:
         id: name and version of the dataset, for example `paper-v1`.
-        seed: root seed; another seed makes a sibling with other maps and the same class
-            table.
+        seed: root seed; another seed gives other maps of the same class table.
         height: rows of a map.
         width: columns of a map.
-        resolution_m: cell width.
-        start_m: (x, y) where navigation starts; None where `places` says.
-        goal_m: (x, y) where it ends; None where `places` says.
-        places: how start and goal are drawn a map, in place of `start_m` and `goal_m`;
-            synthesis 2 only.
-        stuck_threshold: λ_stuck; a cell is truly free when E[λ] exceeds it.
-        synthesis: how maps are made: 1 as by version 0.1, bit for bit, or 2, which
-            knows soft spots, classes that look alike, drawn places and correlated λ,
-            and makes the same ground at any size.
-        correlation_m: ℓ of stored λ: at distance d the noise of two cells has the
-            correlation exp(−d²/2ℓ²); at 0, as in synthesis 1, each cell's is its own.
-        layers: what else is drawn, in this order; objects of `Layer` become their
-            specs. Synthesis 2 only.
-        closed_corners: whether a diagonal step between two cells that are not free is
-            no way, for solvable maps and reference times. False in the shipped recipes
-            and in files of versions before 1.2; in a recipe of synthesis 2 with an id
-            of its own true, unless it says otherwise. Synthesis 2 only.
+        resolution_m: cell width in metres.
+        start_m: (x, y) of the start in metres; None with `places`.
+        goal_m: (x, y) of the goal in metres; None with `places`.
+        places: rule by which start and goal are drawn for each map, instead of
+            `start_m` and `goal_m`; synthesis 2 only.
+        stuck_threshold: λ_stuck in [0, 1); a cell is truly free if E[λ] exceeds it.
+        synthesis: version of the generator. 1 reproduces version 0.1 bit for bit. 2
+            adds soft spots, look-alike classes, drawn start and goal, and correlated λ;
+            its terrain does not depend on the size of the map.
+        correlation_m: correlation length ℓ of stored λ, in metres: the noise of two
+            cells at distance d has the correlation exp(−d²/2ℓ²). At 0, as in synthesis
+            1, cells are independent.
+        layers: further layers, in the order of being drawn; objects of `Layer` become
+            their specs. Synthesis 2 only.
+        closed_corners: whether a diagonal step between two non-free cells is forbidden,
+            for solvable maps and reference times. False in the shipped recipes and in
+            files of versions before 1.2; by default true in custom recipes of synthesis
+            2. Synthesis 2 only.
         environments: number of environments; each shows its own choice of classes.
-        occupancy: share of the cells that each class of an environment covers, summing
-            to 1.
-        class_periods_m: lattice spacings of the class noise, one an octave.
+        occupancy: fraction of the cells of each class of an environment, summing to 1.
+        class_periods_m: lattice spacings of the class noise in metres, one per octave.
         classes: the class table.
         scenarios: scenarios by name.
         splits: splits by name.
@@ -138,7 +137,7 @@ class Recipe:
     closed_corners: bool = False
 
     def __post_init__(self) -> None:
-        """Refuses recipes that contradict themselves."""
+        """Reject recipes that contradict themselves."""
         object.__setattr__(self, "layers", read_layers(self.layers))
         expect(self.synthesis in (1, 2), f"`synthesis` 1 or 2, got {self.synthesis}.")
         expect(0 <= self.seed < 2**63, f"`seed` in 0–2^63 − 1, got {self.seed}.")
@@ -154,27 +153,12 @@ class Recipe:
         check_tints(self.classes, self.scenarios)
         _check_layers(self)
         if self.synthesis == 1:
-            soft = any(item.soft for item in self.classes)
-            asked = {
-                "soft": soft,
-                **{f"layer {spec.name}": True for spec in self.layers},
-                "places": self.places,
-                "correlation_m": self.correlation_m,
-                "closed_corners": self.closed_corners,
-            }
-            for name, value in asked.items():
-                expect(
-                    not value,
-                    f"`synthesis: 2` with `{name}`, got 1, which makes maps as "
-                    "version 0.1 did. "
-                    "Set `synthesis: 2` in the recipe.",
-                )
-            return
+            return _check_synthesis_1(self)
         _check_look_alikes(self)
-        most_m = LONGEST_CORRELATION * min(self.grid.extent_m)
+        max_m = LONGEST_CORRELATION * min(self.grid.extent_m)
         expect(
-            0 <= self.correlation_m <= most_m,
-            f"`correlation_m` in 0–{most_m:g} m, a quarter of the map's shorter side, "
+            0 <= self.correlation_m <= max_m,
+            f"`correlation_m` in 0–{max_m:g} m, a quarter of the map's shorter side, "
             f"got {self.correlation_m:g}.",
         )
 
@@ -185,66 +169,65 @@ class Recipe:
 
     @property
     def fields(self) -> Fields:
-        """What a dataset of the recipe's maps has of each."""
+        """Fields of a dataset of the recipe's maps."""
+        fields = FIELDS | {spec.name: spec.stored_field for spec in self.layers}
+        if not any(spec.affects for spec in self.layers):
+            return fields
         components = 2 if any(item.soft for item in self.classes) else 1
-        truth = (
-            truth_fields(components)
-            if any(spec.affects for spec in self.layers)
-            else {}
-        )
-        return FIELDS | {spec.name: spec.stored_field for spec in self.layers} | truth
+        return fields | truth_fields(components)
 
     @property
     def class_rows(self) -> list[dict[str, Any]]:
-        """The class table as plain data, with what grows on the classes."""
+        """Class table as plain data, with the vegetation of each class."""
         return vegetation.write_classes(plain(list(self.classes)), self._vegetation)
 
     @property
     def _vegetation(self) -> vegetation.Vegetation | None:
-        grown = [spec.layer for spec in self.layers if spec.is_vegetation]
-        return (
-            grown[0] if grown and isinstance(grown[0], vegetation.Vegetation) else None
-        )
+        layers = [spec.layer for spec in self.layers if spec.is_vegetation]
+        if layers and isinstance(layers[0], vegetation.Vegetation):
+            return layers[0]
+        return None
 
     def cells_of(self, positions_m: ndarray) -> tuple[ndarray, ndarray]:
-        """Rows and columns of the cells that positions [B, 2] lie in, read in single
-        precision as stored.
+        """Return rows and columns of the cells of positions.
+
+        Positions are read in single precision, as stored.
+
+        Args:
+            positions_m: (x, y) in metres, shape [B, 2].
+
+        Returns:
+            Two arrays, int64, shape [B].
         """
-        column, row = (
-            np.floor(positions_m.astype(np.float32) / np.float32(self.resolution_m))
-            .astype(np.int64)
-            .T
-        )
+        cells = positions_m.astype(np.float32) / np.float32(self.resolution_m)
+        column, row = np.floor(cells).astype(np.int64).T
         return row.clip(0, self.height - 1), column.clip(0, self.width - 1)
 
     @cached_property
     def units(self) -> tuple[AlikeClasses, ...]:
-        """Classes that are shown together in synthesis 2: those of one colour, in the
-        table's order.
-        """
+        """Classes of one colour, shown together in synthesis 2, in the table's order."""
         return tuple(dict.fromkeys(look_alike_classes(self.classes)))
 
     @cached_property
     def environment_classes(self) -> ndarray:
-        """The classes that each environment shows: indices, distinct in a row, shape
-        [E, len(occupancy)].
-        """
+        """Class indices of each environment, distinct in a row: [E, len(occupancy)]."""
         shown = len(self.occupancy)
         if self.synthesis == 1:
             return deal_classes(len(self.classes), shown, self.environments)
         return deal_units(self.units, shown, self.environments)
 
     def craters(self, scenario: Scenario) -> tuple[int, int]:
-        """Fewest and most craters of a map; in synthesis 2 a scenario's counts are for
-        32 m × 32 m.
+        """Return minimum and maximum number of craters of a map.
+
+        In synthesis 2, a scenario's counts refer to 32 m × 32 m.
         """
         extent_x, extent_y = self.grid.extent_m
-        share = 1.0 if self.synthesis == 1 else extent_x * extent_y / REFERENCE_M**2
-        low, high = (round(share * count) for count in scenario.crater_count)
+        scale = 1.0 if self.synthesis == 1 else extent_x * extent_y / REFERENCE_M**2
+        low, high = (round(scale * count) for count in scenario.crater_count)
         return low, high
 
     def to_dict(self) -> dict[str, Any]:
-        """Gives the recipe as plain data for JSON, fully resolved."""
+        """Return the recipe as plain data for JSON, with presets resolved."""
         data: dict[str, Any] = {}
         for name, value in (plain(self) | {"classes": self.class_rows}).items():
             if name == "layers" and self._vegetation is not None:
@@ -253,12 +236,12 @@ class Recipe:
         data["layers"] = plain([spec for spec in self.layers if not spec.is_vegetation])
         for scenario in data["scenarios"].values():
             if not scenario["tints"]:
-                del scenario["tints"]  # as versions without them wrote it
+                del scenario["tints"]  # as versions without tints wrote it
         unused = ["places"] if self.places is None else ["start_m", "goal_m"]
         unused += [] if data["layers"] else ["layers"]
         unused += [] if self.closed_corners else ["closed_corners"]
         if self.synthesis == 1:
-            # As version 0.1 wrote it, so that its files and readers stay as they are.
+            # As version 0.1 wrote it: its files and readers do not change.
             unused += ["synthesis", "correlation_m"]
             for item in data["classes"]:
                 item.pop("soft")
@@ -266,18 +249,18 @@ class Recipe:
 
 
 def load_recipe(source: str | Path, overrides: Sequence[str] = ()) -> Recipe:
-    """Reads a recipe by shipped id or by path of a YAML file.
+    """Load a recipe by its shipped id or the path of a YAML file.
 
     Args:
         source: id or path.
         overrides: changes `key.key=value`, the value in YAML, such as
-            `splits.train.maps=50`; an item of a list goes by its `name`, as in
-            `classes.dune_sand.soft.weight=0.2`. What differs needs a name of its own,
-            so `id=NAME` has to be among them.
+            `splits.train.maps=50`; an item of a list is named by its `name`, as in
+            `classes.dune_sand.soft.weight=0.2`. Changes must include `id=NAME`, since
+            other maps need another id.
 
     Raises:
-        ConfigError: there is no such recipe, or it is not one; or other maps would bear
-            its id.
+        ConfigError: If there is no such recipe, it is invalid, or its id names other
+            maps.
     """
     path = RECIPES / f"{source}.yaml"
     if not path.exists():
@@ -289,29 +272,27 @@ def load_recipe(source: str | Path, overrides: Sequence[str] = ()) -> Recipe:
         f"{str(source)!r}.",
     )
     data = read_yaml(path)
-    own = _with_class_table(data)
+    resolved = _with_class_table(data)
     for text in overrides:
         name, equals, value = text.partition("=")
+        keys = name.split(".")
         expect(
-            equals and all(name.split(".")),
+            equals and all(keys),
             f"an override such as splits.train.maps=50, got {text!r}.",
         )
-        own = changed(own, name.split("."), load_yaml(value))
-    if (
-        isinstance(own, dict)
-        and own.get("synthesis") == 2
-        and own.get("id") not in shipped
-    ):
-        own = {"closed_corners": True, **own}
-    recipe = recipe_from_dict(own, str(source))
+        resolved = changed(resolved, keys, load_yaml(value))
+    is_synthesis_2 = isinstance(resolved, dict) and resolved.get("synthesis") == 2
+    if is_synthesis_2 and resolved.get("id") not in shipped:
+        resolved = {"closed_corners": True, **resolved}
+    recipe = recipe_from_dict(resolved, str(source))
     expect(
         not overrides or recipe.id != data.get("id"),
         f"`id=NAME` among the overrides, since {recipe.id!r} names the maps of the "
         "recipe as it is.",
     )
-    as_shipped = path == RECIPES / f"{recipe.id}.yaml" and not overrides
+    is_shipped = path == RECIPES / f"{recipe.id}.yaml" and not overrides
     expect(
-        as_shipped or recipe.id not in shipped or recipe == load_recipe(recipe.id),
+        is_shipped or recipe.id not in shipped or recipe == load_recipe(recipe.id),
         f"an `id` of its own in {source}, got {recipe.id!r}, which names other maps: "
         "a recipe shipped with the package.",
     )
@@ -319,33 +300,33 @@ def load_recipe(source: str | Path, overrides: Sequence[str] = ()) -> Recipe:
 
 
 def shipped_recipes() -> list[str]:
-    """Ids of the recipes in the package."""
+    """Return the ids of the recipes in the package, sorted."""
     return sorted(path.stem for path in RECIPES.glob("*.yaml") if path != PRESETS)
 
 
 def shipped_sizes(recipe: str) -> dict[str, int]:
-    """Maps by split of a shipped recipe, read without all that is to be checked of it."""
+    """Return the number of maps of each split of a shipped recipe, without checks."""
     splits = read_yaml(RECIPES / f"{recipe}.yaml")["splits"]
     return {split: entry["maps"] for split, entry in splits.items()}
 
 
 def _with_class_table(data: Any) -> Any:
-    """Puts the shipped class table in the place of `default`, or of none."""
+    """Return the data with the shipped class table, if it is `default` or missing."""
     if not isinstance(data, dict) or data.get("classes", "default") != "default":
         return data
     return {**data, "classes": load_presets(data.get("synthesis"))[0]}
 
 
 def recipe_from_dict(data: Any, origin: str) -> Recipe:
-    """Builds a recipe from plain data, resolving presets.
+    """Return a recipe from plain data, with presets resolved.
 
     Args:
-        data: a mapping as in a recipe file or a manifest.
-        origin: where it came from, for messages.
+        data: mapping as in a recipe file or a manifest.
+        origin: source of the data, for messages.
 
     Raises:
-        ConfigError: a key is unknown or missing, or a value is of the wrong type or out
-            of range.
+        ConfigError: If a key is unknown or missing, or a value is of the wrong type or
+            out of range.
     """
     expect(
         isinstance(data, dict),
@@ -361,21 +342,24 @@ def recipe_from_dict(data: Any, origin: str) -> Recipe:
     try:
         growth, data = vegetation.read_keys(data)
         layers = read_layers(data.get("layers", []))
-        data["layers"] = read_layers((*([growth] if growth else []), *layers))
-        return read(
-            Recipe,
-            data | {"scenarios": scenarios},
-            lambda key: f"`{key}`" if key else "a recipe",
-        )
+        if growth:
+            layers = (growth, *layers)
+        data["layers"] = read_layers(layers)
+        data["scenarios"] = scenarios
+        return read(Recipe, data, lambda key: f"`{key}`" if key else "a recipe")
     except ConfigError as error:
         raise ConfigError(f"Recipe {origin}: {error}") from error
 
 
 def check_name(kind: str, name: str) -> None:
-    """Refuses names that would not do as a file's or a group's.
+    """Check that a name is valid for files and HDF5 groups.
+
+    Args:
+        kind: what is named, for the message.
+        name: the name.
 
     Raises:
-        ConfigError: with `kind` in its message.
+        ConfigError: If it is not.
     """
     expect(
         re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name) and name != "manifest",
@@ -384,21 +368,18 @@ def check_name(kind: str, name: str) -> None:
 
 
 def _check_ends(recipe: Recipe) -> None:
-    given = [
-        name
-        for name in ("start_m", "goal_m", "places")
-        if getattr(recipe, name) is not None
-    ]
+    keys = ("start_m", "goal_m", "places")
+    names = [name for name in keys if getattr(recipe, name) is not None]
     expect(
-        given in (["start_m", "goal_m"], ["places"]),
+        names in (["start_m", "goal_m"], ["places"]),
         "either `start_m` and `goal_m`, or `places`, got "
-        f"{' and '.join(given) or 'neither'}.",
+        f"{' and '.join(names) or 'neither'}.",
     )
     if recipe.places is not None:
         return check_places(recipe.places, recipe.grid)
     extent_x, extent_y = recipe.grid.extent_m
     ends = np.array([recipe.start_m, recipe.goal_m])
-    for name, (x, y) in zip(given, ends.tolist(), strict=True):
+    for name, (x, y) in zip(names, ends.tolist(), strict=True):
         expect(
             0 <= x < extent_x and 0 <= y < extent_y,
             f"`{name}` on the map of {extent_x:g} m × {extent_y:g} m, got ({x}, {y}).",
@@ -411,48 +392,62 @@ def _check_ends(recipe: Recipe) -> None:
     )
 
 
+def _check_synthesis_1(recipe: Recipe) -> None:
+    values: dict[str, Any] = {"soft": any(item.soft for item in recipe.classes)}
+    values |= {f"layer {spec.name}": True for spec in recipe.layers}
+    for name in ("places", "correlation_m", "closed_corners"):
+        values[name] = getattr(recipe, name)
+    for name, value in values.items():
+        expect(
+            not value,
+            f"`synthesis: 2` with `{name}`, got 1, which makes maps as version 0.1 "
+            "did. Set `synthesis: 2` in the recipe.",
+        )
+
+
 def _check_scenarios(recipe: Recipe) -> None:
     extent_x, extent_y = recipe.grid.extent_m
     used = {split.scenario for split in recipe.splits.values()}
     for name, scenario in recipe.scenarios.items():
         if name not in used:
             continue
-        _, most = recipe.craters(scenario)
+        _, max_craters = recipe.craters(scenario)
+        _, max_radius_m = scenario.crater_radius_m
         expect(
-            most == 0 or 2 * scenario.crater_radius_m[1] <= min(extent_x, extent_y),
+            max_craters == 0 or 2 * max_radius_m <= min(extent_x, extent_y),
             f"`crater_radius_m` of scenario {name!r} to fit a map of {extent_x:g} m × "
-            f"{extent_y:g} m, "
-            f"got {scenario.crater_radius_m}.",
+            f"{extent_y:g} m, got {scenario.crater_radius_m}.",
         )
-        covered = most * scenario.mean_crater_area_m2 / (extent_x * extent_y)
+        covered = max_craters * scenario.mean_crater_area_m2 / (extent_x * extent_y)
         expect(
-            covered <= _MOST_CRATERED,
-            f"the craters of scenario {name!r} to cover at most {_MOST_CRATERED:.0%} "
-            "of a map, "
-            f"so that they fit side by side, got {covered:.0%}. Lower `crater_count` "
-            "or `crater_radius_m`.",
+            covered <= _MAX_CRATERED,
+            f"the craters of scenario {name!r} to cover at most {_MAX_CRATERED:.0%} "
+            f"of a map, so that they fit side by side, got {covered:.0%}. Lower "
+            "`crater_count` or `crater_radius_m`.",
         )
 
 
 def _check_environments(recipe: Recipe) -> None:
-    shares, classes, periods = recipe.occupancy, recipe.classes, recipe.class_periods_m
+    occupancy = recipe.occupancy
+    classes = recipe.classes
+    periods = recipe.class_periods_m
     expect(
         1 <= len(classes) <= UNLABELLED,
         f"1–{UNLABELLED} classes in `classes`, got {len(classes)}.",
     )
     expect(
-        np.isclose(sum(shares), 1, atol=1e-6) and min(shares) > 0,
-        f"`occupancy` as shares > 0 summing to 1, got {list(shares)}.",
+        np.isclose(sum(occupancy), 1, atol=1e-6) and min(occupancy) > 0,
+        f"`occupancy` as fractions > 0 summing to 1, got {list(occupancy)}.",
     )
     expect(
-        len(shares) <= len(classes),
-        f"at most {len(classes)} shares in `occupancy`, one a class, got "
-        f"{len(shares)}.",
+        len(occupancy) <= len(classes),
+        f"at most {len(classes)} fractions in `occupancy`, one per class, got "
+        f"{len(occupancy)}.",
     )
-    most = np.iinfo(FIELDS["environment"].dtype).max
+    maximum = np.iinfo(FIELDS["environment"].dtype).max
     expect(
-        1 <= recipe.environments <= most,
-        f"`environments` in 1–{most}, got {recipe.environments}.",
+        1 <= recipe.environments <= maximum,
+        f"`environments` in 1–{maximum}, got {recipe.environments}.",
     )
     expect(
         periods and all(recipe.resolution_m <= period < np.inf for period in periods),
@@ -463,21 +458,19 @@ def _check_environments(recipe: Recipe) -> None:
 
 def _check_splits(recipe: Recipe) -> None:
     expect(recipe.splits, "at least one split in `splits`, got none.")
-    maps, cells = (
-        sum(split.maps for split in recipe.splits.values()),
-        recipe.height * recipe.width,
-    )
+    maps = sum(split.maps for split in recipe.splits.values())
+    cells = recipe.height * recipe.width
     expect(
         maps <= MAX_MAPS and maps * cells <= MAX_CELLS,
         f"at most {MAX_MAPS:,} maps of {MAX_CELLS:,} cells together, got {maps:,} of "
-        f"{cells:,}. Ask for fewer `maps`.",
+        f"{cells:,}. Lower `maps`.",
     )
     for name, split in recipe.splits.items():
         for part in name.split("/"):
             check_name("split name", part)
         expect(
-            not any(other.startswith(f"{name}/") for other in recipe.splits),
-            f"splits side by side, got one inside {name!r}.",
+            not any(split_name.startswith(f"{name}/") for split_name in recipe.splits),
+            f"splits that are not nested, got one inside {name!r}.",
         )
         expect(
             split.scenario in recipe.scenarios,
@@ -487,28 +480,25 @@ def _check_splits(recipe: Recipe) -> None:
 
 
 def _check_look_alikes(recipe: Recipe) -> None:
-    names, shown = [item.name for item in recipe.classes], len(recipe.occupancy)
+    names = [item.name for item in recipe.classes]
+    shown = len(recipe.occupancy)
     flat = np.zeros((len(names), 1, 1))
-    order = np.arange(len(names)).reshape(flat.shape)
-    means = latent.expected_of(latent.truth(order, flat, recipe.classes)).ravel()
-    for first, second in (
-        pair for group in recipe.units for pair in combinations(group, 2)
-    ):
-        expect(
-            abs(means[first] - means[second]) >= _LEAST_GAP,
-            f"classes of one colour to differ by at least {_LEAST_GAP:g} in E[λ] on "
-            "flat ground, "
-            f"got {means[first]:.3f} for {names[first]!r} and {means[second]:.3f} for "
-            f"{names[second]!r}. "
-            "Change an `offset` or a `colour`.",
-        )
+    class_id = np.arange(len(names)).reshape(flat.shape)
+    means = latent.expected_of(latent.truth(class_id, flat, recipe.classes)).ravel()
+    for unit in recipe.units:
+        for a, b in combinations(unit, 2):
+            expect(
+                abs(means[a] - means[b]) >= _MIN_GAP,
+                f"classes of one colour to differ by at least {_MIN_GAP:g} in E[λ] on "
+                f"flat terrain, got {means[a]:.3f} for {names[a]!r} and {means[b]:.3f} "
+                f"for {names[b]!r}. Change an `offset` or a `colour`.",
+            )
     for unit in never_shown(recipe.units, shown):
+        members = ", ".join(names[member] for member in unit)
         raise ConfigError(
             f"Expected classes that can be shown {shown} at a time, one for each "
-            "share in `occupancy`, those of one "
-            "colour together; got no choice of others that goes with "
-            f"{', '.join(names[member] for member in unit)}. Change `occupancy` or a "
-            "`colour`."
+            "fraction in `occupancy`, with all classes of one colour together; got no "
+            f"choice that includes {members}. Change `occupancy` or a `colour`."
         )
 
 
@@ -518,6 +508,6 @@ def _check_layers(recipe: Recipe) -> None:
         for name, scenario in recipe.scenarios.items()
     }
     for spec in recipe.layers:
-        # Others are of a dataset, whose recipe was checked when it was made.
+        # Other layers belong to a dataset, whose recipe was checked at its creation.
         if spec.is_vegetation or spec.is_built:
             check_layer(spec.layer, recipe.grid, recipe.classes, colours)

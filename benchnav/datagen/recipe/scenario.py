@@ -1,9 +1,8 @@
-"""Scenarios, the geometry, light and tints of a family of maps, and the shipped ones
-that recipes build on.
+"""Scenarios: geometry, light and tints of a family of maps.
 
-`presets.yaml` holds the shipped class table and scenarios, which a recipe may name or
-replace. A scenario's `severity` s moves every number of it from `std` (s = 0) to the
-preset (s = 1), and beyond.
+`presets.yaml` contains the shipped class table and scenarios, which a recipe may name
+or replace. The `severity` s of a scenario interpolates each of its numbers between
+`std` (s = 0) and the preset (s = 1), and extrapolates beyond.
 """
 
 import re
@@ -24,7 +23,7 @@ PRESETS = RECIPES / "presets.yaml"
 Range = tuple[float, float]
 SeriesOfShifts = dict[str, list[tuple[float, str]]]
 
-# Those of a recipe that names none.
+# Scenarios of a recipe that does not list its own.
 DEFAULTS = ("std", "hg", "hs")
 
 _NAMED = re.compile(
@@ -34,12 +33,12 @@ _NAMED = re.compile(
 
 @dataclass(frozen=True, kw_only=True)
 class Tint:
-    """What changes the colour of the ground and nothing else, such as snow or wetness.
+    """Change of the terrain's colour only, such as snow or wetness.
 
     Args:
-        classes: names of the classes that it changes; all when empty.
-        colour: RGB in full light that it changes them towards, 0–255.
-        share: how far, in (0, 1): (1 − share) of the class's own colour is left.
+        classes: names of the tinted classes; if empty, all.
+        colour: RGB of the tint in full light, 0–255.
+        share: weight of the tint, in (0, 1); 1 − share is that of the class's colour.
     """
 
     classes: tuple[str, ...] = ()
@@ -47,33 +46,34 @@ class Tint:
     share: float
 
     def __post_init__(self) -> None:
-        """Refuses what is no colour, and what would leave no colour of the class."""
+        """Reject an invalid colour or weight."""
         expect(
             all(0 <= value <= 255 for value in self.colour),
             f"`colour` of a tint in 0–255, got {self.colour}.",
         )
         expect(
             0 < self.share < 1,
-            f"`share` of a tint in (0, 1), got {self.share:g}. At severity 1 a preset "
-            "has its own share.",
+            f"`share` of a tint in (0, 1), got {self.share:g}. Lower the severity: at "
+            "1, a preset has its own share.",
         )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scenario:
-    """Geometry, light and tints of a family of maps; each range is drawn from
-    uniformly, a value a map.
+    """Geometry, light and tints of a family of maps.
+
+    A range (minimum, maximum) is sampled uniformly, one value per map.
 
     Args:
-        relief_m: highest minus lowest elevation of the fractal ground.
-        roughness: Hurst exponent of the fractal ground.
-        crater_count: fewest and most craters a map.
-        crater_radius_m: smallest and largest radius of a crater's rim.
-        crater_depth_ratio: depth below the rim over diameter.
-        light_height: z of the unit vector toward the light; 1 is overhead.
-        ambient: share of ambient light.
-        tints: what changes the colours of classes, one after another. Vegetation keeps
-            its own.
+        relief_m: maximum minus minimum elevation of the fractal terrain, in metres.
+        roughness: Hurst exponent of the fractal terrain, in [0, 1].
+        crater_count: number of craters per map.
+        crater_radius_m: radius of a crater's rim, in metres.
+        crater_depth_ratio: depth below the rim, divided by the diameter, in [0, 1].
+        light_height: z of the unit vector toward the light, in [0, 1]; 1 is overhead.
+        ambient: fraction of ambient light, in [0, 1].
+        tints: changes of the classes' colours, applied in order. Vegetation keeps its
+            colour.
     """
 
     relief_m: Range = (1.4, 1.7)
@@ -86,7 +86,7 @@ class Scenario:
     tints: tuple[Tint, ...] = ()
 
     def __post_init__(self) -> None:
-        """Refuses ranges that are not finite, ordered, or physical."""
+        """Reject ranges that are not finite, ordered, or physical."""
         limits: dict[str, Range] = {
             "relief_m": (0, 1000),
             "roughness": (0, 1),
@@ -96,18 +96,18 @@ class Scenario:
             "light_height": (0, 1),
             "ambient": (0, 1),
         }
-        for name, (least, most) in limits.items():
+        for name, (minimum, maximum) in limits.items():
             value = getattr(self, name)
             low, high = value if isinstance(value, tuple) else (value, value)
             expect(
-                least <= low <= high <= most,
-                f"scenario `{name}` finite, ordered and within [{least:g}, {most:g}], "
-                f"got {value}.",
+                minimum <= low <= high <= maximum,
+                f"scenario `{name}` finite, ordered and within [{minimum:g}, "
+                f"{maximum:g}], got {value}.",
             )
 
     @property
     def mean_crater_area_m2(self) -> float:
-        """Mean area inside a rim; radii are uniform in their logarithm."""
+        """Mean area inside a rim in m²; the logarithms of radii are uniform."""
         low, high = self.crater_radius_m
         if low == high:
             return float(np.pi * low**2)
@@ -115,51 +115,49 @@ class Scenario:
 
 
 def blend(base: Scenario, full: Scenario, severity: float) -> Scenario:
-    """Moves every number of a scenario from `base` (severity 0) to `full` (severity 1).
+    """Return a scenario between `base` (severity 0) and `full` (severity 1).
 
-    Of a tint of `full` that is its share; `base` has none, as `std` has none.
+    All numbers are interpolated. The weights of the tints of `full` are multiplied by
+    the severity; `base` must have no tints, as `std`.
     """
 
     def between(low: Any, high: Any) -> Any:
-        return (
-            tuple(map(between, low, high))
-            if isinstance(low, tuple)
-            else low + severity * (high - low)
-        )
+        if isinstance(low, tuple):
+            return tuple(map(between, low, high))
+        return low + severity * (high - low)
 
-    numbers = [item.name for item in fields(Scenario) if item.name != "tints"]
-    moved = {
-        name: between(getattr(base, name), getattr(full, name)) for name in numbers
+    numbers = {
+        item.name: between(getattr(base, item.name), getattr(full, item.name))
+        for item in fields(Scenario)
+        if item.name != "tints"
     }
-    tints = tuple(
-        replace(tint, share=severity * tint.share) for tint in full.tints if severity
-    )
-    return Scenario(**moved, tints=tints)
+    tints = full.tints if severity else ()
+    tints = tuple(replace(tint, share=severity * tint.share) for tint in tints)
+    return Scenario(**numbers, tints=tints)
 
 
 def load_presets(synthesis: Any) -> tuple[list[Any], dict[str, Any]]:
-    """Reads the shipped class table and the scenarios shipped for a synthesis, as plain
-    data.
-    """
+    """Return the shipped class table and scenarios of a synthesis as plain data."""
     data = yaml.safe_load(PRESETS.read_text())
     return data["classes"], data["scenarios-2" if synthesis == 2 else "scenarios"]
 
 
 def resolve(entry: Any, presets: Mapping[str, Any], name: str) -> Any:
-    """Gives a scenario's numbers in full.
+    """Return the plain data of a scenario with all numbers of its preset.
 
     Args:
-        entry: plain data of a scenario; where it names a `preset`, that one's numbers
-            at its `severity`, with what else the entry says in their place.
-        presets: the presets' plain data by name, `std` among them.
-        name: the scenario's name, for messages.
+        entry: plain data of a scenario. If it names a `preset`, the preset's numbers at
+            its `severity` apply, except those that the entry lists itself.
+        presets: plain data of the presets by name, including `std`.
+        name: name of the scenario, for messages.
 
     Raises:
-        ConfigError: there is no such preset, or the severity is no number.
+        ConfigError: If the preset is unknown, or the severity is not finite.
     """
     if not isinstance(entry, dict) or "preset" not in entry:
         return entry
-    preset, severity = entry["preset"], entry.get("severity", 1.0)
+    preset = entry["preset"]
+    severity = entry.get("severity", 1.0)
     expect(
         isinstance(preset, str) and preset in presets,
         f"`preset` of scenario {name!r} to be one of {sorted(presets)}, got "
@@ -172,36 +170,36 @@ def resolve(entry: Any, presets: Mapping[str, Any], name: str) -> Any:
     base, full = (
         read(Scenario, presets[key], of(f"preset {key!r}")) for key in ("std", preset)
     )
-    changes = {
-        key: value for key, value in entry.items() if key not in ("preset", "severity")
-    }
-    return {**plain(blend(base, full, severity)), **changes}
+    resolved = plain(blend(base, full, severity)) | entry
+    del resolved["preset"]
+    resolved.pop("severity", None)
+    return resolved
 
 
 def find_series(splits: Iterable[str]) -> SeriesOfShifts:
-    """Finds the series of shifts among splits by their names.
+    """Return the series of shifts among splits, by their names.
 
-    A split is one of a series where its name ends in the severity: in hundredths after
-    a dash (`test/hg-050`), or as a number after an @ (`test/hg@0.5`). What stands
-    before is the scenario; the split `std` of the same folder is severity 0 of each,
-    and a split of the scenario's own name (`test/hg`) severity 1. Every other split
-    stands by itself.
+    A split belongs to a series if its name ends in a severity: in hundredths after a
+    dash (`test/hg-050`), or as a number after an @ (`test/hg@0.5`). The name before it
+    is the scenario. The split `std` of the same folder has severity 0 in each series,
+    and a split named as the scenario (`test/hg`) severity 1. Other splits belong to no
+    series.
 
     Args:
         splits: names of splits.
 
     Returns:
-        By scenario, its pairs as (severity, split), ascending, with `std` at severity 0
-        and the scenario itself at 1 where they are there; scenarios with fewer than two
-        pairs are left out.
+        For each scenario, pairs (severity, split) in ascending order. They include
+        `std` and the scenario's split, if they exist. Scenarios with fewer than two
+        pairs are omitted.
     """
     splits = list(splits)
     all_series: SeriesOfShifts = {}
     for split in splits:
-        if named := _NAMED.fullmatch(split):
-            hundredths = named["hundredths"]
-            severity = int(hundredths) / 100 if hundredths else float(named["severity"])
-            all_series.setdefault(named["scenario"], []).append((severity, split))
+        if match := _NAMED.fullmatch(split):
+            hundredths = match["hundredths"]
+            severity = int(hundredths) / 100 if hundredths else float(match["severity"])
+            all_series.setdefault(match["scenario"], []).append((severity, split))
     for scenario, pairs in all_series.items():
         std = f"{scenario[: scenario.rfind('/') + 1]}std"
         for severity, split in ((0.0, std), (1.0, scenario)):

@@ -1,9 +1,8 @@
-"""What terrain looks like: where each class lies, by bands of noise, and its colour
-shaded by the light.
+"""Appearance of terrain: layout of classes by bands of noise, and shaded colours.
 
 Shading is Lambert's law with ambient light, as in paper III-A. Batched NumPy in
-float64, the same on every machine.
-Letters in shapes: B maps, H×W cells, M classes that a map shows.
+float64; results are the same on every machine. Letters in shapes: B maps, H×W cells, M
+classes that a map shows.
 """
 
 import numpy as np
@@ -11,61 +10,62 @@ from numpy import ndarray
 
 
 def class_bands(noise: ndarray, occupancy: ndarray) -> ndarray:
-    """Cuts noise at the quantiles that give each band its share of the cells.
+    """Return bands of noise, cut at the quantiles of the occupancy.
 
     Args:
-        noise: shape [B, H, W].
-        occupancy: share of each band, summing to 1, shape [M].
+        noise: smooth noise, shape [B, H, W].
+        occupancy: fraction of the cells of each band, summing to 1, shape [M].
 
     Returns:
-        Band index in [0, M), int64, shape [B, H, W]; each share is met to within one
-        cell.
+        Band index in [0, M), int64, shape [B, H, W]; each fraction is exact to within
+        one cell.
     """
     flat = noise.reshape(len(noise), -1)
-    edges = np.round(np.cumsum(occupancy)[:-1] * flat.shape[1]).astype(int)
-    levels = np.sort(flat, axis=1)[:, edges[edges < flat.shape[1]]]
-    return (flat[:, None] >= levels[:, :, None]).sum(axis=1).reshape(noise.shape)
+    n_cells = flat.shape[1]
+    edges = np.round(np.cumsum(occupancy)[:-1] * n_cells).astype(int)
+    levels = np.sort(flat, axis=1)[:, edges[edges < n_cells]]
+    bands = (flat[:, None] >= levels[:, :, None]).sum(axis=1)
+    return bands.reshape(noise.shape)
 
 
 def light_direction(azimuth_rad: ndarray, height: ndarray) -> ndarray:
-    """Unit vectors toward the light.
+    """Return unit vectors toward the light.
 
     Args:
-        azimuth_rad: direction in the plane, shape [B].
+        azimuth_rad: direction in the plane in radians, shape [B].
         height: z of the unit vector, in [0, 1], shape [B].
 
     Returns:
         (x, y, z), shape [B, 3].
     """
-    across = np.sqrt(1 - height**2)
-    return np.stack(
-        [across * np.cos(azimuth_rad), across * np.sin(azimuth_rad), height], axis=-1
-    )
+    horizontal = np.sqrt(1 - height**2)
+    x = horizontal * np.cos(azimuth_rad)
+    y = horizontal * np.sin(azimuth_rad)
+    return np.stack([x, y, height], axis=-1)
 
 
 def shade(
     along_x: ndarray, along_y: ndarray, light: ndarray, ambient: float
 ) -> ndarray:
-    """Brightness of the ground: ambient + (1 − ambient)·max(0, n·l).
+    """Return the brightness of terrain: ambient + (1 − ambient)·max(0, n·l).
 
     Args:
         along_x: ∂z/∂x, shape [B, H, W].
         along_y: ∂z/∂y, shape [B, H, W].
         light: unit vectors toward the light, shape [B, 3].
-        ambient: share of ambient light, in [0, 1].
+        ambient: fraction of ambient light, in [0, 1].
 
     Returns:
         Brightness in [0, 1], shape [B, H, W].
     """
     x, y, z = (light[:, k, None, None] for k in range(3))
-    cosine = (z - x * along_x - y * along_y) / np.sqrt(
-        1 + along_x * along_x + along_y * along_y
-    )
+    norm = np.sqrt(1 + along_x * along_x + along_y * along_y)
+    cosine = (z - x * along_x - y * along_y) / norm
     return np.maximum(cosine, 0) * (1 - ambient) + ambient
 
 
 def paint(colours: ndarray, brightness: ndarray) -> ndarray:
-    """Shade colours.
+    """Return an image of shaded colours.
 
     Args:
         colours: RGB in full light, 0–255, shape [B, 3, H, W].

@@ -1,7 +1,7 @@
-"""Rough ground: fractal elevation and craters, and its slope by Horn's method.
+"""Rough terrain: fractal elevation and craters, and slope by Horn's method.
 
-Batched NumPy in float64: NumPy's Fourier transform gives the same numbers on every
-machine, those that PyTorch links to do not. Letters in shapes: B maps, H×W cells.
+Batched NumPy in float64: NumPy's Fourier transform returns the same numbers on every
+machine, unlike those that PyTorch uses. Letters in shapes: B maps, H×W cells.
 
 Sources: paper III-A; Yokokohji et al. (2004) for fractal terrain; Pike (1977) for the
 proportions of craters; Horn (1981), "Hill shading and the reflectance map", for slope.
@@ -16,7 +16,7 @@ Shape = tuple[int, int]  # (H, W)
 
 
 def fractal(key: int, indices: ndarray, shape: Shape, roughness: float) -> ndarray:
-    """Synthesises fractal surfaces from a power-law spectrum.
+    """Return fractal surfaces from a power-law spectrum.
 
     Args:
         key: stream key.
@@ -26,7 +26,7 @@ def fractal(key: int, indices: ndarray, shape: Shape, roughness: float) -> ndarr
             −(roughness + 1).
 
     Returns:
-        Surfaces scaled to a relief (highest minus lowest) of 1, float64, shape [B, H,
+        Surfaces scaled to a relief (maximum minus minimum) of 1, float64, shape [B, H,
         W].
     """
     frequency = _frequencies(shape)
@@ -43,12 +43,12 @@ def open_fractal(
     roughness: float,
     reference_cells: int,
 ) -> ndarray:
-    """Synthesises pieces of fractal ground that goes on beyond the map.
+    """Return sections of fractal terrain that continues beyond the map.
 
-    The spectrum is `fractal`'s for wavelengths under the reference side and levels off
-    above it (von Kármán's), so that the ground is as steep on a map of any size. The
-    surface is made on twice the
-    extent, as a torus, and cropped: the map's opposite edges are no neighbours.
+    The spectrum is that of `fractal` for wavelengths below the reference side, and flat
+    above it (von Kármán's). The steepness therefore does not depend on the size of the
+    map. The surface is a torus of twice the extent, which is cropped: opposite edges of
+    the map are not neighbours.
 
     Args:
         key: stream key.
@@ -58,9 +58,8 @@ def open_fractal(
         reference_cells: side of the square that relief is measured on, in cells.
 
     Returns:
-        Surfaces scaled so that highest minus lowest is 1 on the mean of the squares
-        that cover the map from its corner, the last of them reaching beyond it;
-        float64, shape [B, H, W].
+        Surfaces scaled to a mean relief of 1 over the reference squares that cover the
+        map, from its corner to beyond its edges; float64, shape [B, H, W].
 
     Source: von Kármán (1948), "Progress in the statistical theory of turbulence", for
         the spectrum.
@@ -69,28 +68,26 @@ def open_fractal(
     covered = tiles_y * reference_cells, tiles_x * reference_cells
     twice = 2 * covered[0], 2 * covered[1]
     amplitude = np.hypot(_frequencies(twice), 1 / reference_cells) ** -(roughness + 1)
-    surface = _filtered(rng.normal(key, indices, twice), amplitude)[
-        :, : covered[0], : covered[1]
-    ]
+    surface = _filtered(rng.normal(key, indices, twice), amplitude)
+    surface = surface[:, : covered[0], : covered[1]]
     tiles = surface.reshape(
         len(surface), tiles_y, reference_cells, tiles_x, reference_cells
     )
     relief = (tiles.max(axis=(2, 4)) - tiles.min(axis=(2, 4))).mean(axis=(1, 2))
     low = surface.min(axis=(1, 2))
-    return (surface[:, : shape[0], : shape[1]] - low[:, None, None]) / relief[
-        :, None, None
-    ]
+    heights = surface[:, : shape[0], : shape[1]] - low[:, None, None]
+    return heights / relief[:, None, None]
 
 
 def _frequencies(shape: Shape) -> ndarray:
-    """Of the half spectrum of (H, W) cells, in cycles a cell, shape [H, W // 2 + 1]."""
-    return np.hypot(
-        np.fft.fftfreq(shape[0])[:, None], np.fft.rfftfreq(shape[1])[None, :]
-    )
+    """Return the half spectrum's frequencies in cycles per cell, [H, W // 2 + 1]."""
+    frequency_y = np.fft.fftfreq(shape[0])[:, None]
+    frequency_x = np.fft.rfftfreq(shape[1])[None, :]
+    return np.hypot(frequency_y, frequency_x)
 
 
 def _filtered(white: ndarray, amplitude: ndarray) -> ndarray:
-    """Noise of a spectrum, shape of `white`, [B, H, W]."""
+    """Return white noise with another spectrum, shape of `white`, [B, H, W]."""
     return np.fft.irfft2(np.fft.rfft2(white) * amplitude, s=white.shape[1:])
 
 
@@ -100,47 +97,45 @@ def place_craters(
     extent_m: tuple[float, float],
     count: ndarray,
     radius_m: tuple[float, float],
-    most: int,
+    max_count: int,
 ) -> tuple[ndarray, ndarray]:
-    """Draws centres and radii of craters whose rims do not overlap, by sequential
-    rejection.
+    """Draw centres and radii of craters by sequential rejection; rims do not overlap.
 
     Args:
         key: stream key.
         indices: elements of the stream, shape [B].
-        extent_m: size of the map along x and y.
-        count: craters asked for in each map, shape [B]; a map too crowded for them gets
+        extent_m: size of the map in x and y, in metres.
+        count: requested number of craters of each map, shape [B]; a crowded map has
             fewer.
-        radius_m: smallest and largest radius of a rim.
-        most: most craters of any map of the stream; fixes how many numbers a map draws.
+        radius_m: minimum and maximum radius of a rim, in metres.
+        max_count: maximum number of craters of all maps of the stream; it determines
+            the number of draws per map.
 
     Returns:
         Centres (x, y) in metres, shape [B, N, 2], and radii, shape [B, N]; radius 0
         means no crater.
     """
-    tries = 12 * most
-    draws = rng.uniform(key, indices, (max(tries, 1), 3))
+    n_draws = 12 * max_count
+    draws = rng.uniform(key, indices, (max(n_draws, 1), 3))
     centres = draws[..., :2] * np.asarray(extent_m)
-    # Small craters are the more frequent: uniform in log radius.
+    # Small craters are more frequent: log radii are uniform.
     low, high = np.log(radius_m)
     radii = np.exp(low + (high - low) * draws[..., 2])
-    kept = np.zeros_like(radii)
-    for i in range(tries):
-        wanted = (kept > 0).sum(axis=1) < count
-        if not wanted.any():
+    accepted = np.zeros_like(radii)
+    for i in range(n_draws):
+        is_short = (accepted > 0).sum(axis=1) < count
+        if not is_short.any():
             break
-        gap = np.hypot(*np.moveaxis(centres[:, :i] - centres[:, i : i + 1], -1, 0))
-        apart = ((kept[:, :i] == 0) | (gap > kept[:, :i] + radii[:, i : i + 1])).all(
-            axis=1
-        )
-        kept[:, i] = np.where(apart & wanted, radii[:, i], 0)
-    # Those that were placed first, in their order.
-    order = np.argsort(kept == 0, axis=1, kind="stable")[
-        :, : (kept > 0).sum(axis=1).max(initial=0)
-    ]
-    return np.take_along_axis(centres, order[..., None], axis=1), np.take_along_axis(
-        kept, order, axis=1
-    )
+        before = accepted[:, :i]
+        offset = centres[:, :i] - centres[:, i : i + 1]
+        distance = np.hypot(*np.moveaxis(offset, -1, 0))
+        is_apart = (before == 0) | (distance > before + radii[:, i : i + 1])
+        accepted[:, i] = np.where(is_apart.all(axis=1) & is_short, radii[:, i], 0)
+    # Accepted craters first, in their order.
+    order = np.argsort(accepted == 0, axis=1, kind="stable")
+    order = order[:, : (accepted > 0).sum(axis=1).max(initial=0)]
+    centres = np.take_along_axis(centres, order[..., None], axis=1)
+    return centres, np.take_along_axis(accepted, order, axis=1)
 
 
 def crater_elevation(
@@ -150,16 +145,16 @@ def crater_elevation(
     resolution_m: float,
     depth_ratio: float,
 ) -> ndarray:
-    """Raises rims and sinks parabolic bowls.
+    """Return the elevation of craters: raised rims and parabolic bowls.
 
     Args:
-        centres_m: shape [B, N, 2].
-        radii_m: radius of each rim, 0 for none, shape [B, N].
+        centres_m: (x, y) in metres, shape [B, N, 2].
+        radii_m: radius of each rim in metres, 0 for no crater, shape [B, N].
         shape: (H, W).
-        resolution_m: cell width.
-        depth_ratio: depth of a bowl below its rim over its diameter; the rim stands a
-            fifth of the depth over the plain and falls off outside with the cube of the
-            distance.
+        resolution_m: cell width in metres.
+        depth_ratio: depth of a bowl below its rim, divided by its diameter. The rim
+            rises a fifth of the depth above the plain; outside, its height falls with
+            the cube of the distance.
 
     Returns:
         Elevation to be added, metres, shape [B, H, W].
@@ -168,9 +163,9 @@ def crater_elevation(
     added = np.zeros((len(radii_m), *shape))
     for radius, centre_x, centre_y in zip(radii_m.T, *centres_m.T, strict=True):
         radius = radius[:, None, None]
-        distance = np.hypot(
-            x - centre_x[:, None, None], y[:, None] - centre_y[:, None, None]
-        )
+        offset_x = x - centre_x[:, None, None]
+        offset_y = y[:, None] - centre_y[:, None, None]
+        distance = np.hypot(offset_x, offset_y)
         ratio = distance / np.where(radius > 0, radius, 1)
         depth = 2 * radius * depth_ratio
         bowl = depth * (ratio**2 - 0.8)
@@ -179,37 +174,35 @@ def crater_elevation(
     return added
 
 
-def horn_gradient(framed_m: ndarray, resolution_m: float) -> tuple[ndarray, ndarray]:
-    """Estimates ∂z/∂x and ∂z/∂y by Horn's third-order finite differences.
+def horn_gradient(padded_m: ndarray, resolution_m: float) -> tuple[ndarray, ndarray]:
+    """Return ∂z/∂x and ∂z/∂y by Horn's third-order finite differences.
 
     Args:
-        framed_m: elevation with the ground one cell beyond the map, shape [B, H + 2, W
-            + 2]; where that is NaN, not known, the surface is continued linearly, so
-            that planes are exact everywhere. See `framed`.
-        resolution_m: cell width.
+        padded_m: elevation in metres, padded by one cell of the surrounding terrain,
+            shape [B, H + 2, W + 2]. Where padding is NaN, the surface is continued
+            linearly, so planes are exact everywhere. See `pad_missing`.
+        resolution_m: cell width in metres.
 
     Returns:
-        Two arrays of shape [B, H, W], metres a metre.
+        Two arrays of shape [B, H, W], dimensionless.
     """
-    z = framed_m.copy()
-    # Where the frame is not known, the plane through the two cells next to it.
+    z = padded_m.copy()
+    # Missing padding lies on the plane through the two cells next to it.
     for lines in (z.transpose(2, 0, 1), z.transpose(1, 0, 2)):  # columns, then rows
-        for edge, next_to, beyond in ((0, 1, 2), (-1, -2, -3)):
-            lines[edge] = np.where(
-                np.isnan(lines[edge]), 2 * lines[next_to] - lines[beyond], lines[edge]
-            )
-    pairs_y, pairs_x = z[:, 1:] + z[:, :-1], z[:, :, 1:] + z[:, :, :-1]
-    smooth_y, smooth_x = (
-        pairs_y[:, 1:] + pairs_y[:, :-1],
-        pairs_x[:, :, 1:] + pairs_x[:, :, :-1],
-    )
+        for edge, first, second in ((0, 1, 2), (-1, -2, -3)):
+            plane = 2 * lines[first] - lines[second]
+            lines[edge] = np.where(np.isnan(lines[edge]), plane, lines[edge])
+    pairs_y = z[:, 1:] + z[:, :-1]
+    pairs_x = z[:, :, 1:] + z[:, :, :-1]
+    smooth_y = pairs_y[:, 1:] + pairs_y[:, :-1]
+    smooth_x = pairs_x[:, :, 1:] + pairs_x[:, :, :-1]
     along_x = smooth_y[:, :, 2:] - smooth_y[:, :, :-2]
     along_y = smooth_x[:, 2:] - smooth_x[:, :-2]
     return along_x / (8 * resolution_m), along_y / (8 * resolution_m)
 
 
 def inclination_deg(along_x: ndarray, along_y: ndarray) -> ndarray:
-    """Angle between the ground and the horizontal.
+    """Return the angle between the terrain and the horizontal.
 
     Args:
         along_x: ∂z/∂x, any shape.
@@ -222,16 +215,19 @@ def inclination_deg(along_x: ndarray, along_y: ndarray) -> ndarray:
 
 
 def slopes_deg(elevation_m: ndarray, resolution_m: float) -> ndarray:
-    """Slopes of maps of which nothing beyond is known, float64, shape [B, H, W] of
-    both.
+    """Return slopes of maps without surrounding terrain.
+
+    Args:
+        elevation_m: elevation in metres, shape [B, H, W].
+        resolution_m: cell width in metres.
+
+    Returns:
+        Degrees, float64, shape [B, H, W].
     """
-    return inclination_deg(
-        *horn_gradient(framed(elevation_m.astype(np.float64)), resolution_m)
-    )
+    padded_m = pad_missing(elevation_m.astype(np.float64))
+    return inclination_deg(*horn_gradient(padded_m, resolution_m))
 
 
-def framed(elevation_m: ndarray) -> ndarray:
-    """Frames maps [B, H, W] with one cell of ground that is not known, NaN, shape [B, H
-    + 2, W + 2].
-    """
+def pad_missing(elevation_m: ndarray) -> ndarray:
+    """Return maps [B, H, W] padded by one cell of NaN, shape [B, H + 2, W + 2]."""
     return np.pad(elevation_m, ((0, 0), (1, 1), (1, 1)), constant_values=np.nan)

@@ -1,8 +1,7 @@
-"""From a recipe to maps: each map is a pure function of (recipe, split, index).
+"""Generation of maps: each map is a pure function of (recipe, split, index).
 
-Elevation is quantised first; slope, shading and λ are derived from what is stored.
-Batched NumPy in
-float64. Letters in shapes: B maps, H×W cells.
+Elevation is quantised first; slope, shading and λ are derived from stored elevation.
+Batched NumPy in float64. Letters in shapes: B maps, H×W cells.
 """
 
 from collections.abc import Sequence
@@ -25,46 +24,42 @@ from benchnav.datagen.recipe.scenario import Scenario
 from benchnav.datagen.schema import TRUTH, Maps, join_maps, quantise
 from benchnav.datagen.synth import appearance, elevation
 
-MOST_ATTEMPTS = 200
-# maps at a time, so that what is worked on stays in the processor's cache; of large
-# maps fewer
-_PIECE = 16
-_PIECE_CELLS = 2**20
+MAX_ATTEMPTS = 200
+# Maps per chunk, so that arrays stay in the processor's cache; fewer for large maps.
+_CHUNK = 16
+_CHUNK_CELLS = 2**20
 
 
 def generate(recipe: Recipe, split: str, indices: ndarray) -> Maps:
-    """Makes some maps of a split.
+    """Generate some maps of a split.
 
     Args:
-        recipe: what to make.
+        recipe: recipe of the maps.
         split: name of one of its splits.
-        indices: which maps, ascending integers ≥ 0, shape [B].
+        indices: indices of the maps, ascending integers ≥ 0, shape [B].
 
     Returns:
         The fields of `recipe.fields`, each of shape [B, *entry shape].
 
     Raises:
-        ConfigError: a split asks for solvable maps and the recipe yields none for some
-            index.
+        ConfigError: If a split requires solvable maps, and all draws of a map are
+            rejected.
     """
     indices = np.asarray(indices, dtype=np.int64)
-    size = min(_PIECE, recipe.grid.maps_in(_PIECE_CELLS))
+    size = min(_CHUNK, recipe.grid.maps_in(_CHUNK_CELLS))
     starts = range(0, max(len(indices), 1), size)
-    maps = join_maps(
-        [
-            _generate_piece(recipe, split, indices[start : start + size])
-            for start in starts
-        ]
-    )
+    chunks = [indices[start : start + size] for start in starts]
+    maps = join_maps([_generate_chunk(recipe, split, chunk) for chunk in chunks])
     return {
         name: maps[name].astype(field.dtype, copy=False)
         for name, field in recipe.fields.items()
     }
 
 
-def _generate_piece(recipe: Recipe, split: str, indices: ndarray) -> Maps:
-    maps, pending = Maps(), np.arange(len(indices))
-    for attempt in range(MOST_ATTEMPTS):
+def _generate_chunk(recipe: Recipe, split: str, indices: ndarray) -> Maps:
+    maps = Maps()
+    pending = np.arange(len(indices))
+    for attempt in range(MAX_ATTEMPTS):
         drawn = _draw(recipe, split, indices[pending], attempt)
         if not recipe.splits[split].solvable:
             return {**drawn, "reference_time_s": np.full(len(indices), np.nan)}
@@ -77,38 +72,37 @@ def _generate_piece(recipe: Recipe, split: str, indices: ndarray) -> Maps:
             return maps
     raise ConfigError(
         f"Expected split {split!r} to have maps whose goal can be reached; "
-        f"{MOST_ATTEMPTS} draws gave none "
-        f"for map {int(indices[pending[0]])}. Ease its scenario or lower "
-        "`stuck_threshold`."
+        f"{MAX_ATTEMPTS} draws gave none for map {int(indices[pending[0]])}. Ease its "
+        "scenario or lower `stuck_threshold`."
     )
 
 
 def reference_time_s(recipe: Recipe, maps: Maps) -> ndarray:
-    """Grid reference time: least time from start to goal over truly free cells at a
-    commanded 1 m/s.
+    """Return grid reference times: minimum times over truly free cells at 1 m/s.
 
-    A reference, not a bound: the grid has eight headings, and noise is at its mean.
+    A reference, not a bound: the grid has eight headings, and λ is its expectation.
 
     Returns:
-        Seconds, infinite where no free path joins start and goal, shape [B].
+        Seconds from start to goal, infinite without a free path, shape [B].
     """
     expected = latent.expected_of(latent.stored_truth(maps, recipe.classes))
     free = expected > recipe.stuck_threshold
     costs = gridgraph.travel_time_costs(
         expected, free, recipe.resolution_m, recipe.closed_corners
     )
-    every = np.arange(len(expected))
+    map_index = np.arange(len(expected))
     goals = np.zeros(expected.shape, dtype=bool)
-    goals[(every, *recipe.cells_of(maps["goal_m"]))] = True
+    goals[(map_index, *recipe.cells_of(maps["goal_m"]))] = True
     cost, _ = gridgraph.cost_to_go(costs, goals, recipe.grid.shape)
-    return cost[(every, *recipe.cells_of(maps["start_m"]))]
+    return cost[(map_index, *recipe.cells_of(maps["start_m"]))]
 
 
 def class_map(
     recipe: Recipe, split: str, indices: ndarray, attempt: int = 0
 ) -> ndarray:
-    """Lays out the classes of each map's environment; maps show the environments in
-    turns.
+    """Return the layout of the classes of each map's environment.
+
+    Map i shows environment i mod the number of environments.
 
     Returns:
         Class indices, shape [B, H, W].
@@ -117,16 +111,14 @@ def class_map(
     noise = fractal_perlin(
         recipe.seed, (split, "class", attempt), indices, recipe.grid.shape, periods
     )
-    # Which class takes which band differs from map to map, so no two classes are
-    # neighbours always.
+    # The order of classes over the bands is random, so that neighbours vary.
     order_key = rng.stream_key(recipe.seed, split, "class order", attempt)
     order = rng.permutation(order_key, indices, len(recipe.occupancy))
     table = recipe.environment_classes[indices % recipe.environments]
     shown = np.take_along_axis(table, order, axis=1)
     bands = appearance.class_bands(noise, np.asarray(recipe.occupancy))
-    return np.take_along_axis(shown, bands.reshape(len(indices), -1), axis=1).reshape(
-        bands.shape
-    )
+    flat_bands = bands.reshape(len(indices), -1)
+    return np.take_along_axis(shown, flat_bands, axis=1).reshape(bands.shape)
 
 
 def complete(
@@ -134,51 +126,52 @@ def complete(
     split: str,
     indices: ndarray,
     class_id: ndarray,
-    framed_m: ndarray,
+    padded_m: ndarray,
     attempt: int = 0,
     layers: Sequence[LayerSpec] = (),
 ) -> Maps:
-    """Derives all else from classes and elevation: slope, layers, colour under a random
-    light, λ.
+    """Return maps with all fields that follow from classes and elevation.
+
+    These are slope, layers, colour under a random light, and λ.
 
     Args:
         recipe: class table, seed, start and goal.
-        split: name of the maps' split, for their scenario's light and their random
+        split: name of the maps' split, for the light of its scenario and its random
             streams.
-        indices: which maps of the split, shape [B].
-        class_id: shape [B, H, W].
-        framed_m: elevation, with one cell of the ground beyond, NaN where that is not
-            known, shape [B, H + 2, W + 2]; it is quantised first, and everything
-            follows what is stored.
-        attempt: how many draws of these maps were rejected before.
-        layers: those that are drawn.
+        indices: indices of the maps in the split, shape [B].
+        class_id: class indices, shape [B, H, W].
+        padded_m: elevation in metres, padded by one cell of the surrounding terrain,
+            NaN if missing, shape [B, H + 2, W + 2]. It is quantised first; all other
+            fields follow from the quantised values.
+        attempt: number of previously rejected draws of these maps.
+        layers: layers to draw.
 
     Returns:
-        The fields of `schema.FIELDS` but `reference_time_s`, those of the layers, and
-        those of `schema.TRUTH` if a layer changes λ.
+        The fields of `schema.FIELDS` except `reference_time_s`, those of the layers,
+        and those of `schema.TRUTH` if a layer changes λ.
     """
     key = partial(rng.stream_key, recipe.seed, split)
     scenario = recipe.scenarios[recipe.splits[split].scenario]
-    ground = quantise(framed_m, 13)
-    gradient = elevation.horn_gradient(ground, recipe.resolution_m)
+    padded_m = quantise(padded_m, 13)
+    gradient = elevation.horn_gradient(padded_m, recipe.resolution_m)
     slope = quantise(elevation.inclination_deg(*gradient), 10)
-    azimuth, lift = rng.uniform(key("light", attempt), indices, (2,)).T
-    light = appearance.light_direction(
-        2 * np.pi * azimuth, _within(scenario.light_height, lift)
-    )
-    noise_key, shape = key("traversability", attempt), recipe.grid.shape
+    azimuth, height = rng.uniform(key("light", attempt), indices, (2,)).T
+    height = _within(scenario.light_height, height)
+    light = appearance.light_direction(2 * np.pi * azimuth, height)
+    noise_key = key("traversability", attempt)
+    shape = recipe.grid.shape
     if recipe.synthesis == 1:
         noise = rng.normal(noise_key, indices, shape)
     else:
         cells = recipe.correlation_m / recipe.resolution_m
         noise = copula.correlated_normal(noise_key, indices, shape, cells)
-    below = DrawnMaps(
-        class_id, ground[:, 1:-1, 1:-1], slope, recipe.grid, recipe.classes
-    )
+    elevation_m = padded_m[:, 1:-1, 1:-1]
+    below = DrawnMaps(class_id, elevation_m, slope, recipe.grid, recipe.classes)
     stack = [spec.layer for spec in layers]
     values = draw_layers(stack, recipe.seed, (split, attempt), indices, below)
     realised, stored_truth = _realise(stack, values, below, noise)
     brightness = appearance.shade(*gradient, light, scenario.ambient)
+    colours = _colour(stack, values, below, scenario)
     if recipe.places is None:
         ends = np.array([recipe.start_m, recipe.goal_m], dtype=np.float64)
         start_m, goal_m = np.tile(ends[:, None], (1, len(indices), 1))
@@ -187,9 +180,9 @@ def complete(
             recipe.places, recipe.grid, key("places", attempt), indices
         )
     return {
-        "rgb": appearance.paint(_colour(stack, values, below, scenario), brightness),
+        "rgb": appearance.paint(colours, brightness),
         "class_id": class_id,
-        "elevation_m": below.elevation_m,
+        "elevation_m": elevation_m,
         "slope_deg": slope,
         "traversability": quantise(realised, 16),
         "environment": indices % recipe.environments,
@@ -203,19 +196,16 @@ def complete(
 def _realise(
     layers: Sequence[Layer], values: Maps, below: DrawnMaps, noise: ndarray
 ) -> tuple[ndarray, Maps]:
-    """Return λ [B, H, W] by standard normal numbers, and the fields of `schema.TRUTH`
-    if a layer changes λ.
+    """Return λ [B, H, W] from standard normal noise, and the fields of `TRUTH`.
+
+    There are no such fields if no layer changes λ.
     """
-    truth = affect_layers(
-        layers,
-        latent.truth(below.class_id, below.slope_deg, below.classes),
-        values,
-        below,
-    )
-    is_affected = any(layer.affects() for layer in layers)
-    return latent.quantile_of(truth, noise), dict(
-        zip(TRUTH, truth[1:], strict=True)
-    ) if is_affected else {}
+    truth = latent.truth(below.class_id, below.slope_deg, below.classes)
+    truth = affect_layers(layers, truth, values, below)
+    stored: Maps = {}
+    if any(layer.affects() for layer in layers):
+        stored = dict(zip(TRUTH, truth[1:], strict=True))
+    return latent.quantile_of(truth, noise), stored
 
 
 def _colour(
@@ -228,21 +218,21 @@ def _colour(
 
 
 def _draw(recipe: Recipe, split: str, indices: ndarray, attempt: int) -> Maps:
-    """Draws maps that may or may not be solvable; see `complete`."""
+    """Return drawn maps, which may be unsolvable; see `complete`."""
     key = partial(rng.stream_key, recipe.seed, split)
-    grid, scenario = recipe.grid, recipe.scenarios[recipe.splits[split].scenario]
-    surface = key("elevation", attempt), indices, grid.shape, scenario.roughness
+    grid = recipe.grid
+    scenario = recipe.scenarios[recipe.splits[split].scenario]
+    arguments = key("elevation", attempt), indices, grid.shape, scenario.roughness
     if recipe.synthesis == 1:
-        ground = elevation.fractal(*surface)
+        elevation_m = elevation.fractal(*arguments)
     else:
-        ground = elevation.open_fractal(
-            *surface, max(3, round(REFERENCE_M / recipe.resolution_m))
-        )
-    relief, crowding = rng.uniform(key("relief", attempt), indices, (2,)).T
-    ground *= _within(scenario.relief_m, relief)[:, None, None]
+        reference_cells = max(3, round(REFERENCE_M / recipe.resolution_m))
+        elevation_m = elevation.open_fractal(*arguments, reference_cells)
+    relief, crater_draw = rng.uniform(key("relief", attempt), indices, (2,)).T
+    elevation_m *= _within(scenario.relief_m, relief)[:, None, None]
     low, high = recipe.craters(scenario)
     if high > 0:
-        count = low + np.floor((high - low + 1) * crowding)
+        count = low + np.floor((high - low + 1) * crater_draw)
         craters = elevation.place_craters(
             key("craters", attempt),
             indices,
@@ -251,20 +241,13 @@ def _draw(recipe: Recipe, split: str, indices: ndarray, attempt: int) -> Maps:
             scenario.crater_radius_m,
             high,
         )
-        ground += elevation.crater_elevation(
+        elevation_m += elevation.crater_elevation(
             *craters, grid.shape, grid.resolution_m, scenario.crater_depth_ratio
         )
     class_id = class_map(recipe, split, indices, attempt)
-    return complete(
-        recipe,
-        split,
-        indices,
-        class_id,
-        elevation.framed(ground),
-        attempt,
-        recipe.layers,
-    )
+    padded_m = elevation.pad_missing(elevation_m)
+    return complete(recipe, split, indices, class_id, padded_m, attempt, recipe.layers)
 
 
-def _within(limits: tuple[float, float], share: ndarray) -> ndarray:
-    return limits[0] + (limits[1] - limits[0]) * share
+def _within(limits: tuple[float, float], fraction: ndarray) -> ndarray:
+    return limits[0] + (limits[1] - limits[0]) * fraction

@@ -185,10 +185,13 @@ def test_layers_go_with_their_maps_where_others_are_left_out_and_maps_overlap(
         ("2nd=a.tif", "got '2nd'"),
         ("höhe_m=a.tif", "got 'höhe_m'"),
         ("=a.tif", "got ''"),
-        ("slope_deg=a.tif", "to be none of rgb, class_id, elevation_m, slope_deg,"),
-        ("group=a.tif", "to be none of rgb"),
-        ("entry_digests=a.tif", "to be none of rgb"),
-        ("state=a.tif", "to be none of rgb"),
+        (
+            "slope_deg=a.tif",
+            "that is not reserved (rgb, class_id, elevation_m, slope_deg,",
+        ),
+        ("group=a.tif", "that is not reserved (rgb"),
+        ("entry_digests=a.tif", "that is not reserved (rgb"),
+        ("state=a.tif", "that is not reserved (rgb"),
         ("vegetation_m=a.tif:ft", "`layer` vegetation_m in m, got 'ft'"),
     ],
 )

@@ -13,7 +13,7 @@ import pytest
 from benchnav.datagen.dem.survey import provenance
 from benchnav.datagen.schema import UNLABELLED, quantise
 from benchnav.datagen.synth.appearance import light_direction, shade
-from benchnav.datagen.synth.elevation import framed, horn_gradient, inclination_deg
+from benchnav.datagen.synth.elevation import horn_gradient, inclination_deg, pad_missing
 from tests.datagen.dem.rasters import (
     FLAT,
     NAMES,
@@ -77,7 +77,7 @@ def reprojected(
     frame: int = 0,
 ) -> np.ndarray:
     """GDAL's own answer for cells from the maps' south-west corner on, rows northward,
-    framed by some more.
+    pad_missing by some more.
     """
     west, south = (metres - 0.5 * frame for metres in source["origin_m"])
     expected = np.full([count + 2 * frame for count in cells], np.nan)
@@ -108,7 +108,7 @@ def test_slopes_are_those_of_the_whole_ground_at_seams_too(
     )  # else the raster ends where the maps begin
     cells = (56, 56) if frame else (60, 60)
     ground = quantise(reprojected(dem, source, resampling, cells, frame), 13)
-    slopes = inclination_deg(*horn_gradient(framed(ground[None]), 0.5))[0]
+    slopes = inclination_deg(*horn_gradient(pad_missing(ground[None]), 0.5))[0]
     for index, number in enumerate(source["kept"]):
         row, column = (int(2 * metres) + frame for metres in tile_place(source, number))
         own = (slice(row, row + 16), slice(column, column + 24))
@@ -133,7 +133,9 @@ def test_an_oblique_hill_is_shaded_as_in_the_raster(tmp_path: Path) -> None:
         slope
     ) * np.cos(azimuth - downhill)
     light = light_direction(np.array([np.pi / 2 - azimuth]), np.array([np.cos(zenith)]))
-    ours = shade(*horn_gradient(framed(stored.astype(np.float64)), 0.5), light, 0)[0]
+    ours = shade(*horn_gradient(pad_missing(stored.astype(np.float64)), 0.5), light, 0)[
+        0
+    ]
     inside = (slice(1, -1), slice(1, -1))
     assert np.ptp(hillshade) > 0.5
     np.testing.assert_allclose(

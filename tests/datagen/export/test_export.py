@@ -72,22 +72,22 @@ def read_back(out: Path, split: str, field: str) -> np.ndarray:
     return np.concatenate(chunks)
 
 
-@pytest.mark.parametrize("maps_a_file", [0, 1, 3])
+@pytest.mark.parametrize("maps_per_file", [0, 1, 3])
 def test_values_are_the_datasets_bit_for_bit(
     dataset_path: Path,
     tmp_path: Path,
-    maps_a_file: int,
+    maps_per_file: int,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     # Few maps at a time, so that files begin within what is read at once and row groups
     # end within files.
-    monkeypatch.setattr(parquet, "_CELLS_A_ROW_GROUP", 4 * 32 * 32)
-    out = exported(dataset_path, tmp_path / "out", maps_a_file=maps_a_file)
+    monkeypatch.setattr(parquet, "_CELLS_PER_ROW_GROUP", 4 * 32 * 32)
+    out = exported(dataset_path, tmp_path / "out", maps_per_file=maps_per_file)
     dataset = TerrainDataset(dataset_path)
     for split, name in parquet.split_names(dataset.splits).items():
         count = dataset.map_count(split)
         files = sorted((out / "data").glob(f"{name}-*.parquet"))
-        most = maps_a_file or count
+        most = maps_per_file or count
         wanted = [min(most, count - first) for first in range(0, count, most)]
         assert [pq.read_metadata(path).num_rows for path in files] == wanted
         assert [path.name for path in files] == [
@@ -125,7 +125,7 @@ def test_the_metadata_of_parquet_files_makes_the_maps_again(
 def test_pandas_reads_it_without_code_of_ours(
     dataset_path: Path, tmp_path: Path
 ) -> None:
-    out = exported(dataset_path, tmp_path / "out", maps_a_file=3)
+    out = exported(dataset_path, tmp_path / "out", maps_per_file=3)
     table = pd.read_parquet(out / "data")
     assert len(table) == sum(
         entry["maps"] for entry in TerrainDataset(dataset_path).splits.values()
@@ -160,7 +160,7 @@ def test_metadata_has_what_the_specification_requires(
         url="https://example.org/maps",
         date="2026-01-02",
     )
-    out = exported(dataset_path, tmp_path / "out", publication, maps_a_file=3)
+    out = exported(dataset_path, tmp_path / "out", publication, maps_per_file=3)
     about = metadata(out)
     assert about["@type"] == "sc:Dataset"
     assert about["conformsTo"] == "http://mlcommons.org/croissant/1.0"
@@ -186,7 +186,7 @@ def test_metadata_has_what_the_specification_requires(
 def test_metadata_names_every_file_with_its_digest_and_every_column(
     dataset_path: Path, tmp_path: Path
 ) -> None:
-    out = exported(dataset_path, tmp_path / "out", maps_a_file=3)
+    out = exported(dataset_path, tmp_path / "out", maps_per_file=3)
     about = metadata(out)
     files = [item for item in about["distribution"] if item["@type"] == "cr:FileObject"]
     assert {item["contentUrl"] for item in files} == {
@@ -362,7 +362,7 @@ def test_what_is_there_is_refused_and_replaced_only_where_it_is_an_export(
     Path("file").write_text("a day's work")
     for own in ("own", "file"):
         assert datagen("export", dataset_path, "--out", own, "--overwrite", *OWN) == 2
-        assert "is no exported dataset" in capsys.readouterr().err
+        assert "is not an exported dataset" in capsys.readouterr().err
     assert Path("own/thesis.tex").exists()
     assert {path.name for path in Path.cwd().iterdir()} == {"out", "own", "file"}
 
@@ -593,7 +593,7 @@ def test_layers_are_columns_and_named(tmp_path: Path) -> None:
     )
     about = metadata(out)
     assert (
-        "reference time; layers vegetation_m [m], NaN where nothing is known."
+        "reference time; layers vegetation_m [m], NaN where missing."
         in about["description"]
     )
     assert "layers vegetation_m [m]" in (out / "README.md").read_text()

@@ -158,12 +158,12 @@ def test_datasets_with_one_set_of_layers_merge_and_others_are_refused_in_one_lin
     bare = tiny_dataset(tmp_path / "c.h5", small_stakes(seed=5))
     with pytest.raises(DatasetError) as caught:
         next(merge([path, bare], tmp_path / "no.h5"))
-    assert "unlike fields (vegetation_m of one alone)" in str(caught.value)
+    assert "different fields (vegetation_m only in one)" in str(caught.value)
     assert "\n" not in str(caught.value)
     other = tiny_dataset(
         tmp_path / "d.h5", grown(small_stakes(seed=6), 5.0, wet_clay=GRASS)
     )
-    with pytest.raises(DatasetError, match="have unlike layers"):
+    with pytest.raises(DatasetError, match="have different layers"):
         next(merge([path, other], tmp_path / "no.h5"))
 
 
@@ -179,11 +179,11 @@ def test_layers_of_one_name_and_another_unit_or_order_are_not_merged(
         )
     first, swapped, measured = datasets
     with pytest.raises(
-        DatasetError, match=r"unlike order of fields \(.*a, b / .*b, a\)"
+        DatasetError, match=r"different order of fields \(.*a, b / .*b, a\)"
     ):
         next(merge([first, swapped], tmp_path / "no.h5"))
     with pytest.raises(
-        DatasetError, match=r"fields of unlike dtype, unit or meaning \(a, b\)"
+        DatasetError, match=r"fields of different dtype, unit or meaning \(a, b\)"
     ):
         next(merge([first, measured], tmp_path / "no.h5"))
 
@@ -223,7 +223,7 @@ def test_the_command_refuses_unlike_layers_in_one_line(
     bare = tiny_dataset(tmp_path / "bare.h5", small_stakes(seed=5))
     assert call("datagen", "merge", path, bare, "--out", tmp_path / "no.h5") == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert f"{path} and {bare} have unlike fields (vegetation_m of one alone)" in line
+    assert f"{path} and {bare} have different fields (vegetation_m only in one)" in line
     assert not (tmp_path / "no.h5").exists()
 
 

@@ -112,7 +112,7 @@ def test_maps_of_a_folder_are_those_of_a_file(
 ) -> None:
     for _ in create(tiny_recipe(), tmp_path / "d", shard_cells=3 * 32 * 32):
         pass
-    monkeypatch.setattr(reader, "_MOST_OPEN", 2)
+    monkeypatch.setattr(reader, "_MAX_OPEN", 2)
     whole = TerrainMaps(tiny_dataset(tmp_path / "d.h5"), "train")
     parts = TerrainMaps(tmp_path / "d", "train")
     for index in (7, 0, 3, 5, 2, 6, 1, 4):
@@ -170,7 +170,7 @@ def test_a_file_that_is_one_too_many_is_closed(
             h5py.h5f.OBJ_ALL, h5py.h5f.OBJ_FILE | h5py.h5f.OBJ_DATASET
         )
 
-    monkeypatch.setattr(reader, "_MOST_OPEN", 2)
+    monkeypatch.setattr(reader, "_MAX_OPEN", 2)
     before = count()
     for index in range(8):
         shards[index]

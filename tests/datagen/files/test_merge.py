@@ -62,7 +62,8 @@ def test_all_reasons_are_given_at_once(tmp_path: Path) -> None:
     with pytest.raises(DatasetError) as caught:
         run([first, second, first], tmp_path / "m.h5", "no spaces")
     for reason in (
-        r"unlike resolution_m (0.5 / 0.6)", "unlike classes", "unlike scenarios or `solvable` in split 'test/hs'",
+        r"different resolution_m (0.5 / 0.6)", "different classes",
+        "different scenarios or `solvable` in split 'test/hs'",
         "10 map(s) in common", "got 'no spaces'",
     ):  # fmt: skip
         assert reason in str(caught.value)
@@ -92,7 +93,7 @@ def test_maps_made_in_another_way_are_refused(tmp_path: Path) -> None:
         path = tiny_dataset(
             tmp_path / "other.h5", only(replace(other, seed=3), "train")
         )
-        with pytest.raises(DatasetError, match=f"unlike {name} ") as caught:
+        with pytest.raises(DatasetError, match=f"different {name} ") as caught:
             run([first, path], tmp_path / "n.h5")
         assert "Rule(" not in str(caught.value)
         path.unlink()
@@ -127,7 +128,7 @@ def test_unlike_scenarios_are_found_in_files_that_were_merged_before(
     )
     both = run([first, second], tmp_path / "ab.h5").path
     for order in ([both, third], [third, both]):
-        with pytest.raises(DatasetError, match=r"unlike scenarios .*'test/hs'"):
+        with pytest.raises(DatasetError, match=r"different scenarios .*'test/hs'"):
             run(order, tmp_path / "m.h5")
 
 

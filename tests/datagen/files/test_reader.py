@@ -60,7 +60,8 @@ def test_a_locked_file_is_called_locked(dataset_path: Path, tmp_path: Path) -> N
     with open(path) as other:
         fcntl.flock(other, fcntl.LOCK_EX)
         with pytest.raises(
-            DatasetError, match=r"locked\.h5 is locked: .*Close what writes to it\.$"
+            DatasetError,
+            match=r"locked\.h5 is locked: .*Close the program that writes to it\.$",
         ):
             TerrainDataset(path)
     TerrainDataset(path)
@@ -107,10 +108,10 @@ def test_a_damaged_scale_is_found(dataset_path: Path, tmp_path: Path) -> None:
 
 
 def test_foreign_newer_and_missing_files_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match="not there"):
+    with pytest.raises(DatasetError, match="does not exist"):
         TerrainDataset(tmp_path / "none.h5")
     (tmp_path / "text.h5").write_text("hello")
-    with pytest.raises(DatasetError, match="no readable HDF5"):
+    with pytest.raises(DatasetError, match="not a readable HDF5"):
         TerrainDataset(tmp_path / "text.h5")
     path = tiny_dataset(tmp_path / "d.h5")
     rewrite(path, {"format_version": "1.5"})

@@ -63,8 +63,8 @@ def test_values_lie_within_the_range_and_fill_some_of_it(recipe: Recipe) -> None
     maps = generate(recipe, "train", MAPS)
     (spec,) = recipe.layers
     values, field = maps[spec.name], spec.stored_field
-    assert (field.least <= values).all()
-    assert (values <= field.most).all()
+    assert (field.minimum <= values).all()
+    assert (values <= field.maximum).all()
     assert values.std() > 0
 
 

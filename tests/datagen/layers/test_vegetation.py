@@ -209,8 +209,8 @@ def test_a_class_may_be_overgrown_altogether_or_by_less_than_a_cell() -> None:
         ("wet_clay", {"cover": 0}, "`cover` of vegetation in (0, 1], got 0"),
         ("wet_clay", {"cover": 1.1}, "`cover` of vegetation in (0, 1], got 1.1"),
         ("wet_clay", {"colour": [0, 0, 256]}, "`colour` of vegetation in 0–255, got (0, 0, 256)"),
-        ("wet_clay", {"colour": [152, 126, 100]}, "on 'wet_clay' of a `colour` that no ground has in scenario 'std'"),
-        ("packed_soil", {}, "on 'packed_soil' and 'crusted_soil', whose ground has one colour, got [40, 90"),
+        ("wet_clay", {"colour": [152, 126, 100]}, "on 'wet_clay' of a `colour` that no terrain has in scenario 'std'"),
+        ("packed_soil", {}, "on 'packed_soil' and 'crusted_soil', whose terrain has one colour, got [40, 90"),
         ("wet_clay", {"width": 3}, "'width'"),
     ],
 )  # fmt: skip
@@ -249,7 +249,7 @@ def test_recipes_with_vegetation_say_how_large_its_patches_are(
     bare = small_stakes().to_dict() | {"vegetation_period_m": 4}
     with pytest.raises(
         ConfigError,
-        match="`vegetation_period_m` with `vegetation` of a class, got 4 and none",
+        match="`vegetation_period_m` only with `vegetation` of a class, got 4",
     ):
         recipe_from_dict(bare, "mine.yaml")
 

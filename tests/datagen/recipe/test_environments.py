@@ -124,7 +124,7 @@ def test_tables_that_cannot_be_dealt_are_refused_by_name() -> None:
     ))  # fmt: skip
     assert small_stakes(classes=classes, occupancy=(0.5, 0.5)).units == ((0, 1), (2, 3))
     with pytest.raises(
-        ConfigError, match=r"3 at a time.*goes with sand, dust"
+        ConfigError, match=r"3 at a time.*includes sand, dust"
     ) as caught:
         small_stakes(classes=classes, occupancy=(0.4, 0.3, 0.3))
     assert "\n" not in str(caught.value)
@@ -140,7 +140,7 @@ def test_look_alikes_that_hardly_differ_are_refused_by_name() -> None:
     assert small_stakes(classes=table(0.51), occupancy=(0.5, 0.5))
     with pytest.raises(
         ConfigError,
-        match=r"0\.3 in E\[λ\] on flat ground, got 0\.79\d for 'sand' and 0\.51",
+        match=r"0\.3 in E\[λ\] on flat terrain, got 0\.79\d for 'sand' and 0\.51",
     ):
         small_stakes(classes=table(0.49), occupancy=(0.5, 0.5))
     # Soft spots count.

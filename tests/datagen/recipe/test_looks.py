@@ -202,7 +202,7 @@ def test_a_tint_may_not_give_ground_the_colour_of_vegetation() -> None:
     )
     with pytest.raises(
         ConfigError,
-        match="on 'wet_clay' of a `colour` that no ground has in scenario 'mud'",
+        match="on 'wet_clay' of a `colour` that no terrain has in scenario 'mud'",
     ):
         grown(muddy, wet_clay=replace(grass(0.4), colour=(76, 110, 50)))
 

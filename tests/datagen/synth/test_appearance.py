@@ -7,7 +7,7 @@ from benchnav.datagen.noise import fractal_perlin
 from benchnav.datagen.recipe.latent import latent_mean, latent_std
 from benchnav.datagen.recipe.recipe import load_recipe
 from benchnav.datagen.synth import appearance
-from benchnav.datagen.synth.elevation import framed, horn_gradient
+from benchnav.datagen.synth.elevation import horn_gradient, pad_missing
 
 
 @given(st.lists(st.floats(0.05, 1), min_size=1, max_size=6), st.integers(0, 5))
@@ -33,7 +33,7 @@ def test_perlin_noise_is_smooth_and_zero_at_its_lattice() -> None:
 def test_shading_is_lamberts_law() -> None:
     _, x = np.mgrid[:5, :5] * 0.5
     slope = np.tan(np.radians(20))
-    plane = horn_gradient(framed((slope * x)[None]), 0.5)
+    plane = horn_gradient(pad_missing((slope * x)[None]), 0.5)
     light = appearance.light_direction(
         np.array([np.pi]), np.array([np.cos(np.radians(20))])
     )

@@ -16,7 +16,7 @@ def test_horn_is_exact_on_planes_up_to_the_border(
     y, x = np.mgrid[:7, :9] * resolution
     plane = (3 + along_x * x + along_y * y)[None]
     gradient_x, gradient_y = elevation.horn_gradient(
-        elevation.framed(plane), resolution
+        elevation.pad_missing(plane), resolution
     )
     np.testing.assert_allclose(gradient_x, along_x, atol=1e-9)
     np.testing.assert_allclose(gradient_y, along_y, atol=1e-9)
@@ -29,7 +29,7 @@ def test_horn_is_exact_on_planes_up_to_the_border(
 def test_horn_weights_are_1_2_1() -> None:
     bump = np.zeros((1, 5, 5))
     bump[0, 2, 2] = 8.0
-    gradient_x, gradient_y = elevation.horn_gradient(elevation.framed(bump), 1.0)
+    gradient_x, gradient_y = elevation.horn_gradient(elevation.pad_missing(bump), 1.0)
     assert gradient_x[0, 1:4, 1].tolist() == [1, 2, 1]
     assert gradient_x[0, 1:4, 3].tolist() == [-1, -2, -1]
     assert gradient_y[0, 1, 1:4].tolist() == [1, 2, 1]
@@ -78,7 +78,7 @@ def test_a_crater_has_rim_and_bowl() -> None:
 
 def test_the_slope_at_an_edge_follows_the_ground_beyond_where_it_is_known() -> None:
     ground = np.random.default_rng(0).normal(size=(2, 14, 18))
-    whole = np.stack(elevation.horn_gradient(elevation.framed(ground), 0.5))
+    whole = np.stack(elevation.horn_gradient(elevation.pad_missing(ground), 0.5))
     window = ground[:, 2:10, 4:12].copy()
     np.testing.assert_array_equal(
         elevation.horn_gradient(window, 0.5), whole[:, :, 3:9, 5:11]

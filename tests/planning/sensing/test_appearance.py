@@ -114,7 +114,7 @@ def test_where_nothing_was_seen_are_the_training_means(seed: int, share: float) 
     assert torch.equal(known.layers["vegetation_m"].isnan(), ~seen)
     assert torch.equal(known.layers["seen"], seen.float())
     slopes = elevation.inclination_deg(
-        *elevation.horn_gradient(elevation.framed(ground.double().numpy()), 0.5)
+        *elevation.horn_gradient(elevation.pad_missing(ground.double().numpy()), 0.5)
     )
     for own in range(2):
         for row in range(height):
