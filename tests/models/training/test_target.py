@@ -11,12 +11,12 @@ from benchnav.models.checkpoint import (
     Checkpoint,
     Part,
     load_checkpoint,
-    member_name,
     member_names,
     save_checkpoint,
 )
+from benchnav.models.checkpoint_folders import find_checkpoint
 from benchnav.models.config import ClassifierConfig, NetworkConfig
-from benchnav.models.predictor import find_checkpoint
+from benchnav.models.parts import member_name
 from benchnav.models.training import target as module
 from benchnav.models.training.fit import STATE, FitOptions
 from benchnav.models.training.target import Target, open_target
