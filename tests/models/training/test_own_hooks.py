@@ -17,7 +17,7 @@ from benchnav.models.cli import fit
 from benchnav.models.nets.trainable import TrainableNetwork
 from benchnav.models.training.check import fields_of, try_network
 from benchnav.models.training.data import MapDataset
-from benchnav.models.training.networks import is_trainable
+from benchnav.models.training.find import is_trainable
 from tests.commands import call
 from tests.models.training.conftest import EXAMPLE
 
