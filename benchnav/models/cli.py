@@ -128,7 +128,8 @@ def train_mdn(
         out: Checkpoint folder. Logs are written to OUT.training.
         mdn: Settings of the network.
     """
-    from benchnav.models.training.networks import find_trainable, train_networks
+    from benchnav.models.training.find import find_trainable
+    from benchnav.models.training.networks import train_networks
 
     train_networks(options, data, out, find_trainable("mdn", vars(mdn)))
 
