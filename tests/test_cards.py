@@ -14,7 +14,8 @@ import yaml
 import benchnav
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.checkpoint import digests_of
-from benchnav.models.predictor import find_checkpoint, load_model
+from benchnav.models.checkpoint_folders import find_checkpoint
+from benchnav.models.predictor import load_model
 
 ROOT = Path(__file__).parents[1]
 MODELS = [

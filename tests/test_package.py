@@ -145,7 +145,8 @@ def test_out_of_the_wheel_the_shipped_maps_and_models_are_found(
 import benchnav
 from benchnav.datagen.files.find import dataset_folders, find_dataset
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.models.predictor import find_checkpoint, list_checkpoints, load_model
+from benchnav.models.checkpoint_folders import find_checkpoint, list_checkpoints
+from benchnav.models.predictor import load_model
 print(benchnav.__file__, *dataset_folders())
 print(*(TerrainDataset(find_dataset(name)).path for name in ("paper-v1", "stakes-v1")))
 print(*sorted(path.name for path in list_checkpoints()), find_checkpoint("stakes-v1"))

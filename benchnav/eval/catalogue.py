@@ -203,7 +203,7 @@ def _setting_lines(settings: Mapping[str, Any]) -> Iterator[str]:
 
 def _checkpoints() -> Iterator[Entry]:
     from benchnav.models.checkpoint import read_config
-    from benchnav.models.predictor import list_checkpoints
+    from benchnav.models.checkpoint_folders import list_checkpoints
 
     for folder in list_checkpoints():
         try:

@@ -1,6 +1,4 @@
-"""Models that predict traversability: their base classes, checkpoints, training and
-quality.
-"""
+"""Models of traversability: base classes, checkpoints, training and quality."""
 
 from benchnav.core.public_names import face
 
@@ -17,11 +15,8 @@ __getattr__, __dir__, __all__ = face(
             "load_checkpoint",
             "save_checkpoint",
         ),
-        "benchnav.models.predictor": (
-            "find_checkpoint",
-            "list_checkpoints",
-            "load_model",
-        ),
+        "benchnav.models.checkpoint_folders": ("find_checkpoint", "list_checkpoints"),
+        "benchnav.models.predictor": ("load_model",),
         "benchnav.models.quality.measure": ("evaluate as evaluate_model",),
         "benchnav.models.tiles": (
             "Window",

@@ -5,9 +5,10 @@ from benchnav.models.checkpoint import (
     load_checkpoint,
     save_checkpoint,
 )
+from benchnav.models.checkpoint_folders import find_checkpoint, list_checkpoints
 from benchnav.models.config import TrainingConfig, TrainOptions
 from benchnav.models.nets.trainable import TrainableModel
-from benchnav.models.predictor import find_checkpoint, list_checkpoints, load_model
+from benchnav.models.predictor import load_model
 from benchnav.models.quality.measure import evaluate as evaluate_model
 from benchnav.models.tiles import Window, measure_margin, predict_tiles, write_risk_maps
 from benchnav.models.training.networks import fit_model

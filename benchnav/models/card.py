@@ -1,6 +1,4 @@
-"""The card of a checkpoint, README.md, for hubs and people: what it is, what it was
-trained on, how to load it.
-"""
+"""Card of a checkpoint, README.md, for hubs and people: model, training data, and use."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -22,15 +20,15 @@ def card_of(
     conformal_maps: int = 0,
     pool_temperature: float = 1.0,
 ) -> str:
-    """Writes the card of a checkpoint.
+    """Return the card of a checkpoint.
 
     Args:
-        name: of its folder.
-        model: of what kind it is.
-        parts: its parts by name, each a `models.checkpoint.Part`; one or more.
+        name: name of its folder.
+        model: kind of the model.
+        parts: its parts by name, each a `models.checkpoint.Part`; at least one.
         classes: names of the terrain classes.
-        code: digest of the code of a user's own class; empty where it is ours.
-        conformal_maps: by how many maps it has been recalibrated; 0 where it has not.
+        code: digest of the code of a custom class; empty for models of this package.
+        conformal_maps: number of maps of the recalibration; 0 without one.
         pool_temperature: of the average of its members.
 
     Returns:
@@ -42,21 +40,20 @@ def card_of(
         "tags": ["traversability", "robotics"],
         "datasets": datasets,
     }
-    is_own = code and model not in registry.names(
-        "model"
-    )  # an installed class is found by its name
-    place = f"path/to/file.py:{model}@{name}" if is_own else name
-    own = (
+    # An installed class is found by its name.
+    is_custom = code and model not in registry.names("model")
+    model_path = f"path/to/file.py:{model}@{name}" if is_custom else name
+    custom_note = (
         f"The class `{model}` is a user's own and not in this folder: name the file "
         "that holds it. The "
         f"SHA-256 of its code was `{code}`. Loading runs that file.\n\n"
-        if is_own
+        if is_custom
         else ""
     )
     classes = (
         f"Terrain classes of the maps: {', '.join(classes)}.\n\n" if classes else ""
     )
-    promise = (
+    guarantee = (
         f"It is recalibrated by {conformal_maps} maps (conformal): on a new map of "
         "the same kind λ of a random cell "
         "falls below the u-quantile with probability u at most. Nothing is promised "
@@ -71,11 +68,11 @@ def card_of(
         "the distribution of traversability in every cell of a "
         f"map.{_members(parts, pool_temperature)} This folder "
         "holds tensors and settings, and no code.\n\n"
-        f"```sh\nbenchnav-train evaluate {place} --data DATASET\n"
-        f"benchnav-eval run --model {place} --data DATASET\n```\n\n"
+        f"```sh\nbenchnav-train evaluate {model_path} --data DATASET\n"
+        f"benchnav-eval run --model {model_path} --data DATASET\n```\n\n"
         "```python\nfrom benchnav.models import load_model\n\nmodel = "
-        f"load_model({place!r})\n```\n\n"
-        f"{own}{classes}{promise}## Parts\n\n{_parts_table(parts)}\n\n## "
+        f"load_model({model_path!r})\n```\n\n"
+        f"{custom_note}{classes}{guarantee}## Parts\n\n{_parts_table(parts)}\n\n## "
         f"Settings\n\n{_settings_table(parts)}\n\n"
         "Measures are of the validation maps, which early stopping and calibration "
         "have seen. `config.json` holds the "
@@ -86,7 +83,7 @@ def card_of(
 
 
 def _members(parts: Mapping[str, Any], temperature: float) -> str:
-    """Of an ensemble, of how many networks it is made."""
+    """Return a sentence on the number of networks of an ensemble, otherwise nothing."""
     count = sum(name.partition("-")[2] != "" for name in parts) + 1
     if count == 1:
         return ""

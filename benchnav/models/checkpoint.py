@@ -1,18 +1,17 @@
-"""Checkpoints: a trained model as a folder of data that runs no code when it is read.
+"""Checkpoints: a trained model as a folder of data; reading it runs no code.
 
-`config.json` says what the model is and how each of its parts came to be, and holds its
-own SHA-256; a part, such as `classifier` or `gp`, has its tensors in
-`PART.safetensors`, whose SHA-256 stands in `config.json`; `ground.json` holds
-statistics of the training maps, of which the model itself makes no use. A checkpoint is
-written to a folder beside its own and renamed, so that its name never holds half of
-one.
+`config.json` describes the model and the training of each part, and contains its own
+SHA-256. A part, such as `classifier` or `gp`, has its tensors in `PART.safetensors`,
+whose SHA-256 is in `config.json`. `ground.json` contains statistics of the training
+maps, which the model itself does not use. A checkpoint is written to a temporary folder
+next to its own and renamed, so that it is never incomplete.
 """
 
 import hashlib
 import json
 import os
 import platform
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
@@ -25,7 +24,6 @@ import torch
 from torch import Tensor
 
 import benchnav
-from benchnav.core import registry
 from benchnav.core.errors import CheckpointError, ConfigError
 from benchnav.core.ground import GroundStatistics
 from benchnav.core.short_repr import short_repr
@@ -44,29 +42,27 @@ from benchnav.core.store import (
     write_text,
 )
 from benchnav.models.card import CARD, card_of
+from benchnav.models.parts import GP, member_name, training_command
 
 FORMAT = "benchnav-checkpoint"
 FORMAT_VERSION = (2, 3)
 OLDEST_VERSION = (2, 0)
-_SEALED = (2, 2)  # from which on config.json holds its own digest
-CONFIG, GROUND = "config.json", "ground.json"
+_SEALED = (2, 2)  # from this version on, config.json contains its own digest
+CONFIG = "config.json"
+GROUND = "ground.json"
 FUSED = "fused"
-CLASSIFIER, GP = "classifier", "gp"
 
-_APART = (
-    "tensors",
-    "data_id",
-    "data_digest",
-)  # of a part; all else is written as it is
+# Fields of a part that config.json does not contain under their own names.
+_STORED_ELSEWHERE = ("tensors", "data_id", "data_digest")
 _PACKAGES = ("torch", "lightning", "gpytorch", "segmentation-models-pytorch", "numpy")
 
 
 def _versions() -> dict[str, str]:
-    found = {name: version(name) for name in _PACKAGES}
+    packages = {name: version(name) for name in _PACKAGES}
     return {
         "benchnav": benchnav.__version__,
         "python": platform.python_version(),
-        **found,
+        **packages,
     }
 
 
@@ -75,18 +71,18 @@ class Part:
     """One trained part of a model.
 
     Args:
-        config: settings it is rebuilt from, plain data.
+        config: settings to rebuild it from, plain data.
         tensors: weights and tables by name.
         seed: root seed of its training.
-        metrics: what was measured after training.
-        data_id: name of what it was trained on: a dataset, or a file of slip logs.
-        data_digest: content digest of what it was trained on.
-        half_precision: store kernels as float16; they are read as float32.
-        versions: of the packages that trained it.
-        trainer: settings of the trainer on which the outcome depends; None of a part
-            that none trained, or of an earlier version.
-        conformal: whether every second map of `valid` was kept from it, to be scored in
-            the end.
+        metrics: metrics after training.
+        data_id: name of the training data: a dataset, or a file of slip logs.
+        data_digest: content digest of the training data.
+        half_precision: whether kernels are stored as float16; they are read as float32.
+        versions: versions of the packages that trained it.
+        trainer: settings of the trainer that affect the result; None for a part without a
+            trainer, or of an earlier version.
+        conformal: whether training left out every second map of `valid` for conformal
+            scores.
     """
 
     __repr__ = short_repr
@@ -109,17 +105,15 @@ class Checkpoint:
 
     Args:
         class_names: names of the C classes, in the order of their ids.
-        parts: its parts by name; `gp`, `classifier`, `classifier-2`, … of a fused
-            model.
-        model: registered name of the family that rebuilds the model; of a user's own
-            class, found in a file or module, its name alone.
+        parts: its parts by name; `gp`, `classifier`, `classifier-2`, … of a fused model.
+        model: registered name of the family that rebuilds the model; for a custom class
+            from a file or module, its class name.
         pool_temperature: of the average of several members (see
             `models.nets.calibration`); 1 changes nothing.
-        code: digest of the code of the class; empty where that is ours.
-        conformal: a `models.conformal.ConformalTable` as plain data, by which the whole
-            model is recalibrated; empty where it is not.
-        ground: statistics of the maps that it was trained on last; None where it was
-            trained on none.
+        code: digest of the code of a custom class; empty for models of this package.
+        conformal: a `models.conformal.ConformalTable` as plain data, which recalibrates
+            the model; empty if there is none.
+        ground: statistics of the most recent training maps; None without training maps.
     """
 
     __repr__ = short_repr
@@ -133,136 +127,103 @@ class Checkpoint:
     ground: GroundStatistics | None = None
 
     def part(self, name: str) -> Part:
-        """Gives a part.
+        """Return a part.
 
         Raises:
-            CheckpointError: it has not been trained.
+            CheckpointError: If it has not been trained.
         """
         if name not in self.parts:
             raise CheckpointError(
                 f"Expected a checkpoint with a part {name!r}, got one with "
-                f"{sorted(self.parts)}. "
-                f"Train it with `benchnav-train {_command(name)}` into the same "
-                "folder."
+                f"{sorted(self.parts)}. Train it with `benchnav-train "
+                f"{training_command(name)}` into the same folder."
             )
         return self.parts[name]
 
     def with_part(self, name: str, part: Part) -> "Checkpoint":
-        """Gives a copy in which one part is added or replaced; another member makes
-        another pool and another model.
+        """Return a copy with one part added or replaced.
+
+        Another member invalidates the pool's temperature; any part invalidates the
+        conformal recalibration.
         """
-        pooled = self.pool_temperature if name == GP else 1.0
-        return replace(
-            self,
-            parts={**self.parts, name: part},
-            pool_temperature=pooled,
-            conformal={},
-        )
-
-
-def _command(part: str) -> str:
-    """The command that trains a part."""
-    stem = part.partition("-")[0]
-    if stem in (CLASSIFIER, GP):
-        return stem
-    return (
-        f"fit {stem}"
-        if stem in registry.names("model")
-        else f"fit path/to/file.py:{stem}"
-    )
-
-
-def member_name(index: int, stem: str) -> str:
-    """Name of the part that holds a member of an ensemble; members are counted from 0,
-    and the first is the stem.
-    """
-    return f"{stem}-{index + 1}" if index else stem
-
-
-def is_member(name: str, stem: str) -> bool:
-    """Tells whether a part is a member of the name `stem`."""
-    return name == stem or (
-        name.startswith(f"{stem}-") and name.removeprefix(f"{stem}-").isdigit()
-    )
+        temperature = self.pool_temperature if name == GP else 1.0
+        parts = {**self.parts, name: part}
+        return replace(self, parts=parts, pool_temperature=temperature, conformal={})
 
 
 def digests_of(folder: Path) -> dict[str, str]:
-    """SHA-256 of each file that predictions depend on, by name: not of the card, nor of
-    statistics of the ground.
+    """Return the SHA-256 of each file that affects predictions, by name.
+
+    The card and the statistics of the terrain do not affect them.
     """
-    kinds = (".json", ".safetensors")
-    files = sorted(
-        path
-        for path in folder.iterdir()
-        if path.suffix in kinds and path.name != GROUND
-    )
-    return {path.name: digest_of_path(path) for path in files}
+    suffixes = (".json", ".safetensors")
+    paths = (path for path in folder.iterdir() if path.suffix in suffixes)
+    return {
+        path.name: digest_of_path(path) for path in sorted(paths) if path.name != GROUND
+    }
 
 
 def member_names(checkpoint: Checkpoint, stem: str) -> list[str]:
-    """Names of the members that are there, the first one in any case."""
+    """Return the names of the existing members, or else that of the first."""
     names = [member_name(index, stem) for index in range(len(checkpoint.parts))]
     return [name for name in names if name in checkpoint.parts] or [stem]
 
 
 def as_stored(tensors: Mapping[str, Tensor], half_precision: bool) -> dict[str, Tensor]:
-    """Gives tensors as they are read back: those kept as float16 are rounded to it.
+    """Return tensors as they will be read back: kernels are rounded if stored as float16.
 
     Args:
         tensors: by name.
-        half_precision: whether kernels are kept as float16.
+        half_precision: whether kernels are stored as float16.
     """
     return _as_read(_to_store(tensors, half_precision))
 
 
 def save_checkpoint(folder: str | Path, checkpoint: Checkpoint) -> None:
-    """Writes a checkpoint, replacing one that is there.
+    """Write a checkpoint, and replace an existing one.
 
     Args:
-        folder: its name.
-        checkpoint: what to write.
+        folder: folder of the checkpoint.
+        checkpoint: content to write.
 
     Raises:
-        OSError: it cannot be written.
-        ConfigError: the name is that of something else.
-        BenchnavError: another process is writing it.
+        OSError: If it cannot be written.
+        ConfigError: If the path exists and is not a checkpoint.
+        BenchnavError: If another process is writing it.
     """
-    with sole_writer(Path(folder), str(folder)), open_place(folder) as (place, partial):
-        _write(partial, checkpoint, place.name)
-        take_place(partial, place, last=CONFIG)
+    with sole_writer(Path(folder), str(folder)), open_place(folder) as (path, partial):
+        _write(partial, checkpoint, path.name)
+        take_place(partial, path, last=CONFIG)
 
 
 @contextmanager
 def open_place(folder: str | Path) -> Iterator[tuple[Path, Path]]:
-    """Gives the place that the name of a checkpoint stands for, and an empty folder to
-    write it in.
+    """Provide the resolved path of a checkpoint, and an empty folder to write it to.
 
     Raises:
-        OSError: it cannot be written.
-        ConfigError: the name is that of something else.
+        OSError: If it cannot be written.
+        ConfigError: If the path exists and is not a checkpoint.
     """
     check_output(str(folder))
-    place = real_place(
-        Path(os.path.normpath(folder))
-    )  # a/../b is b, whether or not there is an a
-    restore(place)
-    refuse_taken(
-        place,
-        True,
-        lambda path: (
-            "" if (path / CONFIG).is_file() else "is something else than a checkpoint"
-        ),
-    )
-    with building(place) as partial:
-        yield place, partial
+    # a/../b is b, whether or not there is an a.
+    path = real_place(Path(os.path.normpath(folder)))
+    restore(path)
+    refuse_taken(path, True, _foreign)
+    with building(path) as partial:
+        yield path, partial
+
+
+def _foreign(path: Path) -> str:
+    """Return why a path is not a checkpoint, empty if it is; for `refuse_taken`."""
+    is_checkpoint = (path / CONFIG).is_file()
+    return "" if is_checkpoint else "is something else than a checkpoint"
 
 
 def load_checkpoint(folder: str | Path) -> Checkpoint:
-    """Reads a checkpoint; tensors are on the CPU, and those stored as float16 are
-    float32.
+    """Read a checkpoint, with tensors on the CPU; float16 tensors become float32.
 
     Raises:
-        CheckpointError: it is missing, damaged, or of a newer format.
+        CheckpointError: If it is missing, damaged, or of a newer format.
     """
     folder = Path(folder)
     config = read_config(folder)
@@ -271,21 +232,18 @@ def load_checkpoint(folder: str | Path) -> Checkpoint:
             name: _read_part(folder / f"{name}.safetensors", **entry)
             for name, entry in config["parts"].items()
         }
-        names, pooled = (
-            config["class_names"],
-            float(config.get("pool_temperature", 1.0)),
-        )
-        if not all(isinstance(name, str) for name in names) or len(set(names)) != len(
-            names
-        ):
-            raise ValueError("class_names are no names of different classes")
-        if not 0 < pooled < float("inf"):
-            raise ValueError(f"pool_temperature is {pooled}")
+        names = config["class_names"]
+        is_text = all(isinstance(name, str) for name in names)
+        if not is_text or len(set(names)) != len(names):
+            raise ValueError("class_names are not names of different classes")
+        temperature = float(config.get("pool_temperature", 1.0))
+        if not 0 < temperature < float("inf"):
+            raise ValueError(f"pool_temperature is {temperature}")
         return Checkpoint(
             class_names=tuple(names),
             parts=parts,
             model=config["model"],
-            pool_temperature=pooled,
+            pool_temperature=temperature,
             code=str(config.get("code", "")),
             conformal=dict(config.get("conformal", {})),
             ground=read_ground(folder, config),
@@ -294,59 +252,23 @@ def load_checkpoint(folder: str | Path) -> Checkpoint:
         raise _damaged(folder / CONFIG, f"{type(error).__name__} {error}") from error
 
 
-def training_folder(folder: str | Path) -> Path:
-    """Where the logs of a training stand, and what it needs to go on: beside its
-    checkpoint.
-    """
-    return Path(f"{os.path.normpath(folder)}.training")
-
-
-def refuse_unfinished(folder: str | Path, trained: Collection[str] = ()) -> None:
-    """Refuses a model whose training was interrupted, with how to go on.
-
-    Args:
-        folder: of its checkpoint, whether or not it is there yet.
-        trained: names of the parts that the checkpoint holds.
-
-    Raises:
-        CheckpointError: a part was begun in the folder of logs that the checkpoint
-            lacks.
-    """
-    logs = training_folder(folder)
-    begun = sorted(
-        path.name
-        for path in logs.glob("*")
-        if path.is_dir() and path.name not in trained
-    )
-    if begun:
-        command = "all" if GP in trained else _command(begun[0])
-        raise CheckpointError(
-            f"Expected a trained model in {folder}, got one whose training was "
-            f"interrupted: {logs / begun[0]} is not "
-            "finished. Give its command again with --resume, such as "
-            f"`benchnav-train {command} --data DATA --out {folder} --resume`."
-        )
-
-
 def read_config(folder: Path) -> dict[str, Any]:
-    """Reads what a checkpoint says of itself, without its tensors.
+    """Read the description of a checkpoint, without its tensors.
 
     Raises:
-        CheckpointError: it is missing, damaged, or of a newer format.
+        CheckpointError: If it is missing, damaged, or of a newer format.
     """
     path = folder / CONFIG
     if not path.is_file():
         raise CheckpointError(
             f"Expected a checkpoint folder with {CONFIG}, got {folder} without one. "
-            f"Make one with `benchnav-train all --out {folder}`."
+            f"Create one with `benchnav-train all --out {folder}`."
         )
     try:
         text = path.read_text()
         config = json.loads(text)
-        kind, version = (
-            config["format"],
-            tuple(int(part) for part in config["format_version"].split(".")),
-        )
+        kind = config["format"]
+        version = tuple(int(part) for part in config["format_version"].split("."))
         if kind == FORMAT and _SEALED <= version <= FORMAT_VERSION:
             config = unseal(text)
     except (
@@ -368,26 +290,29 @@ def read_config(folder: Path) -> dict[str, Any]:
         if version > FORMAT_VERSION:
             remedy = "Read it with a newer benchnav: pip install --upgrade benchnav."
         raise CheckpointError(
-            f"Expected format version {'.'.join(map(str, FORMAT_VERSION))} in {path}, "
-            "got "
+            f"Expected format version {_version_text()} in {path}, got "
             f"{config['format_version']}. {remedy}"
         )
     return config
 
 
+def _version_text() -> str:
+    return ".".join(map(str, FORMAT_VERSION))
+
+
 def read_ground(folder: Path, config: Mapping[str, Any]) -> GroundStatistics | None:
-    """Reads the statistics of the ground that a checkpoint brings.
+    """Read the terrain statistics of a checkpoint.
 
     Args:
-        folder: of the checkpoint.
-        config: what `read_config` gave of it. One that was written before there were
-            such statistics does not name them; they may have been put beside its
-            tensors since.
+        folder: folder of the checkpoint.
+        config: result of `read_config`. In checkpoints of earlier versions it does not
+            name statistics, but they may have been added to the folder later.
 
     Raises:
-        CheckpointError: they are missing or damaged.
+        CheckpointError: If the statistics are missing or damaged.
     """
-    path, sha256 = folder / GROUND, config.get("ground", {}).get("sha256")
+    path = folder / GROUND
+    sha256 = config.get("ground", {}).get("sha256")
     if not sha256 and not path.is_file():
         return None
     try:
@@ -400,22 +325,26 @@ def read_ground(folder: Path, config: Mapping[str, Any]) -> GroundStatistics | N
 
 
 def _write(folder: Path, checkpoint: Checkpoint, name: str) -> None:
+    """Write all files of a checkpoint to an empty folder.
+
+    Args:
+        folder: folder to write to.
+        checkpoint: content to write.
+        name: final name of the folder, for the card.
+    """
     parts = {}
     for part_name, part in checkpoint.parts.items():
         content = safetensors.torch.save(_to_store(part.tensors, part.half_precision))
         with replacing(folder / f"{part_name}.safetensors") as partial:
             partial.write_bytes(content)
-        kept = {
+        entry = {
             key: value
             for key, value in vars(part).items()
-            if key not in _APART and value is not None
+            if key not in _STORED_ELSEWHERE and value is not None
         }
-        digest = hashlib.sha256(content).hexdigest()
-        parts[part_name] = {
-            **kept,
-            "data": {"id": part.data_id, "digest": part.data_digest},
-            "sha256": digest,
-        }
+        entry["data"] = {"id": part.data_id, "digest": part.data_digest}
+        entry["sha256"] = hashlib.sha256(content).hexdigest()
+        parts[part_name] = entry
     optional: dict[str, Any] = {}
     if checkpoint.pool_temperature != 1:
         optional["pool_temperature"] = checkpoint.pool_temperature
@@ -429,7 +358,7 @@ def _write(folder: Path, checkpoint: Checkpoint, name: str) -> None:
         optional["ground"] = {"sha256": hashlib.sha256(text.encode()).hexdigest()}
     config = {
         "format": FORMAT,
-        "format_version": ".".join(map(str, FORMAT_VERSION)),
+        "format_version": _version_text(),
         "model": checkpoint.model,
         "class_count": len(checkpoint.class_names),
         "class_names": list(checkpoint.class_names),
@@ -437,18 +366,16 @@ def _write(folder: Path, checkpoint: Checkpoint, name: str) -> None:
         "parts": parts,
     }
     if parts:
-        write_text(
-            folder / CARD,
-            card_of(
-                name,
-                checkpoint.model,
-                checkpoint.parts,
-                checkpoint.class_names,
-                checkpoint.code,
-                checkpoint.conformal.get("maps", 0),
-                checkpoint.pool_temperature,
-            ),
+        card = card_of(
+            name,
+            checkpoint.model,
+            checkpoint.parts,
+            checkpoint.class_names,
+            checkpoint.code,
+            checkpoint.conformal.get("maps", 0),
+            checkpoint.pool_temperature,
         )
+        write_text(folder / CARD, card)
     write_text(folder / CONFIG, seal(config) + "\n")
 
 
@@ -458,8 +385,8 @@ def _to_store(tensors: Mapping[str, Tensor], half: bool) -> dict[str, Tensor]:
         for name, value in tensors.items()
     }
     for name, value in stored.items():
-        # Kernels alone: running variances and biases are few, and may leave float16's
-        # range.
+        # Only kernels: running variances and biases are few, and may exceed the range
+        # of float16.
         if half and value.is_floating_point() and value.ndim >= 2:
             stored[name] = value.half()
     return stored
@@ -485,7 +412,8 @@ def _as_read(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     }
 
 
-def _damaged(path: Path, why: str) -> CheckpointError:
+def _damaged(path: Path, reason: str) -> CheckpointError:
     return CheckpointError(
-        f"{path} is damaged: {why}. Copy the checkpoint again whole, or train it again."
+        f"{path} is damaged: {reason}. Copy the whole checkpoint again, or train it "
+        "again."
     )

@@ -13,11 +13,9 @@ from benchnav.models.config import (
 from benchnav.models.onnx_command import export
 from benchnav.models.quality.command import compare, evaluate_command
 
-_DEFAULT_CLASSIFIER, _DEFAULT_GP, _DEFAULT_MDN = (
-    ClassifierConfig(),
-    LatentGPConfig(),
-    MDNConfig(),
-)
+_DEFAULT_CLASSIFIER = ClassifierConfig()
+_DEFAULT_GP = LatentGPConfig()
+_DEFAULT_MDN = MDNConfig()
 
 
 def fit(
@@ -28,19 +26,19 @@ def fit(
     settings: dict[str, Any] | None = None,
     members: int = 1,
 ) -> None:
-    """Train a model of any kind, by name or of your own class, or an ensemble of them.
+    """Train a model of any kind, by name or a custom class, or an ensemble.
 
     Args:
-        options: How.
+        options: Training options.
         model: NAME of a model that can be trained (fused, mdn, mean_variance, quantile,
             evidential, mc_dropout, swag), or path/to/file.py:Class or
             package.module:Class with a TrainableModel.
         data: Path or id of a dataset with splits train and valid.
-        out: Checkpoint folder. Logs go to OUT.training.
+        out: Checkpoint folder. Logs are written to OUT.training.
         settings: Settings of the model, such as --settings.learning_rate 1e-3
-            --settings.inputs [rgb,elevation_m]; of fused those of its stages, such as
+            --settings.inputs [rgb,elevation_m]; for fused those of its stages, such as
             --settings.classifier.encoder_depth 3.
-        members: How many to train; their distributions are averaged.
+        members: Number of networks; their distributions are averaged.
     """
     from benchnav.models.training.networks import fit_model
 
@@ -54,15 +52,15 @@ def train_classifier(
     classifier: ClassifierConfig = _DEFAULT_CLASSIFIER,
     members: int = 1,
 ) -> None:
-    """Train the terrain classifier, or an ensemble of them.
+    """Train the terrain classifier, or an ensemble.
 
     Args:
-        options: How.
+        options: Training options.
         data: Path or id of a dataset with splits train and valid.
-        out: Checkpoint folder; Gaussian processes in it for the same classes are kept.
-            Logs go to OUT.training.
+        out: Checkpoint folder; Gaussian processes in it for the same classes are
+            preserved. Logs are written to OUT.training.
         classifier: Settings of the classifier.
-        members: How many to train; their probabilities are averaged.
+        members: Number of classifiers; their probabilities are averaged.
     """
     from benchnav.models.training.networks import classifier_of, train_networks
 
@@ -82,14 +80,13 @@ def train_gp(
     Args:
         data: Path or id of a dataset with splits train and valid; or slip logs, a file
             .csv, .tsv, one of these with .gz, or .parquet, with the columns class,
-            slope_deg and traversability; and drive, to measure on whole drives.
-        out: Checkpoint folder; classifiers in it for the same classes are kept, and
+            slope_deg and traversability; and optionally drive, to hold out whole drives.
+        out: Checkpoint folder; classifiers in it for the same classes are preserved, and
             slip logs are read with their class table.
         gp: Settings of the GPs.
-        seed: Root seed of the rows or drives of slip logs that are held out to measure
-            on.
-        device: Where they are trained; auto takes CUDA where there is a GPU.
-        overwrite: Replace GPs, or a checkpoint of other classes, that are there.
+        seed: Root seed of the selection of held-out rows or drives of slip logs.
+        device: Device for training; auto uses CUDA if there is a GPU.
+        overwrite: Replace existing GPs, or a checkpoint of other classes.
     """
     from benchnav.models.training.fit import FitOptions
     from benchnav.models.training.gaussian_processes import train_gps
@@ -105,15 +102,15 @@ def train_all(
     gp: LatentGPConfig = _DEFAULT_GP,
     members: int = 1,
 ) -> None:
-    """Train a whole model: Gaussian processes and classifiers.
+    """Train a complete model: Gaussian processes and classifiers.
 
     Args:
-        options: How.
+        options: Training options.
         data: Path or id of a dataset with splits train and valid.
-        out: Checkpoint folder. Logs go to OUT.training.
+        out: Checkpoint folder. Logs are written to OUT.training.
         classifier: Settings of the classifier.
         gp: Settings of the GPs.
-        members: How many classifiers to train; their probabilities are averaged.
+        members: Number of classifiers; their probabilities are averaged.
     """
     from benchnav.models.training.networks import classifier_of, train_networks
 
@@ -123,15 +120,16 @@ def train_all(
 def train_mdn(
     options: TrainOptions, data: str, out: str, mdn: MDNConfig = _DEFAULT_MDN
 ) -> None:
-    """Train a mixture-density network, which needs no terrain classes.
+    """Train a mixture density network, which needs no terrain classes.
 
     Args:
-        options: How.
+        options: Training options.
         data: Path or id of a dataset with splits train and valid.
-        out: Checkpoint folder. Logs go to OUT.training.
+        out: Checkpoint folder. Logs are written to OUT.training.
         mdn: Settings of the network.
     """
-    from benchnav.models.training.networks import find_trainable, train_networks
+    from benchnav.models.training.find import find_trainable
+    from benchnav.models.training.networks import train_networks
 
     train_networks(options, data, out, find_trainable("mdn", vars(mdn)))
 
@@ -149,7 +147,7 @@ COMMANDS = {
 
 
 def main() -> None:
-    """Entry point of `benchnav-train`."""
+    """Run `benchnav-train`."""
     sys.exit(
         run("benchnav-train", "Train and measure models of traversability.", COMMANDS)
     )

@@ -1,5 +1,5 @@
-"""Settings of models and of their training; light to import, so that commands start
-fast.
+"""Settings of models and of their training; fast to import, so that commands start
+quickly.
 """
 
 import math
@@ -11,33 +11,32 @@ from benchnav.core.errors import expect
 
 DEEPEST = 5  # stages of the encoders of segmentation-models-pytorch
 
-_MAX_PRIOR = 10  # of λ, which is at most 1; beyond it the GPs cannot be solved
-_SEEDS = 2**63  # PyTorch's generators take no others
+_MAX_PRIOR = 10  # in units of λ; beyond it the GPs cannot be solved
+_N_SEEDS = 2**63  # valid seeds of PyTorch's generators
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainOptions:
-    """How networks are trained.
+    """Options of the training of networks.
 
     Args:
         seed: Root seed of weights, order and augmentation; members of an ensemble have
             SEED, SEED + 1, ….
-        device: Where it is trained and calibrated; auto takes CUDA where there is a
-            GPU.
+        device: Device for training and calibration; auto uses CUDA if there is a GPU.
         trainer: Settings of Lightning's trainer, for example --trainer.devices 2
             --trainer.precision 32-true.
-        workers: Processes that read maps ahead. The result is the same for any number.
-        in_memory: Hold all maps in memory instead of reading them when they are needed.
+        workers: Number of processes that read maps ahead. It does not affect the result.
+        in_memory: Store all maps in memory instead of reading them on demand.
         half_precision: Store the weights of networks as float16.
-        symmetries: Turn and mirror training maps at random; by default all but those
-            with a photo, whose light comes from one direction.
-        crop: Train on squares of so many cells a side, drawn anew each epoch; 0 takes
-            whole maps.
-        resume: Go on with an interrupted training from its finished parts and epochs.
+        symmetries: Rotate and mirror training maps at random. If not given, all maps except
+            those with a photo, whose light has a fixed direction.
+        crop: Side in cells of the squares to train on, drawn again each epoch; 0 for whole
+            maps.
+        resume: Resume an interrupted training from its finished parts and epochs.
         overwrite: Replace an existing checkpoint in `out`, or these parts of it.
         conformal: Recalibrate the model on every second map of valid, which early
-            stopping and temperature then leave out. Its lower quantiles then hold on
-            new maps of the same kind.
+            stopping and temperature then leave out. Its lower quantiles then have
+            guaranteed coverage on new maps of the same kind.
     """
 
     seed: int = 0
@@ -55,20 +54,19 @@ class TrainOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class Masking:
-    """What training maps are masked by, as a robot that sees what is near would see
-    them.
+    """Masks of training maps, as seen by a robot with a limited sensor range.
 
-    A masked map is known within a radius of a straight path on it, and that the worse
-    the farther from the path.
+    A masked map is observed within a radius of a straight path, with noise that grows with
+    the distance to the path.
 
     Args:
-        share: of the maps that are masked, those of valid among them; 0 masks none.
-        radius_m: least and greatest radius, between which each map has its own; small
-            ones are as frequent as large ones by their logarithm.
-        colour_noise: standard deviation of each channel of a colour, 0–255, for each
-            metre of distance to the path.
-        elevation_noise: standard deviation of elevation in metres, for each metre of
+        share: fraction of the maps that are masked, also in valid; 0 masks no maps.
+        radius_m: minimum and maximum radius in metres; the radius of a map is drawn between
+            them, uniformly in its logarithm.
+        colour_noise: standard deviation of each channel of a colour, 0–255, per metre of
             distance to the path.
+        elevation_noise: standard deviation of elevation in metres, per metre of distance
+            to the path.
     """
 
     share: float = 0.0
@@ -77,7 +75,7 @@ class Masking:
     elevation_noise: float = 0.002
 
     def __post_init__(self) -> None:
-        """Refuses masks that are none."""
+        """Check the ranges of the settings."""
         _check(self, 0 <= self.share <= 1, "share", "in [0, 1]")
         low, high = self.radius_m
         _check(
@@ -92,26 +90,25 @@ class Masking:
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingConfig:
-    """What any trainable model is given, and how it is trained; a model of one's own
-    adds its own settings.
+    """Settings of any trainable model and its training; custom models add their own.
 
     Args:
-        inputs: layers of the maps that the network is given: rgb, elevation_m,
-            slope_deg, and others that they have, such as vegetation_m; and seen, 1
-            where a cell was seen and 0 elsewhere.
-        jitter: largest relative change of brightness, contrast and saturation of a
-            training map. At 0 low light stays unseen in training.
-        symmetries: turn and mirror training maps at random. Maps with a photo, whose
-            light comes from one direction, are turned only with `--symmetries true`;
-            `--settings.symmetries true` does not turn them.
-        crop: cells of a side of the squares that maps are cut to; 0 takes whole maps.
-        learning_rate: highest rate of the one-cycle schedule.
+        inputs: layers of the maps that the network receives: rgb, elevation_m, slope_deg,
+            and others that the maps have, such as vegetation_m; and seen, 1 in observed
+            cells and 0 elsewhere.
+        jitter: maximum relative change of brightness, contrast and saturation of a training
+            map. At 0, dim light does not occur in training.
+        symmetries: rotate and mirror training maps at random. Maps with a photo, whose
+            light has a fixed direction, are changed only with `--symmetries true`, not with
+            `--settings.symmetries true`.
+        crop: side in cells of the squares cut from maps; 0 for whole maps.
+        learning_rate: maximum rate of the one-cycle schedule.
         weight_decay: of AdamW.
-        batch_size: most maps a batch.
-        max_epochs: length of the schedule.
-        patience: epochs without a better validation loss after which training stops.
-        masking: what of the maps is seen; a network with the input seen is told which
-            cells these are.
+        batch_size: maximum number of maps per batch.
+        max_epochs: length of the schedule in epochs.
+        patience: number of epochs without a lower validation loss after which training
+            stops.
+        masking: masks of the maps; the input seen contains them.
     """
 
     inputs: tuple[str, ...] = ("rgb", "slope_deg")
@@ -126,24 +123,24 @@ class TrainingConfig:
     masking: Masking = field(default_factory=Masking)
 
     def __post_init__(self) -> None:
-        """Refuses numbers that cannot train."""
+        """Check the ranges of the settings."""
         _check(self, 0 < self.learning_rate < 1, "learning_rate", "in (0, 1)")
         for name in ("jitter", "weight_decay"):
             _check(self, 0 <= getattr(self, name) < 1, name, "in [0, 1)")
-        _check_least(self, 2, "batch_size")
-        _check_least(self, 1, "max_epochs", "patience")
+        _check_min(self, 2, "batch_size")
+        _check_min(self, 1, "max_epochs", "patience")
 
 
 @dataclass(frozen=True, kw_only=True)
 class NetworkConfig(TrainingConfig):
-    """What a network of segmentation-models-pytorch is and how it is trained.
+    """Settings of a network of segmentation-models-pytorch and its training.
 
     Args:
         architecture: a decoder of segmentation-models-pytorch, for example unet, fpn or
             segformer.
         encoder: one of its encoders, for example resnet18.
-        pretrained: start from ImageNet weights, which are downloaded; otherwise from
-            random ones.
+        pretrained: start from ImageNet weights, which are downloaded, instead of random
+            ones.
     """
 
     architecture: str = "unet"
@@ -153,19 +150,19 @@ class NetworkConfig(TrainingConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class ClassifierConfig(NetworkConfig):
-    """What the classifier is and how it is trained.
+    """Settings of the classifier and its training.
 
     Args:
-        encoder_depth: stages of the encoder, each of which halves the image; fewer make
-            a smaller network that looks less far around a cell.
-        decoder_channels: channels of the decoder's stages, from coarse to fine, as many
-            as there are of the encoder's; where none are given, the architecture's own.
-        full_resolution: give the last layers the image at full resolution too. Encoders
-            begin by halving it, so that without this every class boundary is guessed
-            from cells twice as large.
+        encoder_depth: number of encoder stages, each of which halves the image; fewer
+            stages reduce the network and its receptive field.
+        decoder_channels: channels of the decoder's stages, from coarse to fine, one per
+            encoder stage. If empty, the architecture's defaults.
+        full_resolution: pass the image at full resolution to the last layers too. Without
+            it, class boundaries are predicted from cells twice as large, since encoders
+            first halve the image.
         focal: γ of the focal loss (Lin et al., 2017), which weighs a cell by (1 − p)^γ,
-            p the probability of its class; 0 leaves the loss a proper score.
-        dice: weight of a soft Dice loss beside the cross-entropy; 0 leaves the loss a
+            with p the probability of its class; at 0 the loss is a proper score.
+        dice: weight of a soft Dice loss added to the cross-entropy; at 0 the loss is a
             proper score.
         label_smoothing: probability spread over all classes in the targets of the
             cross-entropy.
@@ -180,7 +177,7 @@ class ClassifierConfig(NetworkConfig):
     label_smoothing: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuses numbers that cannot train."""
+        """Check the ranges of the settings."""
         super().__post_init__()
         for name in ("focal", "dice"):
             _check(self, 0 <= getattr(self, name) < math.inf, name, "≥ 0")
@@ -198,28 +195,29 @@ class ClassifierConfig(NetworkConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class LatentGPConfig:
-    """What the class-wise GPs are and how they are trained.
+    """Settings of the class-wise GPs and their training.
 
-    The prior decides what is predicted of a class without data, and of slopes steeper
-    than any seen.
+    The prior determines the prediction for a class without data, and for slopes steeper
+    than any observed.
 
     Args:
-        likelihood: censored, which fits observations clipped to [0, 1], or gaussian.
-        second_component: give a class a second mode of λ that slope does not explain,
-            where the data show one; with the censored likelihood alone.
-        inducing_points: how many, evenly over the slopes of the training data.
-        epochs: equal parts of training, after each of which progress is shown.
-        epoch_steps: steps an epoch, each over all cells.
-        prior_level: λ on flat ground before any data.
-        prior_fall: fall of λ per degree of slope before any data.
-        prior_fall_std: standard deviation of that fall.
-        prior_std: initial standard deviation of the function about this line.
-        prior_std_range: range in which training may change it.
-        length_deg: initial length scale of the function.
-        length_range_deg: range in which training may change it.
-        noise_std: standard deviation of λ about the function before any data.
+        likelihood: censored, for observations clipped to [0, 1], or gaussian.
+        second_component: give a class a second mode of λ, independent of slope, if the data
+            show one; only with the censored likelihood.
+        inducing_points: number of inducing points, evenly over the slopes of the training
+            data.
+        epochs: number of equal parts of training, each of which reports progress.
+        epoch_steps: steps per epoch, each over all cells.
+        prior_level: prior λ on flat terrain.
+        prior_fall: prior decrease of λ per degree of slope.
+        prior_fall_std: standard deviation of that decrease.
+        prior_std: initial standard deviation of the function around this line.
+        prior_std_range: range of the standard deviation in training.
+        length_deg: initial length scale of the function in degrees.
+        length_range_deg: range of the length scale in training.
+        noise_std: prior standard deviation of λ around the function.
         noise_spread: standard deviation of its logarithm.
-        noise_std_range: range in which training may change it.
+        noise_std_range: range of the standard deviation in training.
     """
 
     likelihood: Literal["censored", "gaussian"] = "censored"
@@ -239,45 +237,34 @@ class LatentGPConfig:
     noise_std_range: tuple[float, float] = (0.01, 1.0)
 
     def __post_init__(self) -> None:
-        """Refuses settings that cannot train."""
-        _check_least(self, 2, "inducing_points")
-        _check_least(self, 1, "epochs", "epoch_steps")
+        """Check the ranges of the settings."""
+        _check_min(self, 2, "inducing_points")
+        _check_min(self, 1, "epochs", "epoch_steps")
         for name in ("prior_level", "prior_fall"):
-            _check(
-                self, abs(getattr(self, name)) <= _MAX_PRIOR, name, f"in ±{_MAX_PRIOR}"
-            )
+            is_valid = abs(getattr(self, name)) <= _MAX_PRIOR
+            _check(self, is_valid, name, f"in ±{_MAX_PRIOR}")
         for name in ("prior_fall_std", "noise_spread"):
-            _check(
-                self,
-                0 < getattr(self, name) <= _MAX_PRIOR,
-                name,
-                f"> 0 and at most {_MAX_PRIOR}",
-            )
+            is_valid = 0 < getattr(self, name) <= _MAX_PRIOR
+            _check(self, is_valid, name, f"> 0 and at most {_MAX_PRIOR}")
         for name, limits in (
             ("prior_std", "prior_std_range"),
             ("length_deg", "length_range_deg"),
             ("noise_std", "noise_std_range"),
         ):
             low, high = getattr(self, limits)
-            fits = 0 < low < getattr(self, name) < high < math.inf
-            _check(
-                self,
-                fits,
-                name,
-                f"between the bounds of `{limits}`, both > 0, {low} and {high}",
-            )
+            is_valid = 0 < low < getattr(self, name) < high < math.inf
+            expected = f"between the bounds of `{limits}`, both > 0, {low} and {high}"
+            _check(self, is_valid, name, expected)
 
 
 @dataclass(frozen=True, kw_only=True)
 class JoinedConfig(NetworkConfig):
-    """What a network of the image that slope joins cell by cell is and how it is
-    trained.
+    """Settings of an image network joined by slope per cell, and its training.
 
     Args:
-        encoder_depth: stages of the encoder, each of which halves the image; fewer make
-            a smaller network that looks less far around a cell.
-        hidden: channels of the layers in which slope joins what the image tells of a
-            cell.
+        encoder_depth: number of encoder stages, each of which halves the image; fewer
+            stages reduce the network and its receptive field.
+        hidden: channels of the layers in which slope joins the image features.
     """
 
     encoder_depth: int = 5
@@ -285,12 +272,12 @@ class JoinedConfig(NetworkConfig):
     max_epochs: int = 15
 
     def __post_init__(self) -> None:
-        """Refuses numbers that cannot train."""
+        """Check the ranges of the settings."""
         super().__post_init__()
         _check(
             self, 1 <= self.encoder_depth <= DEEPEST, "encoder_depth", f"in 1–{DEEPEST}"
         )
-        _check_least(self, 1, "hidden")
+        _check_min(self, 1, "hidden")
         _check(
             self,
             any(name != "slope_deg" for name in self.inputs),
@@ -301,58 +288,54 @@ class JoinedConfig(NetworkConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class MDNConfig(JoinedConfig):
-    """What the mixture-density network is and how it is trained.
+    """Settings of the mixture density network and its training.
 
     Args:
-        components: K, Gaussians of a cell's mixture.
+        components: K, number of Gaussians of a cell's mixture.
     """
 
     components: int = 3
 
     def __post_init__(self) -> None:
-        """Refuses numbers that cannot train."""
+        """Check the ranges of the settings."""
         super().__post_init__()
-        _check_least(self, 1, "components")
+        _check_min(self, 1, "components")
 
 
 def plain_config(config: Any) -> dict[str, Any]:
-    """The settings of a network as plain data; without `masking` where no map is
-    masked.
+    """Return the settings of a network as plain data.
+
+    `masking` is left out if no map is masked.
 
     Args:
         config: a `TrainingConfig`.
     """
-    data = asdict(config)
-    return {
-        name: value
-        for name, value in data.items()
-        if name != "masking" or config.masking.share
-    }
+    settings = asdict(config)
+    if not config.masking.share:
+        del settings["masking"]
+    return settings
 
 
 def check_seed(seed: int, count: int = 1) -> None:
-    """Refuses a root seed that no generator takes.
+    """Check that generators accept a root seed.
 
     Args:
         seed: the first of the seeds.
-        count: how many follow one another.
+        count: number of consecutive seeds.
 
     Raises:
-        ConfigError: one of them is not in 0–2⁶³ − 1.
+        ConfigError: If one of them is not in 0–2⁶³ − 1.
     """
-    expect(0 <= seed <= _SEEDS - count, f"`seed` in 0–{_SEEDS - count}, got {seed}.")
+    last = _N_SEEDS - count
+    expect(0 <= seed <= last, f"`seed` in 0–{last}, got {seed}.")
 
 
-def _check(config: object, fits: bool, name: str, expected: str) -> None:
-    expect(fits, f"`{name}` {expected}, got {getattr(config, name)!r}.")
+def _check(config: object, is_valid: bool, name: str, expected: str) -> None:
+    expect(is_valid, f"`{name}` {expected}, got {getattr(config, name)!r}.")
 
 
-def _check_least(config: object, least: int, *names: str) -> None:
+def _check_min(config: object, minimum: int, *names: str) -> None:
     for name in names:
         value = getattr(config, name)
-        _check(
-            config,
-            isinstance(value, int) and value >= least,
-            name,
-            f"to be an integer ≥ {least}",
-        )
+        is_valid = isinstance(value, int) and value >= minimum
+        _check(config, is_valid, name, f"to be an integer ≥ {minimum}")

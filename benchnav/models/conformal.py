@@ -1,26 +1,25 @@
-"""Conformal recalibration: lower quantiles that keep what they promise on a new map of
-the same kind.
+"""Conformal recalibration: lower quantiles with guaranteed coverage on a new map of the
+same kind.
 
-Maps that no part of a model has seen give scores: the PIT values s = F(λ) of their
-cells, drawn within the jump where λ has an atom. Cells of one map are alike, so maps
-are the unit: each counts the same, whatever its cells, and one more map counts as if
-    all of its scores were 0. With n maps, and G_j(t) the share of the scores of map j
-    that are under t,
+Calibration maps that no part of a model has seen yield scores: the PIT values s = F(λ)
+of their cells, drawn within the jump where λ has an atom. Cells of a map are spatially
+correlated, so maps are the unit: each has the same weight, whatever its number of
+cells, and one additional map counts as if all its scores were 0. With n maps, and
+G_j(t) the fraction of the scores of map j below t,
 
     t(u) = sup {t : (G_1(t) + … + G_n(t) + 1) / (n + 1) ≤ u},    Q_conf(u) = Q(t(u)).
 
-**Promise.** Let these maps and a new one be exchangeable, and the model be made without
-them. Then for a random cell of the new map, at every level u of the table, P(λ <
-Q_conf(u)) ≤ u; in between, at most the next level. Why: let t* be the supremum of t
-with (G_1(t) + … + G_{n+1}(t)) / (n + 1) ≤ u, the new map included. G_{n+1} ≤ 1, so t(u)
-≤ t*. The maps are exchangeable in t*, so P(s < t*) for a cell of the new map is the
-expected mean of G_j(t*) over all maps, which is at most u. And λ < Q(t) means F(λ) < t,
-hence s < t.
+**Guarantee.** Let these maps and a new one be exchangeable, and the model be trained
+without them. Then for a random cell of the new map, at each level u of the table, P(λ <
+Q_conf(u)) ≤ u; between levels, at most the next level. Proof: let t* be the supremum of
+t with (G_1(t) + … + G_{n+1}(t)) / (n + 1) ≤ u, the new map included. G_{n+1} ≤ 1, so
+t(u) ≤ t*. The maps are exchangeable in t*, so P(s < t*) for a cell of the new map is
+the expected mean of G_j(t*) over all maps, which is at most u. And λ < Q(t) means F(λ)
+< t, hence s < t.
 
-The promise holds on average over new maps and over the choice of the calibration maps.
-It is of one side, of quantiles
-and not of CVaR, and of no other ground: not of hg or hs. Its price is 1 / (n + 1) of
-probability that moves to the lowest λ.
+The guarantee holds on average over new maps and over the choice of calibration maps. It
+is one-sided, applies to quantiles and not to CVaR, and does not apply to other terrain
+such as hg or hs. Its cost is that probability 1 / (n + 1) moves to the lowest λ.
 Sources: Dunn, Wasserman and Ramdas (2022), "Distribution-free prediction sets for
 two-layer hierarchical models" (pooling CDFs); Lee, Barber and Willett (2023),
 "Distribution-free inference with hierarchical data" (the new group's weight). Letters
@@ -46,12 +45,12 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True, kw_only=True)
 class ConformalTable:
-    """At which level of its own a model has the quantile that it is to promise.
+    """Levels at which a model's own quantiles are guaranteed quantiles.
 
     Args:
         levels: u, ascending from 0 to 1.
-        values: t(u) in [0, 1], which do not descend.
-        maps: n, how many maps gave the scores.
+        values: t(u) in [0, 1], not descending.
+        maps: n, number of maps with scores.
     """
 
     levels: tuple[float, ...]
@@ -60,15 +59,14 @@ class ConformalTable:
 
     @classmethod
     def read(cls, data: Mapping[str, Any]) -> Self:
-        """Reads what `plain` has written.
+        """Read the result of `plain`.
 
         Raises:
-            CheckpointError: it is no such table.
+            CheckpointError: If it is not a valid table.
         """
         try:
-            levels, values = (
-                tuple(map(float, data[name])) for name in ("levels", "values")
-            )
+            levels = tuple(map(float, data["levels"]))
+            values = tuple(map(float, data["values"]))
             table = cls(levels=levels, values=values, maps=int(data["maps"]))
         except (KeyError, TypeError, ValueError) as error:
             raise CheckpointError(
@@ -83,44 +81,45 @@ class ConformalTable:
         return table
 
     def plain(self) -> dict[str, Any]:
-        """Plain data."""
+        """Return plain data."""
         return asdict(self)
 
 
 def fit_table(
     scores: Sequence[ndarray], levels: tuple[float, ...] = LEVELS
 ) -> ConformalTable:
-    """Finds t(u) from the scores of calibration maps.
+    """Compute t(u) from the scores of calibration maps.
 
     Args:
-        scores: PIT values of the cells of each map, each of shape [N], N of its own;
-            maps without any are left out.
+        scores: PIT values of the cells of each map, each of shape [N] with its own N;
+            maps without cells are left out.
         levels: u, ascending from 0 to 1.
 
     Raises:
-        ConfigError: no map has a score.
+        ConfigError: If no map has a score.
     """
-    maps = [own for own in scores if len(own)]
+    maps = [map_scores for map_scores in scores if len(map_scores)]
     expect(len(maps) > 0, "maps with an observed λ to calibrate on, got none.")
-    weight = 1 / (len(maps) + 1)
-    weights = np.concatenate([np.full(len(own), weight / len(own)) for own in maps])
+    map_weight = 1 / (len(maps) + 1)
+    weights = np.concatenate(
+        [np.full(len(map_scores), map_weight / len(map_scores)) for map_scores in maps]
+    )
     pooled = np.concatenate(maps)
     order = np.argsort(pooled, kind="stable")
-    # Of the scores up to each, the share; t may rise to the first with which the share
-    # is over u.
-    share = weight + weights[order].cumsum()
-    first = np.searchsorted(share, np.array(levels) - _ROUNDING)
+    # Weight of the scores up to each; t may rise to the first whose weight exceeds u.
+    cumulative = map_weight + weights[order].cumsum()
+    u = np.array(levels)
+    first = np.searchsorted(cumulative, u - _ROUNDING)
     values = np.append(pooled[order], 1.0)[first]
-    values = np.where(np.array(levels) < weight - _ROUNDING, 0.0, values)
-    values[np.array(levels) >= 1] = 1.0
+    values = np.where(u < map_weight - _ROUNDING, 0.0, values)
+    values[u >= 1] = 1.0
     return ConformalTable(levels=levels, values=tuple(values.tolist()), maps=len(maps))
 
 
 def recalibrated(
     distribution: TraversabilityDistribution, table: ConformalTable
 ) -> QuantileDistribution:
-    """Gives the distribution whose quantiles at the levels of a table are those of
-    another at the table's values.
+    """Return the distribution whose quantiles at a table's levels are those at its values.
 
     Args:
         distribution: of shape [*B, H, W].
@@ -130,17 +129,18 @@ def recalibrated(
 
 
 class ConformalModel(TraversabilityModel):
-    """A model whose distributions are recalibrated; it tells no classes.
+    """A model with recalibrated distributions and without classes.
 
     Args:
         model: any model.
-        table: from `fit_table`, by maps that the model has not seen.
+        table: from `fit_table`, on maps that the model has not seen.
     """
 
     def __init__(self, model: TraversabilityModel, table: ConformalTable) -> None:
-        """Keeps them."""
-        self.model, self.table = model, table
+        """Store model and table."""
+        self.model = model
+        self.table = table
 
     def predict(self, observation: Observation) -> QuantileDistribution:
-        """Predicts by the model and recalibrates; distributions of shape [B, H, W]."""
+        """Return recalibrated predictions of the model, of shape [B, H, W]."""
         return recalibrated(self.model.predict(observation), self.table)

@@ -1,4 +1,4 @@
-"""The paper's model: a classifier's probabilities times the class-wise Gaussian
+"""The paper's model: class probabilities of a classifier, fused with class-wise Gaussian
 processes.
 
 Source: paper III-B, equation (1); ensembles: Lakshminarayanan et al. (2017), "Simple
@@ -14,23 +14,23 @@ from torch import Tensor, nn
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Observation
 from benchnav.models.base import ModelFamily, layers_of
-from benchnav.models.checkpoint import GP, Checkpoint
+from benchnav.models.checkpoint import Checkpoint
+from benchnav.models.parts import GP
 from benchnav.models.slope_gp.table import SlopeTable
 
 CHUNK_CELLS = 2**17
 
 
 class FusedModel(ModelFamily):
-    """P(λ) = Σ_c P(c)·P_c(λ | ψ), equation (1), with one component a class, and two
-    where it has soft spots.
+    """P(λ) = Σ_c P(c)·P_c(λ | ψ), equation (1), with one component per class.
 
-    P(c) is the average of the members' probabilities, calibrated as a whole. The
-    paper's `single-class` option is `TraversabilityMixture.most_likely` of the
-    prediction.
+    Classes with soft spots have two components. P(c) is the average of the members'
+    probabilities, calibrated as a whole. The paper's `single-class` option is
+    `TraversabilityMixture.most_likely` of the prediction.
 
     Args:
-        classifiers: the members, each from maps by field to logits [B, C, H, W]; one
-            that has `inputs` is given these layers, and any other the colours alone.
+        classifiers: the members, each from maps by field to logits [B, C, H, W]. A member
+            with `inputs` receives these layers, any other only colours.
         table: the GPs over slope.
         class_names: names of the C classes.
         pool_temperature: of the averaged probabilities (see `models.nets.calibration`).
@@ -43,62 +43,57 @@ class FusedModel(ModelFamily):
         class_names: tuple[str, ...],
         pool_temperature: float = 1.0,
     ) -> None:
-        """Sets the classifiers to evaluation."""
+        """Set the classifiers to evaluation."""
         self.classifiers = tuple(classifier.eval() for classifier in classifiers)
-        self.table, self.class_names, self.pool_temperature = (
-            table,
-            class_names,
-            pool_temperature,
-        )
-        # Told here, since an exported graph cannot hold a number of components that its
-        # tensors decide.
-        self.soft_owners = (
-            tuple(table.soft.weight.nonzero().flatten().tolist()) if table.soft else ()
-        )
+        self.table = table
+        self.class_names = class_names
+        self.pool_temperature = pool_temperature
+        # Computed here, since the number of components in an exported graph cannot
+        # depend on tensors.
+        self.soft_owners: tuple[int, ...] = ()
+        if table.soft:
+            self.soft_owners = tuple(table.soft.weight.nonzero().flatten().tolist())
 
     def predict(self, observation: Observation) -> TraversabilityMixture:
-        """Predicts on the observation's device, to which the classifiers are moved.
+        """Predict on the observation's device.
 
         Args:
-            observation: B maps of any size.
+            observation: B maps of any size. The classifiers are moved to their device.
 
         Returns:
-            Mixture with float32 parameters of shape [B, K, H, W]: the C classes in
-            order, and behind them the second modes of those that have one; `group`
-            tells whose they are.
+            Mixture with float32 parameters of shape [B, K, H, W]: the C classes in order,
+            followed by the second modes; `group` is the class of each component.
         """
         return self.fuse(self.member_probabilities(observation), observation)
 
     def fuse(
         self, member_probabilities: Tensor, observation: Observation
     ) -> TraversabilityMixture:
-        """Makes the prediction of what the members said of the observation, [M, B, C,
-        H, W].
-        """
+        """Return the prediction from the members' probabilities, [M, B, C, H, W]."""
         return self.fuse_at(member_probabilities, observation.slope_deg)
 
     def fuse_at(
         self, member_probabilities: Tensor, slope_deg: Tensor
     ) -> TraversabilityMixture:
-        """As `fuse`, of maps of which the slope is known, [B, H, W]."""
-        weights = sharpen(
-            member_probabilities.sum(0) / len(self.classifiers), self.pool_temperature
-        )
+        """Return the prediction as `fuse`, from slopes in degrees, [B, H, W]."""
+        mean_probability = member_probabilities.sum(0) / len(self.classifiers)
+        weights = sharpen(mean_probability, self.pool_temperature)
         means, stds = self.table.lookup(slope_deg.float())
         group = tuple(range(len(self.class_names)))
-        if soft := self.table.soft:
+        if self.table.soft:
+            owners = list(self.soft_owners)
             group += self.soft_owners
-            share, mean, std = (values.to(weights).view(-1, 1, 1) for values in soft)
-            second = (weights * share, mean.expand_as(weights), std.expand_as(weights))
-            pairs = zip((weights * (1 - share), means, stds), second, strict=True)
-            weights, means, stds = (
-                torch.cat([main, other[:, list(self.soft_owners)]], 1)
-                for main, other in pairs
-            )
+            weight, mean, std = (v.to(weights).view(-1, 1, 1) for v in self.table.soft)
+            soft_weights = (weights * weight)[:, owners]
+            soft_means = mean.expand_as(weights)[:, owners]
+            soft_stds = std.expand_as(weights)[:, owners]
+            weights = torch.cat([weights * (1 - weight), soft_weights], 1)
+            means = torch.cat([means, soft_means], 1)
+            stds = torch.cat([stds, soft_stds], 1)
         return TraversabilityMixture(weights, means, stds, group)
 
     def member_probabilities(self, observation: Observation) -> Tensor:
-        """Class probabilities of each member, before the pool's temperature.
+        """Return class probabilities of each member, before the pool's temperature.
 
         Args:
             observation: B maps of any size.
@@ -107,26 +102,28 @@ class FusedModel(ModelFamily):
             float32, shape [M, B, C, H, W].
         """
         height, width = observation.grid.shape
-        size, members = max(1, CHUNK_CELLS // (height * width)), []
+        size = max(1, CHUNK_CELLS // (height * width))
+        members = []
         with torch.inference_mode():
             for member in self.classifiers:
                 layers = layers_of(observation, getattr(member, "inputs", ("rgb",)))
                 member.to(observation.rgb.device)
-                chunks = [
-                    {name: layer[at : at + size] for name, layer in layers.items()}
-                    for at in range(0, len(observation.rgb), size)
-                ]
-                members.append(
-                    torch.cat([member(chunk).float().softmax(1) for chunk in chunks])
-                )
+                probabilities = []
+                for start in range(0, len(observation.rgb), size):
+                    chunk = slice(start, start + size)
+                    logits = member(
+                        {name: layer[chunk] for name, layer in layers.items()}
+                    )
+                    probabilities.append(logits.float().softmax(1))
+                members.append(torch.cat(probabilities))
         return torch.stack(members)
 
     @classmethod
     def from_checkpoint(cls, checkpoint: Checkpoint) -> "FusedModel":
-        """Rebuilds the model from a checkpoint with GPs and one classifier or more.
+        """Rebuild the model from a checkpoint with GPs and at least one classifier.
 
         Raises:
-            CheckpointError: a half is missing.
+            CheckpointError: If GPs or classifiers are missing.
         """
         from benchnav.models.nets.classifier import classifiers_of
 
@@ -140,12 +137,11 @@ class FusedModel(ModelFamily):
 
 
 def sharpen(probabilities: Tensor, temperature: float) -> Tensor:
-    """Divides the logarithms of class probabilities by a temperature, under 1 to make
-    them surer.
+    """Divide the logarithms of class probabilities by a temperature.
 
     Args:
         probabilities: shape [B, C, H, W].
-        temperature: > 0; at 1 nothing is changed.
+        temperature: > 0; below 1 it sharpens, at 1 it changes nothing.
     """
     if temperature == 1:
         return probabilities

@@ -1,6 +1,4 @@
-"""The command `benchnav-train export`: a checkpoint as a file for robots that have no
-PyTorch.
-"""
+"""The command `benchnav-train export`: a checkpoint as a file for robots without PyTorch."""
 
 from pathlib import Path
 
@@ -12,16 +10,15 @@ def export(
     opset: int = 18,
     overwrite: bool = False,
 ) -> None:
-    """Write a model as one ONNX graph: its network, the parameters of what it predicts,
-    mean and CVaR.
+    """Write a model as one ONNX graph: network, predicted parameters, mean and CVaR.
 
     Args:
         checkpoint: Folder of a checkpoint, its name, owner/name@revision of a hub, or
             path/to/file.py:Class@CHECKPOINT.
-        onnx: File to write, FILE.onnx.
+        onnx: Output file, FILE.onnx.
         level: Level of the CVaR, in [0, 1).
         opset: Version of ONNX's operators.
-        overwrite: Replace a file that is there.
+        overwrite: Replace an existing file.
     """
     from rich.filesize import decimal
 
@@ -37,8 +34,8 @@ def export(
         "it.",
     )
     graph = export_onnx(load_model(checkpoint), path, checkpoint, level, opset)
+    size = decimal(path.stat().st_size)
     print(
-        f"wrote {onnx} ({decimal(Path(path).stat().st_size)}): from "
-        f"{', '.join(graph.layers)} "
-        f"to {', '.join(graph.names)} at level {level:g}"
+        f"wrote {onnx} ({size}): from {', '.join(graph.layers)} to "
+        f"{', '.join(graph.names)} at level {level:g}"
     )

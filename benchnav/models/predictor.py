@@ -1,15 +1,12 @@
-"""How a model is found, by name or by checkpoint, and the privileged ones, which are
-given the truth.
+"""Loading of models by name or checkpoint, and the privileged models.
 
-Models are parts of the registry (`benchnav.core.registry`, kind `model`): what
-stands at a name is either called with its options and makes a model, or is a family,
-with `from_checkpoint`, for checkpoints that bear its name. The package's own models are
-in the same registry.
-Letters in shapes: K components.
+Models are parts of the registry (`benchnav.core.registry`, kind `model`). A registered
+object is either called with its options and returns a model, or is a family with
+`from_checkpoint`, for checkpoints that name it. The package's own models are in the
+same registry. Letters in shapes: K components.
 """
 
 import json
-import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -19,14 +16,13 @@ from typing import Any
 import torch
 from torch import nn
 
-from benchnav.core import hub, registry
+from benchnav.core import registry
 from benchnav.core.command import tell
 from benchnav.core.describe import describe, name_object
 from benchnav.core.errors import CheckpointError, ConfigError, expect, out_of_memory
 from benchnav.core.ground import GroundStatistics
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.registry import Found, Part
-from benchnav.core.shipped_files import shipped_folder
 from benchnav.core.sources import digest_of
 from benchnav.core.terrain import Terrain
 from benchnav.datagen.files.reader import TerrainDataset
@@ -34,7 +30,6 @@ from benchnav.datagen.ground import TRAIN, find_ground, ground_file
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.models.base import PrivilegedModel, TraversabilityModel, is_family
 from benchnav.models.checkpoint import (
-    CLASSIFIER,
     CONFIG,
     FUSED,
     Checkpoint,
@@ -42,76 +37,78 @@ from benchnav.models.checkpoint import (
     load_checkpoint,
     read_config,
     read_ground,
-    refuse_unfinished,
+)
+from benchnav.models.checkpoint_folders import (
+    find_checkpoint,
+    list_checkpoints,
+    split_own,
 )
 from benchnav.models.conformal import ConformalModel, ConformalTable
+from benchnav.models.parts import CLASSIFIER, check_finished
 
 
 class Oracle(PrivilegedModel):
-    """Knows the true distribution of each cell's own class; what is left is noise."""
+    """Predicts the true distribution of each cell's own class; only noise remains."""
 
     def predict_terrain(self, terrain: Terrain) -> TraversabilityMixture:
-        """Gives the true distribution of every cell."""
+        """Return the true distribution of each cell."""
         return terrain.truth
 
 
 class Ideal(PrivilegedModel):
-    """Knows all that colours can tell: of look-alikes, the mixture of their true
-    distributions.
+    """Predicts the best distribution given colours: the mixture over look-alike classes.
 
-    What a model falls short of it is the model's error; what it falls short of the
-    oracle cannot be seen. Its look-alikes weigh the same, so that of them the
-    single-class option keeps the first of the class table.
+    The difference between a model and this one is the model's error; the difference between
+    this one and the oracle cannot be observed in images. Look-alikes have equal weights, so
+    the single-class option selects the first of the class table.
     """
 
     def predict_terrain(self, terrain: Terrain) -> TraversabilityMixture:
-        """Gives the true distributions of all classes that look like the cell's own."""
+        """Return the mixture of the true distributions of each cell's look-alike classes."""
         if terrain.look_alikes is None:
             return terrain.truth
         return terrain.look_alikes(terrain)
 
 
 class Clairvoyant(PrivilegedModel):
-    """Knows the λ that a robot will meet; what is left is planning."""
+    """Predicts the realised λ; only planning remains."""
 
     def predict_terrain(self, terrain: Terrain) -> TraversabilityMixture:
-        """Gives the realised λ of every cell, without doubt, K = 1."""
+        """Return the realised λ of each cell as a point mass, K = 1."""
         means = terrain.traversability.unsqueeze(1)
         return TraversabilityMixture(
             torch.ones_like(means), means, torch.zeros_like(means), (0,)
         )
 
 
-_SOURCE = "_source"  # attribute that keeps how a model was found
+_SOURCE = "_source"  # attribute with the part from which a model was loaded
 Source = str | Path | Mapping[str, Any] | Part
-# `CovarianceModel.nugget` under a model that learnt; docs/reference/sensing.md has the figures it
-# was chosen by. Without a nugget, scores of neighbouring cells that the model predicts
-# wrongly contradict each other.
+# `CovarianceModel.nugget` for a trained model; docs/reference/sensing.md has the measurements behind
+# it. Without a nugget, scores of neighbouring cells with prediction errors contradict
+# each other.
 MODEL_NUGGET = 0.1
-IN_REPOSITORY_ALONE = "paper-v1"  # a checkpoint that `setup.py` leaves out of wheels
 
 
 @dataclass(frozen=True, kw_only=True)
 class ModelPart(Part):
-    """The description of a model: a part of the registry, or a checkpoint, perhaps with
-    the class that rebuilds it.
+    """The description of a model: a part of the registry, or a checkpoint.
+
+    A checkpoint may be combined with the class that rebuilds it.
     """
 
     kind: str = field(default="model", compare=False, repr=False)
 
     @property
     def folder(self) -> Path | None:
-        """Folder of the checkpoint; None for a part of the registry, whose names go
-        first.
+        """Folder of the checkpoint; None for a part of the registry.
+
+        Names of the registry take precedence.
         """
-        is_place = ":" in self.part or self.part.endswith(".py")
         if self.part in registry.names("model"):
             return None
-        if (
-            is_place
-            and split_own(self.part) is None
-            and not (Path(self.part) / CONFIG).is_file()
-        ):
+        is_code = ":" in self.part or self.part.endswith(".py")
+        is_folder = (Path(self.part) / CONFIG).is_file()
+        if is_code and not is_folder and split_own(self.part) is None:
             return None
         folder = find_checkpoint(self.part)
         expect(
@@ -122,43 +119,36 @@ class ModelPart(Part):
 
     @property
     def found(self) -> Found:
-        """The class or function that creates the model; of a checkpoint the class that
-        rebuilds it.
-        """
+        """The class or function that creates the model, or that rebuilds a checkpoint."""
         folder = self.folder
         if folder is None:
             return registry.find("model", self.part)
-        own = split_own(self.part)
-        return (
-            registry.find("model", own[0])
-            if own
-            else find_family(read_config(folder)["model"])
-        )
+        class_and_checkpoint = split_own(self.part)
+        if class_and_checkpoint:
+            return registry.find("model", class_and_checkpoint[0])
+        return find_family(read_config(folder)["model"])
 
     @property
     def key(self) -> str:
         """The description as text, with digests of code and files; see `loaded`."""
         folder = self.folder
         files = digests_of(folder) if folder else registry.option_files(self)
-        return json.dumps(
-            [self.part, dict(self.options), self.found.digest, files], sort_keys=True
-        )
+        content = [self.part, dict(self.options), self.found.digest, files]
+        return json.dumps(content, sort_keys=True)
 
     @property
     def object(self) -> TraversabilityModel:
-        """The model. A process keeps the last two, as long as their code and files stay
-        the same.
-        """
+        """The model; the last two are cached while their code and files do not change."""
         return loaded(self.key)
 
-    def create(self, **given: Any) -> TraversabilityModel:
+    def create(self, **arguments: Any) -> TraversabilityModel:
         """Load the model; see `load_model`."""
         return load_model(self)
 
 
 @lru_cache(maxsize=2)
 def loaded(key: str) -> TraversabilityModel:
-    """Return the model of a `ModelPart.key`, which this process keeps."""
+    """Return the model of a `ModelPart.key`, which is cached."""
     part, options, *_ = json.loads(key)
     return load_model(ModelPart(part=part, label="", options=options))
 
@@ -167,96 +157,90 @@ def read_model(source: Source) -> ModelPart:
     """Read the description of a model as users write it; see `load_model`.
 
     Raises:
-        ConfigError: If it is not a text, a path or a mapping as of a part.
+        ConfigError: If it is not a text, a path or a mapping with a part.
     """
     if isinstance(source, ModelPart):
         return source
-    part = registry.read_part(
-        "model", str(source) if isinstance(source, Path) else source
-    )
+    if isinstance(source, Path):
+        source = str(source)
+    part = registry.read_part("model", source)
     return ModelPart(part=part.part, label=part.label, options=part.options)
 
 
-@torch.inference_mode(False)  # so that it is the same model wherever it is loaded
+@torch.inference_mode(False)  # so that the caller's mode does not affect the model
 def load_model(source: Source) -> TraversabilityModel:
-    """Finds a model by checkpoint or as a part of the registry; it predicts on the
-    observation's device.
+    """Load a model by checkpoint or as a part of the registry.
+
+    It predicts on the observation's device.
 
     Args:
         source: the folder of a checkpoint, by path or by its name in `checkpoints/`
             here or among those shipped, or `owner/name@revision` of a hub; or a part,
             such as `oracle`, `package.module:Name` or `path/to/file.py:Name`, with
-            options where it is a mapping; or the checkpoint of a class that a file or
-            module holds, `path/to/file.py:Name@CHECKPOINT`.
+            options in a mapping; or a checkpoint with its custom class,
+            `path/to/file.py:Name@CHECKPOINT`.
 
     Raises:
-        ConfigError: there is no such model, or it refuses its options.
-        CheckpointError: the checkpoint cannot be used.
+        ConfigError: If the model does not exist or rejects its options.
+        CheckpointError: If the checkpoint cannot be used.
     """
     part = read_model(source)
-    found, folder = part.found, part.folder
+    family = part.found
+    folder = part.folder
     if folder is not None:
-        model = open_checkpoint(_checked_checkpoint(part, folder, found), found)
-    elif is_family(found.target):
+        model = open_checkpoint(_checked_checkpoint(part, folder, family), family)
+    elif is_family(family.target):
         raise no_model(part)
     else:
         model = registry.make("model", part)
-    # A frozen model refuses attributes, and a network takes them for its own.
+    # Frozen models reject attributes, and networks would register them.
     object.__setattr__(model, _SOURCE, part)
     return model
 
 
 def no_model(part: ModelPart) -> ConfigError:
-    """Return the error that says what to name in place of a family of models."""
-    same_name = next(
-        (path for path in list_checkpoints() if path.name == part.part), None
-    )
-    how = (
-        f"path: {same_name}"
-        if same_name
-        else "name or path, a class of your own as FILE.py:Class@CHECKPOINT"
-    )
+    """Return the error for a family of models, with a remedy."""
+    same_name = [path for path in list_checkpoints() if path.name == part.part]
+    remedy = "name or path, a class of your own as FILE.py:Class@CHECKPOINT"
+    if same_name:
+        remedy = f"path: {same_name[0]}"
     return ConfigError(
         f"Expected a model, got {part.part!r}, which is a family of models. Name a "
-        f"checkpoint of it, by its {how}."
+        f"checkpoint of it, by its {remedy}."
     )
 
 
 def describe_model(model: Any) -> Part:
-    """Describe a model by what loads it again; see `benchnav.core.describe.describe`.
+    """Return the part that loads a model; see `benchnav.core.describe.describe`.
 
     Args:
-        model: a model, or what `load_model` takes.
+        model: a model, or an argument of `load_model`.
 
     Returns:
         The part that loads a model with the same weights. A model that was trained in
-        this process, or changed after it was loaded, is known by a name in this process
+        this process, or changed after it was loaded, has a name valid in this process
         only.
 
     Raises:
-        ConfigError: If it is no model.
+        ConfigError: If it is not a model.
     """
     if isinstance(model, str | Path | Mapping | Part):
         return read_model(model)
     part = getattr(model, _SOURCE, None)
     if part is None:
         return describe("model", model)
-    return (
-        part
-        if _digest_of_weights(load_model(part)) == _digest_of_weights(model)
-        else name_object("model", model)
-    )
+    if _digest_of_weights(load_model(part)) == _digest_of_weights(model):
+        return part
+    return name_object("model", model)
 
 
 def _digest_of_weights(model: TraversabilityModel) -> str:
-    tensors = (
-        tensor
+    contents = (
+        tensor.detach().cpu().contiguous().numpy().tobytes()
         for network in networks_of(model)
         for tensor in network.state_dict().values()
     )
-    return digest_of(
-        tensor.detach().cpu().contiguous().numpy().tobytes() for tensor in tensors
-    )
+    return digest_of(contents)
 
 
 def networks_of(value: Any) -> Iterator[nn.Module]:
@@ -272,88 +256,77 @@ def networks_of(value: Any) -> Iterator[nn.Module]:
             yield from networks_of(member)
 
 
-def split_own(source: str | Path) -> tuple[str, str] | None:
-    """Splits `path/to/file.py:Name@CHECKPOINT` into class and checkpoint; None of what
-    is not of this form.
-    """
-    named = re.fullmatch(r"(.+?:[A-Za-z_][\w.]*)@(.+)", str(source))
-    return (
-        None
-        if named is None or (Path(source) / CONFIG).is_file()
-        else (named[1], named[2])
-    )
-
-
 def _checked_checkpoint(part: ModelPart, folder: Path, family: Found) -> Checkpoint:
-    """Read a checkpoint that is finished and, where the user names a class, was trained
-    with it.
+    """Read a checkpoint, and check that it is finished and matches a named class.
+
+    Raises:
+        ConfigError: If the named class cannot rebuild checkpoints.
+        CheckpointError: If the checkpoint is unfinished or of another class.
     """
-    own = split_own(part.part)
-    if own and not is_family(family.target):
+    class_and_checkpoint = split_own(part.part)
+    if class_and_checkpoint and not is_family(family.target):
         raise ConfigError(
-            f"Expected {own[0]} to be a benchnav.models.TrainableModel or "
-            "ModelFamily, whose models are kept in "
-            "checkpoints, got another class or function."
+            f"Expected {class_and_checkpoint[0]} to be a "
+            "benchnav.models.TrainableModel or ModelFamily, whose models checkpoints "
+            "store, got another class or function."
         )
     checkpoint = load_checkpoint(folder)
-    if own and checkpoint.model != family.target.__name__:
-        raise CheckpointError(
-            f"Expected a checkpoint of the class {family.target.__name__}, got "
-            f"{folder}, which is one of "
-            f"{checkpoint.model!r}. Name the class that it was trained with."
-        )
-    if not own and checkpoint.model == FUSED and CLASSIFIER not in checkpoint.parts:
-        refuse_unfinished(folder, checkpoint.parts)
+    if class_and_checkpoint:
+        if checkpoint.model != family.target.__name__:
+            raise CheckpointError(
+                f"Expected a checkpoint of the class {family.target.__name__}, got "
+                f"{folder}, which is one of {checkpoint.model!r}. Name the class that "
+                "it was trained with."
+            )
+    elif checkpoint.model == FUSED and CLASSIFIER not in checkpoint.parts:
+        check_finished(folder, checkpoint.parts)
     return checkpoint
 
 
 def find_family(name: str) -> Found:
-    """Finds the family that a checkpoint names.
+    """Find the family that a checkpoint names.
 
-    Names alone are looked up, never a module or file: what a checkpoint says runs no
-    code of its choice.
+    Only registered names are accepted, never a module or file, so that a checkpoint
+    cannot run code of its choice.
 
     Raises:
-        CheckpointError: it is not known here by name.
+        CheckpointError: If the name is not registered.
     """
-    known = registry.names("model")
-    found = registry.find("model", name) if name in known else None
-    if found is None or not is_family(found.target):
+    options = registry.names("model")
+    family = registry.find("model", name) if name in options else None
+    if family is None or not is_family(family.target):
         raise CheckpointError(
-            f"Expected a checkpoint of a model among {', '.join(known)}, got one of "
-            f"{name!r}. Install the package that "
-            f"registers it, or name the class: path/to/file.py:{name}@CHECKPOINT."
+            f"Expected a checkpoint of a model among {', '.join(options)}, got one of "
+            f"{name!r}. Install the package that registers it, or name the class: "
+            f"path/to/file.py:{name}@CHECKPOINT."
         )
-    return found
+    return family
 
 
 def open_checkpoint(
     checkpoint: Checkpoint, family: Found | None = None
 ) -> TraversabilityModel:
-    """Rebuild the model of a checkpoint, and warn if its class is of other code now.
+    """Rebuild the model of a checkpoint, and warn if the code of its class changed.
 
     Args:
-        checkpoint: as it was read.
-        family: the class that rebuilds it; None for that which the checkpoint names.
+        checkpoint: content of the checkpoint.
+        family: class that rebuilds it; None for the one that the checkpoint names.
 
     Raises:
-        CheckpointError: If the family is not known here by name, or cannot rebuild the
-            model.
+        CheckpointError: If the family is not registered, or cannot rebuild the model.
     """
     family = family or find_family(checkpoint.model)
     if checkpoint.code and checkpoint.code != family.digest:
         tell(
             f"benchnav: warning: {checkpoint.model} in {family.origin} has changed "
-            "since it trained the checkpoint "
-            f"(digest {family.digest[:12]}, then {checkpoint.code[:12]}), so that its "
-            "predictions may differ"
+            f"since it trained the checkpoint (digest {family.digest[:12]}, then "
+            f"{checkpoint.code[:12]}), so that its predictions may differ"
         )
     try:
         model = family.target.from_checkpoint(checkpoint)
-        table = (
-            ConformalTable.read(checkpoint.conformal) if checkpoint.conformal else None
-        )
-        return ConformalModel(model, table) if table else model
+        if not checkpoint.conformal:
+            return model
+        return ConformalModel(model, ConformalTable.read(checkpoint.conformal))
     except CheckpointError:
         raise
     except Exception as error:  # a user's class may raise anything
@@ -363,134 +336,73 @@ def open_checkpoint(
         ) from error
 
 
-def find_checkpoint(source: str | Path) -> Path:
-    """Finds the folder of a checkpoint by path, by name in `checkpoints/` here or among
-    the shipped ones, or on a hub.
-
-    Of `path/to/file.py:Name@CHECKPOINT` it is the folder of CHECKPOINT.
-
-    Raises:
-        CheckpointError: the training of the checkpoint was interrupted.
-        ConfigError: there is no such folder, nor a model of that name.
-    """
-    if own := split_own(source):
-        source = own[1]
-    places = (Path(source), *(folder / source for folder in _checkpoint_folders()))
-    for path in places:
-        if (path / CONFIG).is_file():
-            return path
-    if Path(source).is_dir():
-        return Path(
-            source
-        )  # to be refused by the reader, which says what is missing there
-    for path in places:
-        refuse_unfinished(path)
-    if hub.is_address(source):
-        return hub.download(str(source), "model", CheckpointError)
-    if str(source) == IN_REPOSITORY_ALONE:
-        raise ConfigError(
-            f"Expected the checkpoint {source} in checkpoints/, got none: the wheel "
-            "leaves it out for its size. Copy "
-            f"the folder checkpoints/{source} of the repository there, or name "
-            "another model, such as stakes-v1."
-        )
-    path, names = Path(source), [path.name for path in list_checkpoints()]
-    known = sorted({*registry.names("model"), *names})
-    siblings = [config.parent.name for config in path.parent.glob(f"*/{CONFIG}")]
-    near = (
-        registry.hint(str(source), known)
-        or registry.hint(path.name, siblings, f"{path.parent}/")
-        or registry.hint(path.name, names)
-    )
-    raise ConfigError(
-        f"Expected a model among {', '.join(known)}, the folder of a checkpoint, "
-        "package.module:Name, "
-        "path/to/file.py:Name or owner/name@revision of a hub, got "
-        f"{str(source)!r}.{near}"
-    )
-
-
-def list_checkpoints() -> list[Path]:
-    """Folders of the checkpoints in `checkpoints/` here and of those shipped; of one
-    name the first.
-    """
-    found: dict[str, Path] = {}
-    for folder in _checkpoint_folders():
-        for path in sorted(config.parent for config in folder.glob(f"*/{CONFIG}")):
-            found.setdefault(path.name, path)
-    return list(found.values())
-
-
 def trained_on(source: Source) -> dict[str, str]:
-    """Says which maps a checkpoint was trained on.
+    """Return the maps on which a checkpoint was trained.
 
     Args:
-        source: as `load_model` takes it, which is to have read it.
+        source: argument of `load_model`, which has loaded it before.
 
     Returns:
-        By digest of a split its name and that of its dataset, such as "train of
-        paper-v1"; empty of what is no checkpoint.
+        Name of split and dataset, such as "train of paper-v1", by digest of the split;
+        empty without a checkpoint.
     """
     folder = read_model(source).folder
-    found, parts = {}, read_config(folder)["parts"] if folder else {}
-    for part in parts.values():
+    if not folder:
+        return {}
+    names = {}
+    for part in read_config(folder)["parts"].values():
         for entry in part["data"]["digest"].split(","):
             split, _, digest = entry.partition(":")
-            found[digest] = f"{split} of {part['data']['id']}"
-    return found
+            names[digest] = f"{split} of {part['data']['id']}"
+    return names
 
 
 def nugget_of(model: TraversabilityModel) -> float:
-    """`CovarianceModel.nugget` under a model's predictions: 0 where they are each cell's true
-    distribution.
-    """
+    """Return `CovarianceModel.nugget` for a model's predictions; 0 if they are true distributions."""
     return 0.0 if isinstance(model, Oracle | Clairvoyant) else MODEL_NUGGET
 
 
 def find_ground_statistics(source: Source, dataset: TerrainDataset) -> GroundStatistics:
-    """Finds what is known of ground before any of it is seen.
+    """Return the statistics of terrain for the initial belief.
 
     Args:
-        source: as `load_model` takes it. The statistics that a checkpoint brings are
-            those of the maps that it was trained on.
-        dataset: the maps that are driven on, for models that bring none: the statistics
-            beside it, else those of the shipped recipe of its maps.
+        source: argument of `load_model`. The statistics of a checkpoint are those of
+            its training maps.
+        dataset: the maps to drive on, for models without statistics: the statistics
+            next to it, otherwise those of the shipped recipe of its maps.
 
     Raises:
-        ConfigError: there are none.
-        CheckpointError: those of the checkpoint are damaged.
+        ConfigError: If there are no statistics.
+        CheckpointError: If those of the checkpoint are damaged.
     """
     folder = read_model(source).folder
-    found = read_ground(folder, read_config(folder)) if folder else None
-    found = found or find_ground(dataset)
-    if found is None:
+    statistics = read_ground(folder, read_config(folder)) if folder else None
+    statistics = statistics or find_ground(dataset)
+    if statistics is None:
         path = ground_file(dataset.path)
-        how = (
-            f"{dataset.path}"
-            if TRAIN in dataset.splits
-            else f"TRAINING_DATA --out {path}"
-        )
+        arguments = f"TRAINING_DATA --out {path}"
+        if TRAIN in dataset.splits:
+            arguments = f"{dataset.path}"
         raise ConfigError(
-            f"Expected statistics of the ground in {path}, got none. Make them of "
-            f"maps of the split {TRAIN} with "
-            f"`benchnav-datagen ground {how}`."
+            f"Expected statistics of the ground in {path}, got none. Compute them "
+            f"from maps of the split {TRAIN} with `benchnav-datagen ground {arguments}`."
         )
-    return found
+    return statistics
 
 
 def class_mismatch(
     model: TraversabilityModel | Checkpoint, recipe: Recipe, name: str = "the model"
 ) -> str:
-    """Tells in one line when a model knows another class table than that of the data.
+    """Return in one line that a model has another class table than the data.
 
     Args:
-        model: a model, or a checkpoint, which has a class table even where its model
-            tells no classes.
-        recipe: of the data.
-        name: what the line calls the model.
+        model: a model, or a checkpoint, which has a class table even if its model predicts
+            no classes.
+        recipe: recipe of the data.
+        name: name of the model in the line.
 
     Returns:
-        Empty where the tables are the same, or the model has none.
+        Empty if the tables are equal, or the model has none.
     """
     names = tuple(item.name for item in recipe.classes)
     if model.class_names in ((), names):
@@ -500,7 +412,3 @@ def class_mismatch(
         f"{', '.join(model.class_names)}; the maps have "
         f"{', '.join(names)}"
     )
-
-
-def _checkpoint_folders() -> tuple[Path, Path]:
-    return Path("checkpoints"), shipped_folder("checkpoints")

@@ -1,11 +1,10 @@
-"""Predicts maps that are too large to be predicted whole, tile by tile.
+"""Tile-by-tile prediction of maps that are too large to be predicted whole.
 
-A tile is predicted with a margin on each side that is as wide as the model looks, and
-the margin is then cut off. What is left is the prediction of the whole map to within
-1e-5. A network that pools by 2, 4, …, 32 cells meets the same pools where tiles begin
-at multiples of 32. How far a model looks is measured on itself, so that nothing is to
-be known
-of it. Letters in shapes: B maps, H×W cells of a map, h×w cells of a tile.
+A tile is predicted with a margin on each side as wide as the model's receptive field;
+the margin is then cut off. The result is the prediction of the whole map within 1e-5. A
+network that pools by 2, 4, …, 32 cells has the same pools if tiles start at multiples
+of 32. The receptive field is measured on the model itself, so it need not be known.
+Letters in shapes: B maps, H×W cells of a map, h×w cells of a tile.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -27,8 +26,8 @@ from benchnav.core.terrain import Observation, take_cells
 from benchnav.models.base import TraversabilityModel, predict_observation
 
 _STRIDE = 32
-_PROBES = (256, 512, 1024)  # sides of the maps that a model is tried on
-_NEGLIGIBLE = 1e-6  # a tenth of what tiles may be off
+_PROBES = (256, 512, 1024)  # sides of the maps on which a model is probed
+_NEGLIGIBLE = 1e-6  # a tenth of the error bound of tiles
 
 
 class Window(NamedTuple):
@@ -36,8 +35,8 @@ class Window(NamedTuple):
     H, W].
 
     Attributes:
-        rows: from the first to behind the last.
-        columns: likewise.
+        rows: rows of the map.
+        columns: columns of the map.
     """
 
     rows: slice
@@ -50,35 +49,37 @@ def predict_tiles(
     tile: int = 1024,
     margin: int | None = None,
 ) -> Iterator[tuple[Window, TraversabilityDistribution]]:
-    """Predicts a map tile by tile, one more each time the next is asked for.
+    """Predict a map tile by tile, each tile when it is requested.
 
     Args:
         model: any model that is not privileged.
         observation: B maps of any size.
-        tile: most cells along a side of a tile without its margin, at least 64.
-        margin: cells that are predicted on each side of a tile and cut off; None
-            measures it, see `measure_margin`.
+        tile: maximum side of a tile without its margin in cells, at least 64.
+        margin: width of the margin in cells; None to measure it, see
+            `measure_margin`.
 
     Returns:
-        Windows that cover the map without overlap, row by row, each with the
-        distribution in it, of shape [B, h, w].
+        Windows that cover the map without overlap, row by row, each with its
+        distribution of shape [B, h, w].
 
     Raises:
-        ConfigError: the settings are none, the model looks too far, or its answer does
-            not fit the maps.
+        ConfigError: If a setting is invalid, the receptive field of the model is too
+            large, or its prediction has the wrong type or shape.
     """
     expect(tile >= 2 * _STRIDE, f"`tile` of at least {2 * _STRIDE} cells, got {tile}.")
     expect(
         margin is None or margin >= 0, f"`margin` of no cells or more, got {margin}."
     )
-    rows, columns = (_cut_side(side, tile) for side in observation.grid.shape)
+    height, width = observation.grid.shape
+    rows = _cut_side(height, tile)
+    columns = _cut_side(width, tile)
     if margin is None:
-        margin = (
-            0 if len(rows) == len(columns) == 1 else measure_margin(model, observation)
-        )
+        is_single = len(rows) == len(columns) == 1
+        margin = 0 if is_single else measure_margin(model, observation)
+    windows = (Window(*sides) for sides in product(rows, columns))
     return (
         (window, _predict_window(model, observation, window, margin))
-        for window in (Window(*sides) for sides in product(rows, columns))
+        for window in windows
     )
 
 
@@ -90,27 +91,27 @@ def write_risk_maps(
     tile: int = 1024,
     margin: int | None = None,
 ) -> dict[str, Path]:
-    """Writes maps of what a model predicts, tile by tile, for planners or other
-    programs.
+    """Write maps of measures of a prediction, tile by tile, for other programs.
 
-    `numpy.load(path, mmap_mode="r")` reads a part of one without the rest. Files of
-    these names are replaced, each when all are whole.
+    `numpy.load(path, mmap_mode="r")` reads a part of a map only. Existing files of the
+    same names are replaced when all maps are complete.
 
     Args:
         model: any model that is not privileged.
         observation: B maps of any size.
-        measures: by name what is to be written of the predicted distribution, of shape
-            [B, h, w]; for example `{"cvar:0.9": lambda distribution:
-            distribution.cvar(0.9)}`, or a risk measure of `benchnav.planning.risk`.
-        folder: where; it is made.
+        measures: functions of the predicted distribution, of shape [B, h, w], by name;
+            for example `{"cvar:0.9": lambda distribution: distribution.cvar(0.9)}`, or
+            a risk measure of `benchnav.planning.risk`.
+        folder: output folder, which need not exist.
         tile: as in `predict_tiles`.
         margin: as in `predict_tiles`.
 
     Returns:
-        By name the file: `NAME.npy` with `-` for `:`, float32, shape [B, H, W].
+        The file of each measure by name: `NAME.npy` with `-` for `:`, float32, shape
+        [B, H, W].
 
     Raises:
-        ConfigError: as in `predict_tiles`, or a measure gives something else.
+        ConfigError: As in `predict_tiles`, or if a measure returns an invalid value.
     """
     paths = {name: Path(folder) / f"{name.replace(':', '-')}.npy" for name in measures}
     expect(
@@ -120,76 +121,68 @@ def write_risk_maps(
     tiles = predict_tiles(model, observation, tile, margin)
     shape = (len(observation.rgb), *observation.grid.shape)
     with ExitStack() as files:
-        maps = {
-            name: np.lib.format.open_memmap(
-                files.enter_context(replacing(path)),
-                mode="w+",
-                dtype=np.float32,
-                shape=shape,
+        maps = {}
+        for name, path in paths.items():
+            partial = files.enter_context(replacing(path))
+            maps[name] = np.lib.format.open_memmap(
+                partial, mode="w+", dtype=np.float32, shape=shape
             )
-            for name, path in paths.items()
-        }
         for window, distribution in tiles:
             for name, measure in measures.items():
-                target, values = maps[name][:, *window], measure(distribution)
-                got = (
-                    list(values.shape)
-                    if isinstance(values, Tensor)
-                    else type(values).__name__
-                )
+                target = maps[name][:, *window]
+                values = measure(distribution)
+                got: Any = type(values).__name__
+                if isinstance(values, Tensor):
+                    got = list(values.shape)
                 expect(
                     got == list(target.shape),
                     f"measure {name!r} to give a tensor of shape "
                     f"{list(target.shape)}, got {got}.",
                 )
                 target[...] = values.cpu()
-        for written in maps.values():
-            written.flush()
+        for risk_map in maps.values():
+            risk_map.flush()
     return paths
 
 
 def measure_margin(model: TraversabilityModel, observation: Observation) -> int:
-    """Measures how far a model looks around a cell, by predicting maps with and without
-    what lies beyond an edge.
+    """Measure the receptive field around a cell, by cropping maps and predicting again.
 
     A map is predicted whole, and again without its first and without its last 32 rows
-    and columns. The farthest cell from the edge whose parameters differ by more than
-    rounding says how far the model looks. The maps tried are the middle of the first
-    map, and cells drawn from all over it; their side doubles from 256 to 1024 until the
-    farthest cells differ by no more than 1e-6 (relatively, where parameters are above
-    1).
+    and columns. The receptive field is the distance from the edge of the farthest cell
+    whose parameters differ by more than rounding. The maps are the centre of the first
+    map, and cells drawn from all over it. Their side doubles from 256 to 1024 until the
+    farthest cells differ by at most 1e-6 (relatively, for parameters above 1).
 
     Args:
         model: any model that is not privileged.
-        observation: maps like those that are to be predicted.
+        observation: maps similar to those to predict.
 
     Returns:
-        Cells, a multiple of 32; 0 of a model that looks at each cell alone.
+        Cells, a multiple of 32; 0 for a model that predicts each cell independently.
 
     Raises:
-        ConfigError: the model looks farther than 960 cells, or pools by more than 32.
+        ConfigError: If the receptive field exceeds 960 cells, or the model pools by
+            more than 32.
     """
     for side in _PROBES:
-        margin = 0
+        reaches = []
         for probe in _probes(observation, side):
             reach = _reach(model, probe)
             if reach is None:
                 break
-            margin = max(margin, -(-reach // _STRIDE) * _STRIDE)
+            reaches.append(-(-reach // _STRIDE) * _STRIDE)
         else:
-            return margin
+            return max(reaches)
     raise ConfigError(
         f"Expected a model that looks at most {_PROBES[-1] - 2 * _STRIDE} cells far "
-        f"and pools by {_STRIDE} at most, "
-        f"got {type(model).__name__}, whose tiles differ from the whole map. Predict "
-        "the map whole, or give `margin`."
+        f"and pools by {_STRIDE} at most, got {type(model).__name__}, whose tiles "
+        "differ from the whole map. Predict the map whole, or give `margin`."
     )
 
 
 def _cut_side(size: int, tile: int) -> list[slice]:
-    """Cuts a side of a map into as few parts as there can be, of nearly equal length,
-    at multiples of the stride.
-    """
+    """Cut a side of a map into the fewest, nearly equal parts, at multiples of the stride."""
     blocks = -(-size // _STRIDE)
     parts = -(-blocks // (tile // _STRIDE))
     edges = [blocks * part // parts * _STRIDE for part in range(parts)]
@@ -199,59 +192,53 @@ def _cut_side(size: int, tile: int) -> list[slice]:
 def _predict_window(
     model: TraversabilityModel, observation: Observation, window: Window, margin: int
 ) -> TraversabilityDistribution:
-    outer = [
-        slice(
-            max(part.start - margin, 0) // _STRIDE * _STRIDE,
-            min(-(-(part.stop + margin) // _STRIDE) * _STRIDE, size),
-        )
-        for part, size in zip(window, observation.grid.shape, strict=True)
-    ]
+    """Return the prediction of a window, computed with a margin."""
+    outer = []
+    inner = []
+    for part, size in zip(window, observation.grid.shape, strict=True):
+        start = max(part.start - margin, 0) // _STRIDE * _STRIDE
+        stop = min(-(-(part.stop + margin) // _STRIDE) * _STRIDE, size)
+        outer.append(slice(start, stop))
+        inner.append(slice(part.start - start, part.stop - start))
     distribution = predict_observation(model, take_cells(observation, *outer))
-    inner = Window(
-        *(
-            slice(part.start - edge.start, part.stop - edge.start)
-            for part, edge in zip(window, outer, strict=True)
-        )
-    )
     return map_tensors(distribution, lambda values: values[..., *inner])
 
 
 def _probes(observation: Observation, side: int) -> Iterator[Observation]:
-    """The middle of the first map, repeated where the map is smaller, and cells from
-    anywhere in it.
-    """
-    sizes, one = observation.grid.shape, observation.select(torch.tensor([0]))
-    rows, columns = ((size - side) // 2 + torch.arange(side) for size in sizes)
-    yield take_cells(one, rows[:, None] % sizes[0], columns % sizes[1])
-    drawn = rng.uniform(
-        rng.stream_key(0, "models", "margin"), np.arange(2), (side, side)
-    )
-    yield take_cells(
-        one,
-        *(
-            torch.from_numpy((n * share).astype(int))
-            for n, share in zip(sizes, drawn, strict=True)
-        ),
-    )
+    """Yield the centre of the first map, repeated if it is smaller, and random cells."""
+    height, width = observation.grid.shape
+    first_map = observation.select(torch.tensor([0]))
+    rows = (height - side) // 2 + torch.arange(side)
+    columns = (width - side) // 2 + torch.arange(side)
+    yield take_cells(first_map, rows[:, None] % height, columns % width)
+    key = rng.stream_key(0, "models", "margin")
+    uniform = rng.uniform(key, np.arange(2), (side, side))
+    random_rows = torch.from_numpy((height * uniform[0]).astype(int))
+    random_columns = torch.from_numpy((width * uniform[1]).astype(int))
+    yield take_cells(first_map, random_rows, random_columns)
 
 
 def _reach(model: TraversabilityModel, probe: Observation) -> int | None:
-    """How many cells from an edge a prediction differs from that of a map that goes on
-    there; None where all do.
+    """Return the distance from an edge up to which cropping changes a prediction.
 
-    What is left in the farthest corner is rounding, which depends on the size of a map.
+    Differences in the farthest corner are rounding, which depends on the size of a map.
+
+    Returns:
+        Cells; None if even the farthest cells change.
     """
-    whole, side = predict_observation(model, probe), probe.grid.height
+    prediction = predict_observation(model, probe)
+    side = probe.grid.height
     row = torch.arange(side - _STRIDE, device=probe.rgb.device)
     distance = torch.minimum(row[:, None], row).flatten()
     worst = torch.zeros(len(row), dtype=torch.float64, device=row.device)
-    for part, flip in (
-        (slice(_STRIDE, side), []),
-        (slice(0, side - _STRIDE), [-2, -1]),
-    ):
-        alone = predict_observation(model, take_cells(probe, part, part))
-        there = map_tensors(whole, lambda values, part=part: values[..., part, part])
-        difference = _difference(alone, there).flip(flip).flatten()
+    without_first = (slice(_STRIDE, side), [])
+    without_last = (slice(0, side - _STRIDE), [-2, -1])
+    for part, flip in (without_first, without_last):
+        cropped = predict_observation(model, take_cells(probe, part, part))
+        expected = map_tensors(
+            prediction, lambda values, part=part: values[..., part, part]
+        )
+        difference = _difference(cropped, expected).flip(flip).flatten()
         worst = worst.scatter_reduce(0, distance, difference, "amax")
     rounding = worst[-_STRIDE:].max()
     if rounding > _NEGLIGIBLE:
@@ -259,22 +246,24 @@ def _reach(model: TraversabilityModel, probe: Observation) -> int | None:
     return int(((worst > rounding) * (row + 1)).max())
 
 
-def _difference(
-    one: TraversabilityDistribution, other: TraversabilityDistribution
-) -> Tensor:
-    """How far the parameters of two distributions of a map differ, relatively where
-    above 1, float64 [H, W].
-    """
-    found: list[Tensor] = []
+def _difference(a: TraversabilityDistribution, b: TraversabilityDistribution) -> Tensor:
+    """Return the largest difference of the parameters of two distributions per cell.
 
-    def compare(values: Tensor, others: Tensor) -> Tensor:
-        first, second = values.double().flatten(0, -3), others.double().flatten(0, -3)
+    Differences are relative for parameters above 1.
+
+    Returns:
+        float64, shape [H, W].
+    """
+    differences: list[Tensor] = []
+
+    def compare(values: Tensor, expected: Tensor) -> Tensor:
+        first = values.double().flatten(0, -3)
+        second = expected.double().flatten(0, -3)
         same = (first == second) | (first.isnan() & second.isnan())
         difference = (first - second).abs() / second.abs().clamp(min=1)
-        found.append(
-            torch.where(same, 0, difference.nan_to_num(torch.inf, torch.inf)).amax(0)
-        )
+        finite = difference.nan_to_num(torch.inf, torch.inf)
+        differences.append(torch.where(same, 0, finite).amax(0))
         return values
 
-    map_tensors(one, compare, other)
-    return torch.stack(found).amax(0)
+    map_tensors(a, compare, b)
+    return torch.stack(differences).amax(0)

@@ -24,7 +24,7 @@ from benchnav.models.base import predict_observation
 from benchnav.models.config import Masking
 from benchnav.models.predictor import find_ground_statistics
 from benchnav.models.quality.scores import lower_fifth_and_width
-from benchnav.models.training.map_order import draw_looks
+from benchnav.models.training.map_order import draw_visibility
 from benchnav.models.training.masks import RandomMasks
 from studies.study import Rows, Work
 
@@ -44,7 +44,7 @@ def tables(work: Work, folder: Path, models: Sequence[str] = MODELS) -> dict[str
     rows = []
     for radius_m in (None, *RADII_M):
         masks = radius_m and RandomMasks(
-            law=Masking(share=1.0, radius_m=(radius_m, radius_m)),
+            masking=Masking(share=1.0, radius_m=(radius_m, radius_m)),
             means=means,
             resolution_m=dataset.grid.resolution_m,
         )
@@ -64,7 +64,7 @@ def observed(
     dataset: TerrainDataset, masks: RandomMasks | None
 ) -> Iterator[tuple[Terrain, Observation, Tensor]]:
     """Maps some at a time: the truth, what is seen of it, and which cells these are."""
-    looks = torch.from_numpy(draw_looks(SEED, 0, dataset.map_count(SPLIT)))
+    looks = torch.from_numpy(draw_visibility(SEED, 0, dataset.map_count(SPLIT)))
     looks[:, 6] = 0.0  # none of the path is driven, so that a disc is seen
     for indices, _ in dataset.chunks(SPLIT, fields=()):
         terrain = dataset.terrain(SPLIT, indices)

@@ -17,7 +17,8 @@ from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.run.runner import run_suite
 from benchnav.models.base import predict
-from benchnav.models.predictor import find_checkpoint, load_model
+from benchnav.models.checkpoint_folders import find_checkpoint
+from benchnav.models.predictor import load_model
 from benchnav.models.quality.measure import evaluate
 
 FEW_SAMPLES = {"mppi": {"samples": 1024}, "astar_mppi": {"mppi": {"samples": 1024}}}

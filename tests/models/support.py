@@ -17,7 +17,8 @@ from benchnav.models.nets.inputs import LayerScale
 from benchnav.models.slope_gp.cells import Cells, SlopeSums
 from benchnav.models.slope_gp.table import SlopeTable, table_slopes
 from benchnav.models.training.check import Trainable
-from benchnav.models.training.networks import classifier_of, find_trainable
+from benchnav.models.training.find import find_trainable
+from benchnav.models.training.networks import classifier_of
 
 NAMES = ("a", "b", "c")
 

@@ -26,9 +26,10 @@ from benchnav.models.checkpoint import (
     load_checkpoint,
     save_checkpoint,
 )
+from benchnav.models.checkpoint_folders import find_checkpoint
 from benchnav.models.config import ClassifierConfig
 from benchnav.models.nets.classifier import TerrainClassifier
-from benchnav.models.predictor import find_checkpoint, load_model, open_checkpoint
+from benchnav.models.predictor import load_model, open_checkpoint
 from benchnav.models.slope_gp.table import SlopeTable, SoftModes
 from benchnav.testing.model import check_model
 from tests.commands import call

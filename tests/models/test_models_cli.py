@@ -370,10 +370,10 @@ def test_classes_without_rows_are_told_before_what_was_learned_of_them_is_droppe
 @pytest.mark.parametrize(
     ("command", "expected"),
     [
-        (["all", *QUICK_GP], "gp kept; to go on, give the same command with --resume"),
+        (["all", *QUICK_GP], "gp kept; to resume, give the same command with --resume"),
         (
             ["all", "--overwrite", *QUICK_GP],
-            "gp kept; to go on, give the same command with --resume in place of --overwrite",
+            "gp kept; to resume, give the same command with --resume instead of --overwrite",
         ),
         (["mdn"], "nothing was finished; give the same command again"),
         (
@@ -407,11 +407,11 @@ def test_epochs_that_were_finished_are_said_to_be_kept(tmp_path: Path) -> None:
     (tmp_path / "classifier").mkdir()
     (tmp_path / "classifier" / STATE).touch()
     target: Any = SimpleNamespace(checkpoint=SimpleNamespace(parts={"gp": None}))
-    said = networks._kept(
+    said = networks._resume_hint(
         target, ["gp", "classifier", "classifier-2"], FitOptions(folder=tmp_path)
     )
     assert said == (
-        "gp and the finished epochs of classifier kept; to go on, give the same command with --resume"
+        "gp and the finished epochs of classifier kept; to resume, give the same command with --resume"
     )
 
 

@@ -18,16 +18,16 @@ from benchnav.models.checkpoint import Checkpoint, Part, save_checkpoint
 from benchnav.models.config import ClassifierConfig, MDNConfig
 from benchnav.models.fused import FusedModel
 from benchnav.models.nets.classifier import TerrainClassifier
+from benchnav.models.nets.ensemble import Ensemble
 from benchnav.models.nets.mdn import MixtureDensityModel
-from benchnav.models.nets.trainable import Ensemble
-from benchnav.models.onnx_graph import (
+from benchnav.models.onnx_distributions import (
     _normal_cdf,
     _normal_score,
     cvar_of,
-    export_onnx,
     mean_of,
     parameters_of,
 )
+from benchnav.models.onnx_graph import export_onnx
 from benchnav.models.predictor import Oracle
 from benchnav.models.slope_gp.table import SlopeTable, SoftModes
 from tests.commands import call
@@ -235,7 +235,7 @@ def test_what_has_no_graph_is_refused(tmp_path: Path) -> None:
     refused = (
         (Oracle(), "got Oracle"),
         (odd, "the graph is off by"),
-        (small("swag"), "got SWAGModel, which draws its weights as it predicts"),
+        (small("swag"), "got SWAGModel, which draws its weights during prediction"),
         (small("evidential"), "got EvidentialModel, which needs the digamma function"),
         (
             Ensemble([small("swag"), small("swag", seed=2)]),

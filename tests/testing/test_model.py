@@ -16,9 +16,10 @@ from benchnav.core.pooled import pool
 from benchnav.core.quantiles import LEVELS, QuantileDistribution
 from benchnav.core.terrain import Observation
 from benchnav.models.base import TraversabilityModel, is_family
-from benchnav.models.checkpoint import load_checkpoint, member_name
+from benchnav.models.checkpoint import load_checkpoint
 from benchnav.models.config import MDNConfig
 from benchnav.models.nets.mdn import MixtureDensityModel
+from benchnav.models.parts import member_name
 from benchnav.models.predictor import load_model, open_checkpoint
 from benchnav.testing import check_model
 from tests.models.support import scale

@@ -1,1 +1,1 @@
-"""Networks that tell of each cell its class, or its traversability at once."""
+"""Networks that predict the class or the traversability of each cell."""

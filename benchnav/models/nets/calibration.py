@@ -1,14 +1,14 @@
-"""Calibration on the validation maps by one number, fitted by maximum likelihood.
+"""Calibration on the validation maps by one parameter, fitted by maximum likelihood.
 
-Of class probabilities it is the temperature by which logits are divided, so that
-confidence fits accuracy; it leaves every most likely class as it is. The average of
-several calibrated classifiers is not sure enough of itself, the less so the more they
-differ. So it is given a temperature of its own: first pool, then calibrate.
+For class probabilities it is the temperature by which logits are divided, so that
+confidence matches accuracy; the most likely classes do not change. The average of
+several calibrated classifiers is underconfident, increasingly so the more they differ.
+It therefore has a temperature of its own: pool first, then calibrate.
 
-Of distributions of λ it is the temperature T that the normal scores are multiplied by:
-F⁻¹(Φ(T·Φ⁻¹(u))). Where the predictions are right, the scores z = Φ⁻¹(F(λ)) of what was
-observed are standard normal; a density has φ(z / T) / T, an atom Φ(upper / T) − Φ(lower
-/ T).
+For distributions of λ it is the temperature T by which normal scores are multiplied:
+F⁻¹(Φ(T·Φ⁻¹(u))). If the predictions are correct, the scores z = Φ⁻¹(F(λ)) of the
+observations are standard normal; a density has φ(z / T) / T, an atom Φ(upper / T) −
+Φ(lower / T).
 
 Sources: Guo et al. (2017), "On calibration of modern neural networks"; Rahaman and
 Thiery (2021), "Uncertainty quantification and deep ensembles". Letters in shapes: B
@@ -30,43 +30,42 @@ from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import DatasetError
 from benchnav.datagen.schema import UNLABELLED
 
-_MOST_CELLS = 200_000
-_LARGEST = 20.0
-_LARGEST_SCORE = 8.0  # beyond which a normal distribution has less than 10⁻¹⁵
-_LEAST_GAIN = 1e-3  # nats a cell, for which a distribution is changed at all
+_MAX_CELLS = 200_000
+_MAX_TEMPERATURE = 20.0
+_MAX_SCORE = 8.0  # a normal distribution has less than 10⁻¹⁵ beyond
+_MIN_ATOM = 1e-9  # smaller masses are rounding errors of a CDF without an atom
+_MIN_GAIN = 1e-3  # nats per cell; below, a distribution is left unchanged
 
 
 def fit_temperature(logits: Tensor, class_id: Tensor) -> float:
-    """Finds the temperature of least negative log likelihood, in [0.05, 20].
+    """Return the temperature of minimum negative log-likelihood, in [0.05, 20].
 
     Args:
         logits: shape [N, C].
         class_id: true classes, int64, shape [N].
     """
     logits = logits.double()
-    return _least(
-        lambda temperature: float(
-            nn.functional.cross_entropy(logits / temperature, class_id)
-        )
-    )
+
+    def loss(temperature: float) -> float:
+        return float(nn.functional.cross_entropy(logits / temperature, class_id))
+
+    return _minimise(loss)
 
 
 def fit_pool_temperature(
     members: Sequence[nn.Module], maps: Any, seed: int = 0, device: torch.device = CPU
 ) -> float:
-    """Finds the temperature of the average of several classifiers' probabilities, for
-    `models.fused.sharpen`.
+    """Return the temperature of the average of classifiers, for `models.fused.sharpen`.
 
     Args:
-        members: each calibrated by itself, from maps by field to logits [B, C, H, W].
+        members: classifiers from maps by field to logits [B, C, H, W], each already
+            calibrated.
         maps: a `models.training.data.MapDataset` with their inputs and `class_id`.
-        seed: root seed of the cells to fit to.
-        device: where to compute, to which the classifiers are moved.
+        seed: root seed for sampling cells.
+        device: where to compute; the classifiers are moved there.
     """
-    average, class_id = (
-        torch.zeros((), device=device),
-        torch.zeros(0, dtype=torch.int64),
-    )
+    average = torch.zeros((), device=device)
+    class_id = torch.zeros(0, dtype=torch.int64)
     for member in members:
         logits, class_id = sample_logits(member, maps, seed, device)
         average = average + logits.double().softmax(1) / len(members)
@@ -74,85 +73,82 @@ def fit_pool_temperature(
 
 
 def fit_width(lower: Tensor, upper: Tensor) -> float:
-    """Finds the temperature of normal scores; exactly 1 where none gains 0.001 nats a
-    cell.
+    """Return the temperature of normal scores, or 1 if it gains under 0.001 nats a cell.
 
     Args:
-        lower: normal score of P(λ < observed), shape [N].
-        upper: of P(λ ≤ observed), which is the same but at an atom, shape [N].
+        lower: normal scores of P(λ < observed), shape [N].
+        upper: normal scores of P(λ ≤ observed), equal to `lower` except at atoms,
+            shape [N].
     """
-    low, high = (scores.double().cpu().numpy() for scores in (lower, upper))
-    # Under 10⁻⁹ it is the rounding of a CDF that has none there.
-    is_atom, score = (
-        ndtr(high) - ndtr(low) > 1e-9,
-        high.clip(-_LARGEST_SCORE, _LARGEST_SCORE),
-    )
-    low, high = (
-        np.where(is_atom, low, -1.0),
-        np.where(is_atom, high, 1.0),
-    )  # of which the mass is defined
+    low = lower.double().cpu().numpy()
+    high = upper.double().cpu().numpy()
+    is_atom = ndtr(high) - ndtr(low) > _MIN_ATOM
+    score = high.clip(-_MAX_SCORE, _MAX_SCORE)
+    # Placeholders elsewhere keep the mass well defined.
+    low = np.where(is_atom, low, -1.0)
+    high = np.where(is_atom, high, 1.0)
+    # Take the difference in the tail where it loses no digits.
+    flip = low > 0
+    near_tail = np.where(flip, -high, low)
+    far_tail = np.where(flip, -low, high)
 
     def loss(temperature: float) -> float:
         density = 0.5 * (score / temperature) ** 2 + np.log(temperature)
-        # Of both tails the one in which the difference keeps its digits.
-        flip = low > 0
-        first, second = (
-            np.where(flip, -high, low) / temperature,
-            np.where(flip, -low, high) / temperature,
-        )
-        above, below = log_ndtr(second), log_ndtr(first)
-        mass = above + np.log1p(-np.exp(np.minimum(below - above, -1e-12)))
+        log_upper = log_ndtr(far_tail / temperature)
+        log_lower = log_ndtr(near_tail / temperature)
+        log_ratio = np.minimum(log_lower - log_upper, -1e-12)
+        mass = log_upper + np.log1p(-np.exp(log_ratio))
         return float(np.where(is_atom, -mass, density).mean())
 
-    found = _least(loss)
-    return found if loss(1.0) - loss(found) > _LEAST_GAIN else 1.0
+    temperature = _minimise(loss)
+    return temperature if loss(1.0) - loss(temperature) > _MIN_GAIN else 1.0
 
 
-def _least(loss: Callable[[float], float]) -> float:
-    """The temperature in [0.05, 20] of least loss."""
-    reach = float(np.log(_LARGEST))
-    found = minimize_scalar(
-        lambda log: loss(float(np.exp(log))), bounds=(-reach, reach), method="bounded"
+def _minimise(loss: Callable[[float], float]) -> float:
+    """Return the temperature of minimum loss, in [0.05, 20]."""
+    bound = float(np.log(_MAX_TEMPERATURE))
+    result = minimize_scalar(
+        lambda log: loss(float(np.exp(log))), bounds=(-bound, bound), method="bounded"
     )
-    return float(np.exp(found.x))
+    return float(np.exp(result.x))
 
 
 def sample_logits(
     classifier: nn.Module, maps: Any, seed: int = 0, device: torch.device = CPU
 ) -> tuple[Tensor, Tensor]:
-    """Classifies maps and keeps at most 200 000 cells, the same share of every map.
+    """Classify maps and return at most 200 000 cells, the same fraction of each map.
 
     Args:
         classifier: from maps by field to logits [B, C, H, W].
         maps: a `models.training.data.MapDataset` with its inputs and `class_id`.
         seed: root seed of the draw.
-        device: where to compute, to which the classifier is moved.
+        device: where to compute; the classifier is moved there.
 
     Returns:
-        Logits [N, C] and true classes [N], int64, of the cells whose class is known, on
-        that device.
+        Logits [N, C] and true classes [N], int64, of labelled cells, on that device.
 
     Raises:
-        DatasetError: there is no such cell.
+        DatasetError: If no cell is labelled.
     """
-    found, classifier = [], classifier.to(device)
+    classifier = classifier.to(device)
+    logits_per_map = []
+    labels_per_map = []
+    n_per_map = _cells_per_map(maps)
     with torch.inference_mode(), exact_convolutions():
-        for batch, cells in _sampled(maps, seed, device):
-            logits, class_id = (
-                classifier(batch).float().flatten(2),
-                batch["class_id"].flatten(1).long(),
-            )
-            for place, drawn in enumerate(cells):
-                drawn = drawn[class_id[place, drawn] != UNLABELLED][: _kept(maps)]
-                found.append(
-                    (logits[place][:, drawn].T.clone(), class_id[place, drawn])
-                )
-    logits, class_id = (torch.cat(parts) for parts in zip(*found, strict=True))
+        for batch, orders in _shuffled(maps, seed, device):
+            logits = classifier(batch).float().flatten(2)
+            class_id = batch["class_id"].flatten(1).long()
+            for i, order in enumerate(orders):
+                is_labelled = class_id[i, order] != UNLABELLED
+                cells = order[is_labelled][:n_per_map]
+                logits_per_map.append(logits[i][:, cells].T.clone())
+                labels_per_map.append(class_id[i, cells])
+    class_id = torch.cat(labels_per_map)
     if not len(class_id):
         raise DatasetError(
-            "Expected validation maps with cells whose class is known, got none."
+            "Expected validation maps with labelled cells, got none. Check `class_id`."
         )
-    return logits, class_id
+    return torch.cat(logits_per_map), class_id
 
 
 def sample_scores(
@@ -162,13 +158,14 @@ def sample_scores(
     seed: int = 0,
     device: torch.device = CPU,
 ) -> tuple[Tensor, Tensor]:
-    """Predicts maps and keeps the normal scores of at most 200 000 observed cells, the
-    same share of every map.
+    """Predict maps and return the normal scores of at most 200 000 observed cells.
+
+    The fraction of cells is the same for each map.
 
     Args:
         predict: from layers by name to distributions [B, H, W].
         maps: a `models.training.data.MapDataset` with the inputs and `traversability`.
-        inputs: layers that the model is given.
+        inputs: layers that the model receives.
         seed: root seed of the draw.
         device: where to compute.
 
@@ -177,48 +174,52 @@ def sample_scores(
         device.
 
     Raises:
-        DatasetError: there is no such cell.
+        DatasetError: If λ is not observed in any cell.
     """
-    found, inputs = [], tuple(inputs)
+    inputs = tuple(inputs)
+    lower_scores = []
+    upper_scores = []
+    n_per_map = _cells_per_map(maps)
     with torch.inference_mode(), exact_convolutions():
-        for batch, cells in _sampled(maps, seed, device):
+        for batch, orders in _shuffled(maps, seed, device):
             observed = batch["traversability"]
-            known, kept = (
-                observed.isfinite().flatten(1),
-                torch.zeros_like(observed, dtype=torch.bool).flatten(1),
-            )
-            for place, drawn in enumerate(cells):
-                kept[place, drawn[known[place, drawn]][: _kept(maps)]] = True
-            kept = kept.view_as(observed)
-            if bool(kept.any()):
-                distribution = predict({name: batch[name] for name in inputs}).at(kept)
-                found.append(
-                    [
-                        s.flatten().clone()
-                        for s in distribution.to_normal(observed[kept].unsqueeze(0))
-                    ]
-                )
-    if not found:
-        raise DatasetError("Expected validation maps with an observed λ, got none.")
-    lower, upper = (torch.cat(parts) for parts in zip(*found, strict=True))
-    return lower, upper
+            is_observed = observed.isfinite().flatten(1)
+            is_selected = torch.zeros_like(is_observed)
+            for i, order in enumerate(orders):
+                cells = order[is_observed[i, order]][:n_per_map]
+                is_selected[i, cells] = True
+            is_selected = is_selected.view_as(observed)
+            if not bool(is_selected.any()):
+                continue
+            layers = {name: batch[name] for name in inputs}
+            distribution = predict(layers).at(is_selected)
+            values = observed[is_selected].unsqueeze(0)
+            lower, upper = distribution.to_normal(values)
+            lower_scores.append(lower.flatten().clone())
+            upper_scores.append(upper.flatten().clone())
+    if not lower_scores:
+        raise DatasetError(
+            "Expected validation maps with observed λ, got NaN in every cell. Record "
+            "λ in some cells."
+        )
+    return torch.cat(lower_scores), torch.cat(upper_scores)
 
 
-def _kept(maps: Any) -> int:
-    """Cells that are kept of each map."""
-    return max(1, _MOST_CELLS // len(maps))
+def _cells_per_map(maps: Any) -> int:
+    """Return the maximum number of sampled cells per map."""
+    return max(1, _MAX_CELLS // len(maps))
 
 
-def _sampled(
+def _shuffled(
     maps: Any, seed: int, device: torch.device
 ) -> Iterator[tuple[dict[str, Tensor], list[Tensor]]]:
-    """Maps some at a time, each with its cells in an order drawn for it."""
+    """Yield chunks of maps, and a random order of the cells of each map."""
     key = rng.stream_key(seed, "models", "temperature")
     for indices, batch in maps.chunks(device):
-        size = (
-            batch["class_id"][0].numel()
-            if "class_id" in batch
-            else batch["traversability"][0].numel()
-        )
-        orders = [rng.permutation(key, np.array([index]), size)[0] for index in indices]
-        yield batch, [torch.from_numpy(order).to(device) for order in orders]
+        field = "class_id" if "class_id" in batch else "traversability"
+        n_cells = batch[field][0].numel()
+        orders = []
+        for index in indices:
+            order = rng.permutation(key, np.array([index]), n_cells)[0]
+            orders.append(torch.from_numpy(order).to(device))
+        yield batch, orders

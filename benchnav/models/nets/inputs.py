@@ -1,7 +1,7 @@
-"""What networks are given of the maps: layers as the channels of one image, scaled by
-the training maps.
+"""Inputs of networks: layers of the maps as channels of one image, scaled by statistics
+of the training maps.
 
-Letters in shapes: B maps, H×W cells, N channels of all inputs together.
+Letters in shapes: B maps, H×W cells, C channels of a layer, N channels of all inputs.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -14,17 +14,16 @@ from benchnav.core.errors import ConfigError, expect
 from benchnav.core.grid import is_azimuth
 from benchnav.core.settings import hint
 
-Maps = Mapping[
-    str, Tensor
-]  # by field, `rgb` of shape [B, 3, H, W], all others [B, H, W]
+# By field: `rgb` of shape [B, 3, H, W], all others [B, H, W].
+Maps = Mapping[str, Tensor]
 
 
 class LayerScale(NamedTuple):
-    """What a layer is scaled by: statistics of the training maps, float32.
+    """Scale of a layer: statistics of the training maps, float32.
 
     Args:
-        mean: of each channel, shape [C]; of colours 0–255.
-        std: of each channel, shape [C].
+        mean: per channel, shape [C]; colours are in 0–255.
+        std: per channel, shape [C].
         rms: root mean square, at least 1, shape [].
     """
 
@@ -34,14 +33,14 @@ class LayerScale(NamedTuple):
 
 
 class InputStack(nn.Module):
-    """Stacks layers of maps as the channels of one image, scaled by the training maps.
+    """Layers of maps stacked as the channels of one image, scaled by the training maps.
 
     Colour has three channels, a direction two (cosine and sine), any other layer one.
-    What is missing, NaN, becomes 0, which stands for the mean.
+    Missing values (NaN) become 0, which represents the mean.
 
     Args:
-        names: of the layers.
-        scale: by layer; where there is none, it comes with the state dict.
+        names: names of the layers.
+        scale: by layer; None if the state dict contains it.
     """
 
     mean: Tensor
@@ -50,65 +49,64 @@ class InputStack(nn.Module):
     def __init__(
         self, names: Sequence[str], scale: Mapping[str, LayerScale] | None = None
     ) -> None:
-        """Keeps the scale as buffers."""
+        """Register the scale as buffers."""
         super().__init__()
         self.names = tuple(names)
-        self.channels = sum(
-            3 if name == "rgb" else 1 + is_azimuth(name) for name in names
-        )
-        mean, std = torch.zeros(self.channels), torch.ones(self.channels)
+        self.channels = sum(map(_n_channels, names))
+        mean = torch.zeros(self.channels)
+        std = torch.ones(self.channels)
         if scale is not None:
-            mean, std = (
-                torch.cat([getattr(scale[name], value) for name in names])
-                for value in ("mean", "std")
-            )
+            mean = torch.cat([scale[name].mean for name in names])
+            std = torch.cat([scale[name].std for name in names])
         self.register_buffer("mean", mean.clone())
         self.register_buffer("std", std.clone())
 
     def forward(self, maps: Maps) -> Tensor:
-        """Stacks the layers of B maps; shape [B, N, H, W]."""
-        layers = [channels_of(name, maps[name]) for name in self.names]
-        image = (
-            layers[0]
-            if len(layers) == 1
-            else torch.cat([layer.to(self.mean.dtype) for layer in layers], 1)
-        )
-        image = (image.to(self.mean.dtype) - self.mean.view(-1, 1, 1)) / self.std.view(
-            -1, 1, 1
-        )
-        return (
-            image if self.names == ("rgb",) else torch.where(image.isfinite(), image, 0)
-        )
+        """Return the layers of B maps as one image, shape [B, N, H, W]."""
+        dtype = self.mean.dtype
+        layers = [channels_of(name, maps[name]).to(dtype) for name in self.names]
+        image = layers[0] if len(layers) == 1 else torch.cat(layers, 1)
+        centred = image - self.mean.view(-1, 1, 1)
+        scaled = centred / self.std.view(-1, 1, 1)
+        if self.names == ("rgb",):
+            return scaled
+        return torch.where(scaled.isfinite(), scaled, 0)
+
+
+def _n_channels(name: str) -> int:
+    return 3 if name == "rgb" else 1 + is_azimuth(name)
 
 
 def channels_of(name: str, layer: Tensor) -> Tensor:
-    """The channels of a layer, [B, C, H, W], from a field of the maps."""
+    """Return the channels of a layer, [B, C, H, W], from a field of the maps."""
     if name == "rgb":
         return layer
     if is_azimuth(name):
-        return torch.stack([torch.deg2rad(layer).cos(), torch.deg2rad(layer).sin()], 1)
+        radians = torch.deg2rad(layer)
+        return torch.stack([radians.cos(), radians.sin()], 1)
     return layer.unsqueeze(1)
 
 
 def check_inputs(inputs: Sequence[str], fields: Iterable[str]) -> None:
-    """Refuses inputs that maps do not have.
+    """Check that the maps have all inputs.
 
     Args:
-        inputs: layers that a network is to be given.
-        fields: layers that the maps have.
+        inputs: names of the layers that a network receives.
+        fields: names of the layers of the maps.
 
     Raises:
-        ConfigError: there are none, one is not there, or one stands twice.
+        ConfigError: If `inputs` is empty, names a layer twice, or names a layer that
+            the maps do not have.
     """
-    known = list(fields)
+    options = list(fields)
+    is_unique = len(set(inputs)) == len(inputs)
     expect(
-        inputs and len(set(inputs)) == len(inputs),
+        inputs and is_unique,
         f"`inputs` as layers, each once, got {list(inputs)}.",
     )
     for name in inputs:
-        if name not in known:
+        if name not in options:
             raise ConfigError(
-                f"Expected `inputs` among the layers of the maps, {', '.join(known)}, "
-                f"got {name!r}."
-                f"{hint(name, known)}"
+                f"Expected `inputs` among the layers of the maps, "
+                f"{', '.join(options)}, got {name!r}.{hint(name, options)}"
             )

@@ -1,10 +1,10 @@
-"""From the layers of maps to some numbers a cell: a network of the image, which the
-slope joins cell by cell.
+"""From layers of maps to N numbers per cell: an image network, joined by the slope per
+cell.
 
-The image goes through a convolutional network, for what the ground is shows in its
-surroundings; slope joins behind it, for traversability hangs on the slope of the cell
-itself. A subclass says what the numbers are.
-Letters in shapes: B maps, H×W cells, N numbers a cell, F features a cell.
+The image passes through a convolutional network, because a cell's surroundings show its
+terrain. Slope joins after that network, because traversability depends on the slope of
+the cell itself. Subclasses define the meaning of the numbers.
+Letters in shapes: B maps, H×W cells, N numbers per cell, F features per cell.
 """
 
 from abc import abstractmethod
@@ -26,20 +26,18 @@ _FEATURES = 32
 
 
 class JoinedModel(TrainableModel):
-    """Predicts from N numbers a cell, of the image and of the slope where `inputs`
-    names it.
+    """Model with N numbers per cell, from the image and from slope if it is an input.
 
     Args:
-        config: what it is.
+        config: settings.
     """
 
     slope_scale_deg: Tensor
 
     def __init__(self, config: JoinedConfig) -> None:
-        """Keeps the settings."""
+        """Derive the settings of the image network."""
         super().__init__(config)
-        # The classifier's network, whose outputs tell of the ground by features rather
-        # than by classes.
+        # The classifier's network, with features instead of classes as outputs.
         self.image = ClassifierConfig(
             architecture=config.architecture,
             encoder=config.encoder,
@@ -49,69 +47,70 @@ class JoinedModel(TrainableModel):
 
     @property
     def stride(self) -> int:
-        """By which the encoder makes images smaller."""
+        """Downsampling factor of the encoder."""
         return 2**self.image.encoder_depth
 
     @abstractmethod
     def first_numbers(self) -> Tensor:
-        """What the numbers of a cell are about before any training, shape [N]."""
+        """Return the numbers of a cell, up to small random terms, before training; shape [N]."""
 
     @abstractmethod
     def to_outputs(self, numbers: Tensor) -> Any:
-        """Gives what the loss and `to_distribution` take, from the numbers, float32 of
-        shape [B, N, H, W].
+        """Return the input of the loss and of `to_distribution`.
+
+        Args:
+            numbers: float32, shape [B, N, H, W].
         """
 
     def make_modules(self, scale: Mapping[str, LayerScale] | None) -> None:
-        """Makes the network of the image, and what joins its features with the slope,
-        where that is an input.
-        """
+        """Create the image network and the layers that join its features with slope."""
         self.has_slope = SLOPE in self.inputs
         rms = scale[SLOPE].rms if scale and self.has_slope else torch.ones(())
         self.register_buffer("slope_scale_deg", rms.clone())
-        self.stack = InputStack([name for name in self.inputs if name != SLOPE], scale)
+        image_layers = [name for name in self.inputs if name != SLOPE]
+        self.stack = InputStack(image_layers, scale)
         self.network = self.configure_network(self.stack.channels)
-        hidden, first = self.config.hidden, self.first_numbers()
-        torch.default_generator.manual_seed(
-            self.seed
-        )  # so that these weights do not hang on the encoder
+        hidden = self.config.hidden
+        bias = self.first_numbers()
+        # Seed again, so that these weights do not depend on the encoder.
+        torch.default_generator.manual_seed(self.seed)
         self.joint = nn.Sequential(
             nn.Conv2d(_FEATURES + self.has_slope, hidden, 1),
             nn.SiLU(),
             nn.Conv2d(hidden, hidden, 1),
             nn.SiLU(),
         )
-        self.head = nn.Conv2d(hidden, len(first), 1)
+        self.head = nn.Conv2d(hidden, len(bias), 1)
         self.joint.to(memory_format=torch.channels_last)
-        self.head.load_state_dict(
-            {"weight": _FIRST_SPREAD * self.head.weight, "bias": first}
-        )
+        weight = _FIRST_SPREAD * self.head.weight
+        self.head.load_state_dict({"weight": weight, "bias": bias})
 
     def configure_network(self, channels: int) -> nn.Module:
-        """From images to features, [B, F, H, W]."""
+        """Return the network from images to features, [B, F, H, W]."""
         return build_network(self.image, channels, _FEATURES)
 
     def features(self, maps: Maps) -> Tensor:
-        """What the image tells of each cell, and its slope, shape [B, F + 1, H, W]."""
+        """Return the image features of each cell, and its slope, shape [B, F + 1, H, W]."""
         features = super().forward(maps)
         if self.has_slope:
-            slope = (
-                maps[SLOPE].to(self.slope_scale_deg) / self.slope_scale_deg
-            ).unsqueeze(1)
-            features = torch.cat([features, slope.to(features.dtype)], dim=1)
+            slope = maps[SLOPE].to(self.slope_scale_deg) / self.slope_scale_deg
+            slope = slope.unsqueeze(1).to(features.dtype)
+            features = torch.cat([features, slope], dim=1)
         return features
 
     def numbers(self, hidden: Tensor) -> Tensor:
-        """The numbers of each cell, float32 under autocast too, from the last hidden
-        layer.
+        """Return the numbers of each cell, float32 even under autocast.
+
+        Args:
+            hidden: output of the last hidden layer.
         """
         with torch.autocast(hidden.device.type, enabled=False):
             return self.head(hidden.to(self.head.weight.dtype))
 
     def forward(self, maps: Maps) -> Any:
-        """Computes the outputs for maps of any size.
+        """Compute the outputs for maps of any size.
 
         Args:
-            maps: B maps by field, `inputs` among them.
+            maps: B maps by field, which include `inputs`.
         """
         return self.to_outputs(self.numbers(self.joint(self.features(maps))))

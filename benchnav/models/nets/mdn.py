@@ -1,7 +1,7 @@
-"""A mixture-density network: from colour and slope straight to the distribution of
-traversability.
+"""Mixture density network: predicts the distribution of traversability directly from
+colour and slope.
 
-It knows no terrain classes: it learns from observed λ alone, by the likelihood of a
+It does not use terrain classes: it learns only from observed λ, by the likelihood of a
 Gaussian mixture clipped to [0, 1].
 Sources: Bishop (1994), "Mixture density networks"; Tobin (1958), "Estimation of
 relationships for limited dependent variables". Letters in shapes: B maps, H×W cells, K
@@ -21,75 +21,67 @@ from benchnav.models.nets.inputs import Maps
 from benchnav.models.nets.joined import JoinedModel
 from benchnav.models.nets.trainable import Loss
 
-LEAST_STD = 0.01
+MIN_STD = 0.01
 
 _FIRST_STD = 0.2
 
 
 def to_std(widths: Tensor) -> Tensor:
-    """Standard deviations, at least 0.01, from numbers of any size."""
-    return nn.functional.softplus(widths) + LEAST_STD
+    """Return standard deviations of at least 0.01 from unbounded numbers."""
+    return nn.functional.softplus(widths) + MIN_STD
 
 
 def first_width(count: int) -> Tensor:
-    """So many numbers of which `to_std` makes 0.2."""
-    return torch.full(
-        (count,), math.log(math.expm1(_FIRST_STD - LEAST_STD))
-    )  # softplus⁻¹
+    """Return `count` numbers that `to_std` maps to 0.2."""
+    width = math.log(math.expm1(_FIRST_STD - MIN_STD))  # softplus⁻¹
+    return torch.full((count,), width)
 
 
 def censored_nll(
     log_weights: Tensor, means: Tensor, stds: Tensor, observed: Tensor
 ) -> Tensor:
-    """Negative log likelihood of observed λ under a Gaussian mixture clipped to [0, 1].
+    """Return the censored negative log-likelihood of λ under a clipped mixture.
 
-    Inside (0, 1) it is that of the density; at 0 and 1 that of the probability mass
-    clipped there.
+    The mixture is of Gaussians clipped to [0, 1]. In (0, 1) the likelihood is the
+    density; at 0 and 1 it is the probability mass clipped there.
 
     Args:
         log_weights: logarithms of weights that sum to 1 over K, shape [B, K, H, W].
         means: before clipping, shape [B, K, H, W].
         stds: before clipping, > 0, shape [B, K, H, W].
-        observed: λ in [0, 1], and NaN where it was not observed, shape [B, H, W].
+        observed: λ in [0, 1], NaN if not observed, shape [B, H, W].
 
     Returns:
-        Mean over the observed cells, a number; 0 where none was.
+        Mean over the observed cells, a scalar; 0 without observed cells.
     """
     seen = observed.isfinite()
-    # A cell left out needs some value that is finite: NaN times 0 would reach the
-    # gradients.
-    at = torch.where(seen, observed, 0.5).unsqueeze(1)
-    component = component_log_prob(means, stds, at)
-    total = torch.logsumexp(component + log_weights, dim=1)
-    return -torch.where(seen, total, 0.0).sum() / seen.sum().clamp(min=1)
+    # Unobserved cells need a finite value: NaN times 0 would enter the gradients.
+    finite = torch.where(seen, observed, 0.5).unsqueeze(1)
+    component = component_log_prob(means, stds, finite)
+    log_prob = torch.logsumexp(component + log_weights, dim=1)
+    return -torch.where(seen, log_prob, 0.0).sum() / seen.sum().clamp(min=1)
 
 
 class MixtureDensityModel(JoinedModel):
-    """Predicts the mixture of every cell from colour and slope.
+    """Gaussian mixture of each cell, predicted from colour and slope.
 
     Args:
-        config: what it is.
+        config: settings.
     """
 
     def __init__(self, config: MDNConfig) -> None:
-        """Keeps the settings."""
+        """Store the settings; `build` creates the network."""
         super().__init__(config)
 
     def first_numbers(self) -> Tensor:
-        """Components begin with means evenly over [0, 1], and with nearly the same
-        weight and width.
-        """
+        """Return means spread over [0, 1], equal weights and equal widths."""
         count = self.config.components
-        return torch.cat(
-            [
-                torch.zeros(count),
-                (torch.arange(count) + 0.5) / count,
-                first_width(count),
-            ]
-        )
+        logits = torch.zeros(count)
+        means = (torch.arange(count) + 0.5) / count
+        return torch.cat([logits, means, first_width(count)])
 
     def configure_losses(self) -> Loss:
-        """The negative log likelihood of λ as observed."""
+        """Return the negative log-likelihood of observed λ."""
 
         def loss(outputs: tuple[Tensor, Tensor, Tensor], observed: Tensor) -> Tensor:
             log_weights, means, stds = outputs
@@ -98,16 +90,14 @@ class MixtureDensityModel(JoinedModel):
         return loss
 
     def to_outputs(self, numbers: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Logarithms of the weights, means and standard deviations, each of shape [B,
-        K, H, W].
-        """
+        """Return log weights, means and standard deviations, each of shape [B, K, H, W]."""
         logits, means, widths = numbers.chunk(3, dim=1)
         return logits.log_softmax(1), means, to_std(widths)
 
     def to_distribution(
         self, outputs: tuple[Tensor, Tensor, Tensor]
     ) -> TraversabilityMixture:
-        """The mixture, with parameters of shape [B, K, H, W]."""
+        """Return the mixture, with parameters of shape [B, K, H, W]."""
         log_weights, means, stds = outputs
         return TraversabilityMixture(log_weights.exp(), means, stds)
 
@@ -115,13 +105,16 @@ class MixtureDensityModel(JoinedModel):
     def from_tensors(
         cls, config: Mapping[str, Any], map_classes: tuple[str, ...], tensors: Maps
     ) -> Self:
-        """As `TrainableModel.from_tensors`; before format 2.3 the network of the image
-        had another name.
+        """Rebuild a trained network; see `TrainableModel.from_tensors`.
+
+        Checkpoints before format 2.3 have other names for the image network.
         """
-        renamed = {
-            name.replace("ground.colour_", "stack.").replace(
-                "ground.network.", "network."
-            ): (value.flatten() if name.startswith("ground.colour_") else value)
-            for name, value in tensors.items()
-        }
+        renamed = {}
+        for name, values in tensors.items():
+            new_name = name.replace("ground.colour_", "stack.")
+            new_name = new_name.replace("ground.network.", "network.")
+            if name.startswith("ground.colour_"):
+                renamed[new_name] = values.flatten()
+            else:
+                renamed[new_name] = values
         return super().from_tensors(config, map_classes, renamed)

@@ -1,9 +1,9 @@
-"""What a trainable model is: named hooks that a subclass fills in.
+"""Base classes of trainable models: named hooks that a subclass implements.
 
-`benchnav-train fit` trains any `TrainableModel`, a user's own as well as ours. It
-learns one field of the maps, λ as it was observed, from layers of the same maps. A
-subclass says which layers (`inputs` among its settings), makes its network, its loss
-and its distribution, and leaves the rest as it is:
+`benchnav-train fit` trains any `TrainableModel`, custom ones included. A model learns
+one field of the maps, observed λ, from layers of the same maps. A subclass states the
+layers (`inputs` among its settings), creates its network, loss and distribution, and
+inherits everything else:
 
     class Mine(TrainableModel):
         def __init__(self, config: MyConfig = MyConfig()) -> None:
@@ -13,7 +13,7 @@ and its distribution, and leaves the rest as it is:
         def configure_losses(self) -> Loss: ...
         def to_distribution(self, outputs) -> TraversabilityDistribution: ...
 
-Letters in shapes: B maps, H×W cells, N channels of all inputs together.
+Letters in shapes: B maps, H×W cells, N channels of all inputs.
 """
 
 import math
@@ -31,7 +31,6 @@ from torchmetrics import MeanMetric, MeanSquaredError, Metric, MetricCollection
 
 from benchnav.core import rng
 from benchnav.core.batch import map_tensors
-from benchnav.core.conditioned import conditioned
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import expect
 from benchnav.core.pooled import pool
@@ -42,82 +41,81 @@ from benchnav.models.base import ModelFamily, TraversabilityModel, layers_of
 from benchnav.models.checkpoint import Checkpoint, Part, member_names
 from benchnav.models.config import TrainingConfig, plain_config
 from benchnav.models.nets.calibration import fit_width, sample_scores
+from benchnav.models.nets.ensemble import Ensemble, widened
 from benchnav.models.nets.inputs import InputStack, LayerScale, Maps
 
 CHUNK_CELLS = 2**17
-
-WARM_UP_SHARE = 0.15
+WARM_UP_FRACTION = 0.15
 
 Loss = Callable[[Any, Tensor], Tensor]
 
 
 class TrainableNetwork(lightning.LightningModule):
-    """A network that learns one field of the maps from others: the base of trainable
-    models, and of the classifier.
+    """Network that learns one field of the maps: base of trainable models and classifier.
 
     Args:
-        config: what it is and how it is trained.
+        config: settings of the network and its training.
     """
 
     target: ClassVar[str] = "traversability"
-    """Field of the maps that is learned."""
+    """Field of the maps to learn."""
 
     stops_early: ClassVar[bool] = True
-    """Whether training ends after `patience` epochs without a gain, and keeps the best;
-    if not, it keeps the last.
+    """Whether training stops after `patience` epochs without a gain and keeps the best
+    epoch; otherwise it keeps the last.
     """
 
     no_graph: ClassVar[str] = ""
-    """Why no ONNX graph can be made of it; empty where one can."""
+    """Reason why the model cannot be exported to ONNX; empty if it can."""
 
     def __init__(self, config: TrainingConfig) -> None:
-        """Keeps the settings; `build` makes the network."""
+        """Store the settings; `build` creates the network."""
         super().__init__()
         self.config: Any = config
         self.map_classes: tuple[str, ...] = ()
-        self.seed, self.temperature = 0, 1.0
+        self.seed = 0
+        self.temperature = 1.0
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Layers that the network is given: `rgb`, `elevation_m`, `slope_deg`, and
-        others that the maps have.
+        """Layers that the network receives: `rgb`, `elevation_m`, `slope_deg`, or others of the
+        maps.
         """
         return tuple(self.config.inputs)
 
     @property
     def stride(self) -> int:
-        """Maps are padded to multiples of so many cells for the network, and its
-        outputs cropped.
-        """
+        """Number of cells to whose multiples maps are padded; outputs are cropped."""
         return 1
 
     @abstractmethod
     def configure_network(self, channels: int) -> nn.Module:
-        """Makes the network with fresh weights, drawn from PyTorch's global generator,
-        which has been seeded.
+        """Create the network with new weights, drawn from PyTorch's global generator.
+
+        The generator has been seeded.
 
         Args:
-            channels: N, of the images that it is given, [B, N, H, W].
+            channels: N, of the images that the network receives, [B, N, H, W].
         """
 
     @abstractmethod
     def configure_losses(self) -> Loss:
-        """Gives the loss of a batch, from outputs of `forward` and the field that is
-        learned, [B, H, W], to a number.
+        """Return the loss: from outputs of `forward` and the target, [B, H, W], to a scalar.
 
-        The field is NaN, or 255 of classes, where it is not known; those cells are to
-        be left out.
+        The target is NaN in cells without a value, or 255 in unlabelled cells; the loss must
+        ignore these cells.
         """
 
     def configure_metrics(self) -> dict[str, Metric]:
-        """Gives what is measured on the validation maps beside the loss, by name;
-        `update_metrics` updates it.
-        """
+        """Return further metrics of the validation maps, by name; see `update_metrics`."""
         return {}
 
     def update_metrics(self, outputs: Any, target: Tensor) -> None:
-        """Updates `self.metrics` by a batch of validation maps, [B, H, W] of the field
-        that is learned.
+        """Update `self.metrics` with a batch of validation maps.
+
+        Args:
+            outputs: of `forward`.
+            target: field to learn, shape [B, H, W].
         """
 
     def build(
@@ -126,35 +124,34 @@ class TrainableNetwork(lightning.LightningModule):
         map_classes: tuple[str, ...] = (),
         seed: int = 0,
     ) -> Self:
-        """Makes the network with fresh weights; leaves PyTorch's global generator as it
-        was.
+        """Create the network with new weights; restore PyTorch's global generator.
 
         Args:
             scale: of the training maps, by layer of `inputs`.
             map_classes: names of the terrain classes of the maps.
-            seed: root seed of the weights, and of what is drawn in training.
+            seed: root seed of the weights and of all draws in training.
         """
-        self.map_classes, self.seed = map_classes, seed
+        self.map_classes = map_classes
+        self.seed = seed
         with torch.random.fork_rng(devices=[]):
             torch.default_generator.manual_seed(seed)
             self.make_modules(scale)
-        # A loss that is no number is to be seen, not left out.
-        measured: dict[str, Any] = {
-            "loss": MeanMetric(nan_strategy=math.nan),
-            **self.configure_metrics(),
-        }
-        self.metrics = MetricCollection(measured, prefix="valid_", compute_groups=False)
+        # A NaN loss must show, not be ignored.
+        loss = MeanMetric(nan_strategy=math.nan)
+        metrics: dict[str, Any] = {"loss": loss, **self.configure_metrics()}
+        self.metrics = MetricCollection(metrics, prefix="valid_", compute_groups=False)
         self.loss = self.configure_losses()
         return self
 
     def make_modules(self, scale: Mapping[str, LayerScale] | None) -> None:
-        """Makes what has weights: `stack`, from layers to one image, and `network`."""
+        """Create the modules with weights: `stack`, from layers to one image, and `network`."""
         self.stack = InputStack(self.inputs, scale)
         self.network = self.configure_network(self.stack.channels)
 
     def __getstate__(self) -> dict[str, Any]:
-        """The state without the loss, which may be a closure; `__setstate__` configures
-        it again.
+        """Return the state without the loss, which may be a closure.
+
+        `__setstate__` configures the loss again.
         """
         state = super().__getstate__()
         if "loss" in state:
@@ -162,9 +159,7 @@ class TrainableNetwork(lightning.LightningModule):
         return state
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restores a pickled or copied network, whose loss refers to it and not to the
-        original.
-        """
+        """Restore a pickled or copied network with a loss that refers to the copy."""
         super().__setstate__(state)
         if "loss" in state:
             self.loss = self.configure_losses()
@@ -173,80 +168,81 @@ class TrainableNetwork(lightning.LightningModule):
     def from_tensors(
         cls, config: Mapping[str, Any], map_classes: tuple[str, ...], tensors: Maps
     ) -> Self:
-        """Rebuilds a trained network, downloading nothing.
+        """Rebuild a trained network without any download.
 
         Args:
-            config: fields of its settings, and perhaps a `temperature`.
-            map_classes: names of the terrain classes of the maps it was trained on.
+            config: fields of its settings, and optionally `temperature`.
+            map_classes: names of the terrain classes of the training maps.
             tensors: a state dict.
 
         Raises:
-            ConfigError: the settings are not those of such a network.
-            RuntimeError: the tensors do not fit them.
+            ConfigError: If the settings are not valid for this network.
+            RuntimeError: If the tensors do not match the settings.
         """
         settings = dict(config)
         temperature = settings.pop("temperature", 1.0)
-        fits = isinstance(temperature, int | float) and 0 < temperature < math.inf
-        expect(fits, f"a `temperature` > 0, got {temperature!r}.")
+        is_number = isinstance(temperature, int | float)
+        expect(
+            is_number and 0 < temperature < math.inf,
+            f"a `temperature` > 0, got {temperature!r}.",
+        )
         kind = config_class(cls)
         if "pretrained" in settings:
             settings["pretrained"] = False
-        network = cls(read(kind, settings, of(kind.__name__))).build(
-            map_classes=map_classes
-        )
+        network = cls(read(kind, settings, of(kind.__name__)))
+        network.build(map_classes=map_classes)
         network.load_state_dict(tensors)
         network.temperature = float(temperature)
         return network.eval()
 
     def settings(self) -> dict[str, Any]:
-        """Plain data that it is rebuilt from, beside its tensors: the configuration and
-        the temperature.
-        """
+        """Return plain data to rebuild the network: configuration and temperature."""
         return {**plain_config(self.config), "temperature": self.temperature}
 
     def forward(self, maps: Maps) -> Any:
-        """Computes the outputs of the network for maps of any size, which are padded
-        and the outputs cropped.
+        """Compute the outputs for maps of any size, by padding and cropping.
 
         Args:
-            maps: B maps by field, `inputs` among them.
+            maps: B maps by field, which include `inputs`.
 
         Returns:
-            Of a network whose output is one tensor, shape [B, *, H, W].
+            The cropped output, shape [B, *, H, W]; the network's output must be one
+            tensor.
         """
         image = self.stack(maps)
         height, width = image.shape[-2:]
         if self.stride > 1:
             padding = (0, -width % self.stride, 0, -height % self.stride)
             image = nn.functional.pad(image, padding, mode="replicate")
-        return self.network(image.contiguous(memory_format=torch.channels_last))[
-            ..., :height, :width
-        ]
+        image = image.contiguous(memory_format=torch.channels_last)
+        return self.network(image)[..., :height, :width]
 
     def assess(self, maps: Maps) -> tuple[Tensor, int]:
-        """Computes the loss of a batch, and of how many cells it is the mean; in
-        evaluation updates `metrics`.
+        """Compute a batch's loss and its number of cells; in evaluation update `metrics`.
+
+        Returns:
+            The loss, and the number of cells of which it is the mean.
         """
-        outputs, target = self(maps), maps[self.target]
+        outputs = self(maps)
+        target = maps[self.target]
         if target.is_floating_point():
-            known = target.isfinite()
+            has_value = target.isfinite()
             with torch.autocast(target.device.type, enabled=False):
                 outputs = in_single_precision(outputs)
                 loss = self.loss(outputs, target)
         else:
             target = target.long()
-            known, loss = target != UNLABELLED, self.loss(outputs, target)
+            has_value = target != UNLABELLED
+            loss = self.loss(outputs, target)
         if not self.training:
             self.update_metrics(outputs, target)
-        return loss, int(known.sum())
+        return loss, int(has_value.sum())
 
     def calibrate(self, maps: Any, device: torch.device) -> None:
-        """Is called with the validation maps when the training has ended; the network
-        is in evaluation.
+        """Calibrate on the validation maps; called after training, in evaluation.
 
         Args:
-            maps: a `models.training.data.MapDataset` with `inputs` and the field that
-                is learned.
+            maps: a `models.training.data.MapDataset` with `inputs` and the field to learn.
             device: where to compute.
         """
 
@@ -254,22 +250,21 @@ class TrainableNetwork(lightning.LightningModule):
     def fit_pool(
         cls, members: Sequence[Self], maps: Any, seed: int, device: torch.device
     ) -> float:
-        """Fits the temperature of the average of several members.
+        """Fit the temperature of the average of several members.
 
         Args:
-            members: trained and calibrated.
-            maps: a `models.training.data.MapDataset` with their inputs and the field
-                that is learned.
-            seed: root seed of the cells to fit to.
+            members: trained and calibrated networks.
+            maps: a `models.training.data.MapDataset` with their inputs and the field to learn.
+            seed: root seed for sampling cells.
             device: where to compute.
         """
         raise NotImplementedError
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
-        """AdamW under the schedule of `configure_schedule`."""
+        """Return AdamW with the schedule of `configure_schedule`."""
         rate = self.config.learning_rate
-        # Under mixed precision the fused kind unscales gradients by itself, and
-        # Lightning would not clip them.
+        # Under mixed precision, fused AdamW unscales gradients itself, so Lightning
+        # could not clip them.
         fused = not self.trainer.gradient_clip_val
         optimizer = torch.optim.AdamW(
             self.parameters(), rate, weight_decay=self.config.weight_decay, fused=fused
@@ -282,28 +277,28 @@ class TrainableNetwork(lightning.LightningModule):
         }
 
     def configure_schedule(self, optimizer: torch.optim.Optimizer, steps: int) -> Any:
-        """Gives the schedule of the learning rate over all steps of a training: one
-        cycle (Smith and Topin, 2018).
+        """Return the learning rate schedule over all steps: one cycle.
+
+        Source: Smith and Topin (2018), "Super-convergence: very fast training of neural
+        networks using large learning rates".
         """
         return torch.optim.lr_scheduler.OneCycleLR(
             optimizer,
             self.config.learning_rate,
             total_steps=steps,
-            pct_start=WARM_UP_SHARE,
+            pct_start=WARM_UP_FRACTION,
         )
 
     def on_train_epoch_start(self) -> None:
-        """Seeds what an epoch draws, such as dropout: by seed and epoch, so that a
-        resumed training draws the same.
-        """
-        place = np.array(
-            [self.current_epoch * self.trainer.world_size + self.global_rank]
-        )
-        drawn = rng.uniform(rng.stream_key(self.seed, "models", "epoch"), place, (1,))
-        torch.manual_seed(int(drawn.item() * 2**53))
+        """Seed the epoch's draws, such as dropout, so that a resumed training repeats them."""
+        world_size = self.trainer.world_size
+        index = np.array([self.current_epoch * world_size + self.global_rank])
+        key = rng.stream_key(self.seed, "models", "epoch")
+        uniform = rng.uniform(key, index, (1,))
+        torch.manual_seed(int(uniform.item() * 2**53))
 
     def training_step(self, batch: Maps, batch_index: int) -> Tensor:
-        """Computes the loss of a batch."""
+        """Compute the loss of a batch."""
         loss, cells = self.assess(batch)
         self.log(
             "train_loss",
@@ -316,21 +311,19 @@ class TrainableNetwork(lightning.LightningModule):
         return loss
 
     def validation_step(self, batch: Maps, batch_index: int) -> None:
-        """Measures a batch."""
+        """Measure a batch."""
         self.tally(batch)
-        named = {
-            "valid_loss": self.metrics["loss"],
-            **dict(self.metrics.items()),
-        }  # tables begin with it
-        self.log_dict(named, on_epoch=True, batch_size=len(batch[self.target]))
+        # Tables start with the loss.
+        metrics = {"valid_loss": self.metrics["loss"], **dict(self.metrics.items())}
+        self.log_dict(metrics, on_epoch=True, batch_size=len(batch[self.target]))
 
     def measure(self, maps: Any) -> dict[str, float]:
-        """Measures maps as training does, by name, such as `valid_loss`; the network is
-        in evaluation.
+        """Return metrics of maps by name, such as `valid_loss`, as in training.
+
+        The network must be in evaluation.
 
         Args:
-            maps: a `models.training.data.MapDataset` with `inputs` and the field that
-                is learned.
+            maps: a `models.training.data.MapDataset` with `inputs` and the field to learn.
         """
         self.metrics.to(self.device).reset()
         with torch.inference_mode():
@@ -339,31 +332,33 @@ class TrainableNetwork(lightning.LightningModule):
         return {name: float(value) for name, value in self.metrics.compute().items()}
 
     def tally(self, batch: Maps) -> None:
-        """Updates `metrics` by a batch; the network is in evaluation."""
+        """Update `metrics` with a batch; the network must be in evaluation."""
         loss, cells = self.assess(batch)
         self.metrics["loss"].update(loss, cells)
 
 
 class TrainableModel(TrainableNetwork, ModelFamily):
-    """A model that `benchnav-train fit` trains, and that is kept in checkpoints.
+    """Model that `benchnav-train fit` trains and that checkpoints store.
 
-    Calibration: the temperature T widens or narrows every distribution on the scale of
+    Calibration: the temperature T widens or narrows each distribution on the scale of
     normal scores, to F⁻¹(Φ(T·Φ⁻¹(u))). It is fitted to the validation maps by maximum
-    likelihood and leaves every median as it is.
+    likelihood and does not change medians.
     """
 
     @abstractmethod
     def to_distribution(self, outputs: Any) -> TraversabilityDistribution:
-        """Gives the distribution of λ in each cell, [B, H, W], from outputs of
-        `forward`, float32.
+        """Return the distribution of λ in each cell, [B, H, W].
+
+        Args:
+            outputs: of `forward`, float32.
         """
 
     def predict(self, observation: Observation) -> TraversabilityDistribution:
-        """Predicts on the observation's device, to which the network is moved, some
-        maps at a time.
+        """Predict on the observation's device, in chunks of maps.
 
         Args:
-            observation: B maps of any size, with the layers of `inputs`.
+            observation: B maps of any size, with the layers of `inputs`. The network is moved
+                to their device.
 
         Returns:
             Distributions of shape [B, H, W].
@@ -371,36 +366,37 @@ class TrainableModel(TrainableNetwork, ModelFamily):
         return self.sharpen(self.predict_raw(layers_of(observation, self.inputs)))
 
     def predict_raw(self, maps: Maps) -> TraversabilityDistribution:
-        """Predicts before calibration, from layers by name."""
+        """Predict without calibration.
+
+        Args:
+            maps: layers by name, at least one.
+        """
         first = next(iter(maps.values()))
         self.eval().to(first.device)
-        size = max(1, CHUNK_CELLS // (first.shape[-2] * first.shape[-1]))
+        cells_per_map = first.shape[-2] * first.shape[-1]
+        size = max(1, CHUNK_CELLS // cells_per_map)
+        distributions = []
         with torch.inference_mode():
-            chunks = [
-                self._some(
-                    {name: layer[at : at + size] for name, layer in maps.items()}
-                )
-                for at in range(0, len(first), size)
-            ]
-        return map_tensors(chunks[0], lambda *values: torch.cat(values), *chunks[1:])
-
-    def _some(self, maps: Maps) -> TraversabilityDistribution:
-        return self.to_distribution(in_single_precision(self(maps)))
+            for start in range(0, len(first), size):
+                chunk = slice(start, start + size)
+                outputs = self({name: layer[chunk] for name, layer in maps.items()})
+                distributions.append(self.to_distribution(in_single_precision(outputs)))
+        return map_tensors(
+            distributions[0], lambda *values: torch.cat(values), *distributions[1:]
+        )
 
     def sharpen(
         self, distribution: TraversabilityDistribution
     ) -> TraversabilityDistribution:
-        """Applies the temperature."""
+        """Apply the temperature."""
         return widened(distribution, self.temperature)
 
     def configure_metrics(self) -> dict[str, Metric]:
-        """The root mean square error of E[λ] to λ as observed."""
+        """Return the root mean square error of E[λ] relative to observed λ."""
         return {"rmse": MeanSquaredError(squared=False)}
 
     def update_metrics(self, outputs: Any, target: Tensor) -> None:
-        """Updates every metric by E[λ] and λ of the cells where it was observed, each
-        of shape [N].
-        """
+        """Update every metric with E[λ] and observed λ, each of shape [N]."""
         seen = target.isfinite()
         mean = self.to_distribution(outputs).mean()[seen]
         for name, metric in self.metrics.items(keep_base=True):
@@ -408,30 +404,31 @@ class TrainableModel(TrainableNetwork, ModelFamily):
                 metric.update(mean, target[seen])
 
     def calibrate(self, maps: Any, device: torch.device) -> None:
-        """Fits the temperature."""
-        self.temperature = fit_width(
-            *sample_scores(self.predict_raw, maps, self.inputs, self.seed, device)
+        """Fit the temperature."""
+        lower, upper = sample_scores(
+            self.predict_raw, maps, self.inputs, self.seed, device
         )
+        self.temperature = fit_width(lower, upper)
 
     @classmethod
     def fit_pool(
         cls, members: Sequence[Self], maps: Any, seed: int, device: torch.device
     ) -> float:
-        """Fits the temperature of the average of several members' distributions."""
+        """Fit the temperature of the average of several members' distributions."""
 
         def predict(layers: dict[str, Tensor]) -> TraversabilityDistribution:
-            return pool(
-                [member.sharpen(member.predict_raw(layers)) for member in members]
-            )
+            calibrated = (m.sharpen(m.predict_raw(layers)) for m in members)
+            return pool(list(calibrated))
 
-        return fit_width(*sample_scores(predict, maps, members[0].inputs, seed, device))
+        lower, upper = sample_scores(predict, maps, members[0].inputs, seed, device)
+        return fit_width(lower, upper)
 
     @classmethod
     def from_checkpoint(cls, checkpoint: Checkpoint) -> TraversabilityModel:  # type: ignore[override]
-        """Rebuilds the model, or the ensemble.
+        """Rebuild the model, or the ensemble.
 
         Raises:
-            CheckpointError: there is no part of it.
+            CheckpointError: If the checkpoint has no part of it.
         """
         name = checkpoint.model
         members = [
@@ -444,52 +441,10 @@ class TrainableModel(TrainableNetwork, ModelFamily):
 
     @classmethod
     def from_part(cls, part: Part, checkpoint: Checkpoint) -> Self:
-        """Rebuilds one member."""
+        """Rebuild one member."""
         return cls.from_tensors(part.config, checkpoint.class_names, part.tensors)
 
 
-class Ensemble(TraversabilityModel):
-    """Several models as one: the average of their distribution functions, calibrated as
-    a whole.
-
-    Source: Lakshminarayanan et al. (2017), "Simple and scalable predictive uncertainty
-    estimation using deep ensembles".
-
-    Args:
-        members: the models.
-        temperature: of the average; see `TrainableModel`.
-    """
-
-    def __init__(
-        self, members: Sequence[TrainableModel], temperature: float = 1.0
-    ) -> None:
-        """Keeps them."""
-        self.members, self.temperature = tuple(members), temperature
-
-    def predict(self, observation: Observation) -> TraversabilityDistribution:
-        """Predicts by all members; distributions of shape [B, H, W]."""
-        averaged = pool([member.predict(observation) for member in self.members])
-        return widened(averaged, self.temperature)
-
-
-def widened(
-    distribution: TraversabilityDistribution, temperature: float
-) -> TraversabilityDistribution:
-    """Multiplies the normal scores of distributions by a temperature, over 1 to make
-    them wider.
-
-    Args:
-        distribution: of shape [B, H, W].
-        temperature: > 0; at 1 nothing is changed.
-    """
-    if temperature == 1:
-        return distribution
-    zeros = torch.zeros(
-        distribution.shape, dtype=distribution.dtype, device=distribution.device
-    )
-    return conditioned(distribution, zeros, zeros + temperature)
-
-
 def in_single_precision(outputs: Any) -> Any:
-    """Outputs of a network, a tensor or a collection of them, as float32."""
+    """Return a network's outputs, a tensor or a collection of tensors, as float32."""
     return apply_to_collection(outputs, Tensor, Tensor.float)

@@ -1,1 +1,1 @@
-"""How good a model is: measures, tables and figures."""
+"""Measures, tables and figures of the quality of models."""

@@ -1,8 +1,8 @@
-"""What can be said without a model: the class of the nearest colour, and one
-distribution of λ for all cells.
+"""Baselines without a model: the class of the nearest colour, and one distribution of λ
+for all cells.
 
-A model that is worse than these is worse than none. Letters in shapes: B maps, H×W
-cells, C classes.
+A model that scores worse than these is of no use. Letters in shapes: B maps, H×W cells,
+C classes.
 """
 
 import numpy as np
@@ -16,15 +16,14 @@ _BINS = 2**12
 
 
 def nearest_colour(rgb: Tensor, colours: Tensor) -> Tensor:
-    """Takes for each cell the class whose colour in full light is nearest, by Euclidean
-    distance.
+    """Return for each cell the class whose fully lit colour is nearest (Euclidean).
 
     Args:
         rgb: 0–255, shape [B, 3, H, W].
-        colours: of the classes, 0–255, shape [C, 3].
+        colours: colours of the classes, 0–255, shape [C, 3].
 
     Returns:
-        Class indices, int64, shape [B, H, W]; of classes equally near the first.
+        Class indices, int64, shape [B, H, W]; the first among equally near classes.
     """
     pixels = rgb.movedim(1, -1).float().flatten(1, 2)
     distance = torch.cdist(pixels, colours.float().expand(len(rgb), -1, -1))
@@ -32,29 +31,32 @@ def nearest_colour(rgb: Tensor, colours: Tensor) -> Tensor:
 
 
 def nearest_colour_accuracy(dataset: TerrainDataset, split: str) -> float:
-    """Share of a split's labelled cells whose class `nearest_colour` tells."""
+    """Return the fraction of a split's labelled cells that `nearest_colour` classifies."""
     colours = torch.tensor([item.colour for item in dataset.recipe.classes])
-    right, cells = 0, 0
+    n_correct = 0
+    n_labelled = 0
     for _, maps in dataset.chunks(split, ("rgb", "class_id")):
-        found = nearest_colour(torch.from_numpy(maps["rgb"]), colours)
+        predicted = nearest_colour(torch.from_numpy(maps["rgb"]), colours)
         class_id = torch.from_numpy(maps["class_id"])
-        right += int((found == class_id).sum())
-        cells += int((class_id != UNLABELLED).sum())
-    return right / max(1, cells)
+        n_correct += int((predicted == class_id).sum())
+        n_labelled += int((class_id != UNLABELLED).sum())
+    return n_correct / max(1, n_labelled)
 
 
 def climatology_crps(dataset: TerrainDataset, split: str) -> float:
-    """CRPS of one distribution of λ for all cells: that of the split's own observed λ.
+    """Return the CRPS of the split's own distribution of observed λ for all cells.
 
-    It is ∫ F·(1 − F), with F the share of cells up to a value, read off a histogram:
-    off by 1e-4 at most. Not a number
-    where no λ was observed. Source: Gneiting and Raftery (2007), 4.2.
+    It is ∫ F·(1 − F), with F the fraction of cells up to a value, computed from a
+    histogram with an error below 1e-4. It is NaN if λ was not observed. Source:
+    Gneiting and Raftery (2007), "Strictly proper scoring rules, prediction, and
+    estimation", 4.2.
     """
     counts = np.zeros(_BINS)
     for _, maps in dataset.chunks(split, ("traversability",)):
-        observed = maps["traversability"]
-        counts += np.histogram(observed[np.isfinite(observed)], _BINS, (0.0, 1.0))[0]
+        layer = maps["traversability"]
+        observed = layer[np.isfinite(layer)]
+        counts += np.histogram(observed, _BINS, (0.0, 1.0))[0]
     if not counts.any():
         return float("nan")
-    below = np.cumsum(counts) / counts.sum()
-    return float((below * (1 - below)).mean())
+    cdf = np.cumsum(counts) / counts.sum()
+    return float((cdf * (1 - cdf)).mean())

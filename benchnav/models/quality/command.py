@@ -1,5 +1,5 @@
-"""The commands `benchnav-train evaluate` and `benchnav-train compare`: whether models
-predict well, and which best.
+"""The commands `benchnav-train evaluate` and `benchnav-train compare`: quality of models'
+predictions.
 """
 
 from pathlib import Path
@@ -31,26 +31,25 @@ def evaluate_command(
             package.module:Name, path/to/file.py:Name or
             path/to/file.py:Name@CHECKPOINT.
         data: Path or id of a dataset.
-        splits: Which splits, for example [test/std,valid]; every test split when not
-            given.
-        out: Folder for quality.json, quality.csv, quality.md and figures; none when not
-            given.
-        json: File for what quality.json holds, without the rest.
-        maps: How many maps of each split the map sheets among the figures show; all
-            maps are measured.
+        splits: Names of splits, for example [test/std,valid]. If empty, all test splits.
+        out: Folder for quality.json, quality.csv, quality.md and figures. If empty,
+            nothing is written.
+        json: File for the content of quality.json only.
+        maps: Number of maps of each split in the map sheets among the figures; all maps
+            are measured.
         seed: Root seed of the draws that place clipped values within their atoms.
-        overwrite: Replace an evaluation that is in `out`.
-        device: Where the model is measured; auto takes CUDA where there is a GPU.
-            Figures are made on the CPU.
+        overwrite: Replace an existing evaluation in `out`.
+        device: Device for the measurement; auto uses CUDA if there is a GPU. Figures are
+            drawn on the CPU.
     """
     from benchnav.core.errors import expect
 
     expect(maps >= 0, f"`maps` ≥ 0, got {maps}. 0 leaves the map sheets out.")
-    target = Path(json)
     if json:
+        target = Path(json)
         expect(
             target.parent.is_dir() and not target.is_dir(),
-            f"`json` to be a file in a folder that exists, got {target}. Make "
+            f"`json` to be a file in an existing folder, got {target}. Create "
             f"{target.parent} first.",
         )
         check_writable(target)
@@ -72,23 +71,20 @@ def compare(
     overwrite: bool = False,
     device: Device = "auto",
 ) -> None:
-    """Compare models on the test splits of a dataset: one table, and paired differences
-    by map.
+    """Compare models on the test splits of a dataset: scores and paired differences per map.
 
     Args:
         models: Checkpoint folders, or models by NAME, package.module:Name,
             path/to/file.py:Name or path/to/file.py:Name@CHECKPOINT. The privileged
-            models oracle and ideal join them where the truth is known.
+            models oracle and ideal are added if the truth is available.
         data: Path or id of a dataset.
-        splits: Which splits, for example [test/std,valid]; every test split when not
-            given.
+        splits: Names of splits, for example [test/std,valid]. If empty, all test splits.
         out: Folder for compare.json, compare.csv, differences.csv, compare.md and
-            figures; none when not given.
+            figures. If empty, nothing is written.
         seed: Root seed of the draws that place clipped values within their atoms, the
             same for all models.
-        overwrite: Replace a comparison that is in `out`.
-        device: Where the models are measured and timed; auto takes CUDA where there is
-            a GPU.
+        overwrite: Replace an existing comparison in `out`.
+        device: Device for measuring and timing; auto uses CUDA if there is a GPU.
     """
     dataset = open_maps(data, splits, seed, out, overwrite, COMPARISON, "a comparison")
 

@@ -1,6 +1,4 @@
-"""The files of an evaluation and of a comparison, and what is checked before any work
-is done.
-"""
+"""Files of an evaluation and of a comparison, and checks of arguments before any work."""
 
 import tempfile
 from collections.abc import Collection
@@ -23,22 +21,21 @@ def open_maps(
     out: str,
     overwrite: bool,
     files: Collection[str],
-    what: str,
+    content: str,
 ) -> "TerrainDataset":
-    """Open the dataset that models are measured on, after a check of the other
-    arguments.
+    """Check the arguments of a measurement and open its dataset.
 
     Args:
         data: its path or id.
-        splits: which of its splits; None for every test split.
+        splits: names of its splits; None for all test splits.
         seed: root seed.
-        out: folder that is written to; if empty, none.
-        overwrite: whether what is there may be replaced.
-        files: names of what such a folder holds, in addition to `FIGURES`.
-        what: what that is, such as "an evaluation".
+        out: output folder; if empty, nothing is written.
+        overwrite: whether an existing measurement may be replaced.
+        files: names of the files of such a folder, in addition to `FIGURES`.
+        content: description of such a folder, such as "an evaluation".
 
     Raises:
-        ConfigError: If `splits` is empty, or the folder holds something else.
+        ConfigError: If `splits` is empty, or the folder contains other files.
     """
     from benchnav.core.errors import expect
     from benchnav.core.store import refuse_taken
@@ -48,25 +45,28 @@ def open_maps(
 
     check_seed(seed)
     if out:
-        refuse_taken(
-            Path(out), overwrite, partial(_foreign, files={*files, FIGURES}, what=what)
-        )
+        names = {*files, FIGURES}
+        reason = partial(_foreign, files=names, content=content)
+        refuse_taken(Path(out), overwrite, reason)
         check_writable(Path(out, next(iter(files))))
     dataset = TerrainDataset(find_dataset(data))
     expect(splits != [], f"`splits` among {', '.join(dataset.splits)}, got none.")
     return dataset
 
 
-def _foreign(folder: Path, files: set[str], what: str) -> str:
-    """Return why what is at a path is none of these; empty if it is one. For
-    `refuse_taken`.
-    """
-    own = folder.is_dir() and {item.name for item in folder.iterdir()} <= files
-    return "" if own else f"is something else than {what}"
+def _foreign(folder: Path, files: set[str], content: str) -> str:
+    """Return why a path is not such a folder, empty if it is; for `refuse_taken`."""
+    if folder.is_dir() and {item.name for item in folder.iterdir()} <= files:
+        return ""
+    return f"is something else than {content}"
 
 
 def check_writable(path: Path) -> None:
-    """Reject a file that cannot be written, by an OSError that names it."""
+    """Check that a file can be written.
+
+    Raises:
+        OSError: If it cannot; the error names the file.
+    """
     nearest = next(parent for parent in path.absolute().parents if parent.exists())
     try:
         with tempfile.TemporaryFile(dir=nearest):

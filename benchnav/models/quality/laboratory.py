@@ -1,4 +1,4 @@
-"""Models measured on splits of a dataset: one by itself, or several that are compared."""
+"""Measurement of models on splits of a dataset: one model, or several to compare."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,13 +10,14 @@ import torch
 from benchnav.core.device import find_device, gpu_name
 from benchnav.core.store import write_text
 from benchnav.core.tables import print_table
+from benchnav.core.terrain import Terrain
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.predictor import class_mismatch
 from benchnav.models.quality.compare.candidates import (
     Candidate,
-    candidate,
     count_parameters,
     find_candidates,
+    load_candidate,
     prediction_ms,
 )
 from benchnav.models.quality.compare.figures import comparison_figures
@@ -28,7 +29,8 @@ from benchnav.models.quality.compare.report import (
     comparison_table,
     difference_table,
 )
-from benchnav.models.quality.figures import QualityData, quality_figures
+from benchnav.models.quality.figure_data import QualityData
+from benchnav.models.quality.figures import quality_figures
 from benchnav.models.quality.files import COMPARISON, EVALUATION
 from benchnav.models.quality.map_sums import by_group
 from benchnav.models.quality.measure import choose_splits, known_splits
@@ -48,26 +50,26 @@ def evaluate(
     json: str = "",
     maps: int = 3,
 ) -> None:
-    """Measure a model, and print and write how good it is; see
-    `command.evaluate_command`.
-    """
-    one = candidate(source, source)
-    chosen = choose_splits(one.model, dataset, splits)
+    """Measure a model, print and write its quality; see `command.evaluate_command`."""
+    candidate = load_candidate(source, source)
+    chosen = choose_splits(candidate.model, dataset, splits)
     measurement = Measurement(
         dataset=dataset, splits=chosen, seed=seed, device=find_device(device)
     )
-    measurement.measure([(split, one) for split in chosen], "splits", by_map=False)
-    qualities, title = measurement.of(one), f"{source} on {dataset.id}"
+    pairs = [(split, candidate) for split in chosen]
+    measurement.measure(pairs, "splits", by_map=False)
+    qualities = measurement.of(candidate)
+    title = f"{source} on {dataset.id}"
     print_table(quality_table(title, qualities))
-    notes = [*measurement.notes_of_data, *measurement.notes_of(one)]
+    notes = [*measurement.notes_of_data, *measurement.notes_of(candidate)]
     print(*notes, sep="\n")
-    about = {
+    header = {
         "model": source,
-        **measurement.about(notes),
+        **measurement.header(notes),
         "nearest_colour_accuracy": measurement.nearest_colour_accuracy,
         "climatology_crps": measurement.climatology_crps,
     }
-    report = quality_json(about, qualities)
+    report = quality_json(header, qualities)
     if json:
         write_text(Path(json), report)
         print(f"wrote {json}")
@@ -76,15 +78,15 @@ def evaluate(
         print(f"columns: --out FOLDER writes {page_file}, which explains them")
         return
     name = Path(source).name if Path(source).is_dir() else source
-    shown = f"model {name} on dataset {dataset.id}"
     data = QualityData(
-        title=shown, model=one.model, dataset=dataset, qualities=qualities, maps=maps
+        title=f"model {name} on dataset {dataset.id}",
+        model=candidate.model,
+        dataset=dataset,
+        qualities=qualities,
+        maps=maps,
     )
-    page = Page(
-        title=title,
-        tables=[quality_table(title, qualities, whole=True)],
-        notes=[*notes, *data.absent],
-    )
+    table = quality_table(title, qualities, all_columns=True)
+    page = Page(title=title, tables=[table], notes=[*notes, *data.absent])
     for line in data.absent:
         print(line)
     texts = {report_file: report, csv_file: quality_csv(qualities)}
@@ -99,24 +101,25 @@ def compare(
     device: str,
     out: str = "",
 ) -> None:
-    """Compare models, and print and write which is best; see `command.compare`."""
-    candidates, chosen = find_candidates(sources), known_splits(dataset, splits)
+    """Compare models, print and write scores and differences; see `command.compare`."""
+    candidates = find_candidates(sources)
+    chosen = known_splits(dataset, splits)
     measurement = Measurement(
         dataset=dataset, splits=chosen, seed=seed, device=find_device(device)
     )
-    # The class table is not the truth of imported ground.
+    # The class table is not the truth of imported terrain.
     pairs = [
-        (split, one)
+        (split, candidate)
         for split in chosen
-        for one in candidates
-        if not (one.needs_truth and split in measurement.unknown)
+        for candidate in candidates
+        if not (candidate.needs_truth and split in measurement.unknown)
     ]
     measurement.measure(pairs, "models and splits", by_map=True)
-    comparison = _compared(measurement, candidates)
-    title = (
-        f"{', '.join(one.label for one in candidates if one.source in sources)} "
-        f"on {dataset.id}"
-    )
+    comparison = _compare(measurement, candidates)
+    labels = [
+        candidate.label for candidate in candidates if candidate.source in sources
+    ]
+    title = f"{', '.join(labels)} on {dataset.id}"
     print_table(comparison_table(title, comparison))
     notes = _notes(measurement, candidates, comparison)
     print(*notes, sep="\n")
@@ -127,26 +130,22 @@ def compare(
             "all differences"
         )
         return
-    about = {**measurement.about(notes), "threads": torch.get_num_threads()}
+    header = {**measurement.header(notes), "threads": torch.get_num_threads()}
     texts = {
-        report_file: comparison_json(about, comparison),
+        report_file: comparison_json(header, comparison),
         csv_file: comparison_csv(comparison),
         differences_file: comparison.pairs.to_csv(index=False, float_format="%.6g"),
     }
-    tables = [
-        comparison_table(title, comparison, whole=True),
-        difference_table(comparison),
-    ]
-    page = Page(
-        title=title, tables=[table for table in tables if table.rows], notes=notes
-    )
-    write_folder(
-        Path(out), texts, page_file, page, comparison_figures(comparison), comparison
-    )
+    scores = comparison_table(title, comparison, all_columns=True)
+    differences = difference_table(comparison)
+    tables = [table for table in (scores, differences) if table.rows]
+    page = Page(title=title, tables=tables, notes=notes)
+    figures = comparison_figures(comparison)
+    write_folder(Path(out), texts, page_file, page, figures, comparison)
 
 
-def _compared(measurement: Measurement, candidates: Sequence[Candidate]) -> Comparison:
-    """Compare what was measured, and say what each model costs."""
+def _compare(measurement: Measurement, candidates: Sequence[Candidate]) -> Comparison:
+    """Compare the measured models, and measure their costs."""
     dataset = measurement.dataset
     tallies = {
         key: quality.by_map
@@ -155,79 +154,93 @@ def _compared(measurement: Measurement, candidates: Sequence[Candidate]) -> Comp
     }
     sums: dict[str, dict[str, Any]] = {}
     for split in measurement.splits:
-        groups: Any = np.arange(dataset.map_count(split))
-        if "group" in dataset.field_names:
-            groups = dataset.read(split, fields=("group",))["group"].reshape(-1)
+        groups = _groups(dataset, split)
         sums[split] = {
-            model: by_group(own.sums(), groups)
-            for (of, model), own in tallies.items()
-            if of == split
+            model: by_group(tally.sums(), groups)
+            for (tally_split, model), tally in tallies.items()
+            if tally_split == split
         }
-    summary, pairs, best = compare_sums(
-        sums, [one.label for one in candidates if not one.privileged]
-    )
+    competing = [
+        candidate.label for candidate in candidates if not candidate.privileged
+    ]
+    summary, pairs, best = compare_sums(sums, competing)
     terrain = dataset.terrain(measurement.splits[0], [0]).to(measurement.device)
     models = {
-        one.label: {
-            "source": one.source,
-            "privileged": one.privileged,
-            "parameters": None if one.privileged else count_parameters(one.model),
-            "prediction_ms": None
-            if one.privileged
-            else prediction_ms(one.model, terrain),
-        }
-        for one in candidates
-        if (summary["model"] == one.label).any()
+        candidate.label: _cost(candidate, terrain)
+        for candidate in candidates
+        if (summary["model"] == candidate.label).any()
     }
     return Comparison(
         models=models, summary=summary, pairs=pairs, best=best, tallies=tallies
     )
 
 
+def _groups(dataset: TerrainDataset, split: str) -> np.ndarray:
+    """Return the group id of each map, shape [M]."""
+    if "group" not in dataset.field_names:
+        return np.arange(dataset.map_count(split))
+    groups: np.ndarray = dataset.read(split, fields=("group",))["group"].reshape(-1)
+    return groups
+
+
+def _cost(candidate: Candidate, terrain: Terrain) -> dict[str, Any]:
+    """Return source and cost of a model; privileged models have no cost."""
+    is_timed = not candidate.privileged
+    return {
+        "source": candidate.source,
+        "privileged": candidate.privileged,
+        "parameters": count_parameters(candidate.model) if is_timed else None,
+        "prediction_ms": prediction_ms(candidate.model, terrain) if is_timed else None,
+    }
+
+
 def _notes(
     measurement: Measurement, candidates: Sequence[Candidate], comparison: Comparison
 ) -> list[str]:
-    """Return what else a reader has to know of the numbers of a comparison."""
+    """Return notes for readers of the numbers of a comparison."""
     dataset = measurement.dataset
-    units = dict(
+    n_units = dict(
         zip(comparison.summary["split"], comparison.summary["units"], strict=True)
     )
     counts = []
     for split in measurement.splits:
-        count = dataset.map_count(split)
-        grouped = f" in {units[split]} groups" if units[split] != count else ""
-        counts.append(f"{split} {count} maps{grouped}")
+        n_maps = dataset.map_count(split)
+        is_grouped = n_units[split] != n_maps
+        groups = f" in {n_units[split]} groups" if is_grouped else ""
+        counts.append(f"{split} {n_maps} maps{groups}")
     lines = [f"statistical units: {', '.join(counts)}", *measurement.notes_of_data]
-    rivals = sum(not one.privileged for one in candidates)
-    corrected = rivals * (rivals - 1) // 2
-    if few := [
-        split for split, own in units.items() if corrected * 2.0 ** (1 - own) >= ALPHA
-    ]:
+    n_competing = sum(not candidate.privileged for candidate in candidates)
+    n_tests = n_competing * (n_competing - 1) // 2
+    # Of n units, the smallest p-value of a sign-flip permutation test is 2^(1 − n).
+    too_few = [
+        split for split, n in n_units.items() if n_tests * 2.0 ** (1 - n) >= ALPHA
+    ]
+    if too_few:
         lines.append(
-            f"no difference can be significant with so few maps: {', '.join(few)}"
+            f"no difference can be significant with so few maps: {', '.join(too_few)}"
         )
-    left = [one.label for one in candidates if one.needs_truth]
-    if left and (unknown := measurement.unknown):
+    left_out = [candidate.label for candidate in candidates if candidate.needs_truth]
+    if left_out and measurement.unknown:
         lines.append(
-            f"{' and '.join(left)} are left out on {', '.join(unknown)}: the truth is "
-            "unknown there"
+            f"{' and '.join(left_out)} are left out on "
+            f"{', '.join(measurement.unknown)}: the truth is unknown there"
         )
-    for one in candidates:
-        if class_mismatch(one.model, dataset.recipe):
+    for candidate in candidates:
+        if class_mismatch(candidate.model, dataset.recipe):
             lines.append(
-                f"{one.label} is compared by λ alone: its classes are not those of "
+                f"{candidate.label} is compared by λ only: its classes are not those of "
                 "these maps"
             )
-        if not one.privileged:
-            lines += [f"{one.label}: {line}" for line in measurement.notes_of(one)]
+        if not candidate.privileged:
+            lines += [
+                f"{candidate.label}: {line}" for line in measurement.notes_of(candidate)
+            ]
     height, width = dataset.grid.shape
     threads = torch.get_num_threads()
-    where = (
-        gpu_name(measurement.device)
-        or f"the CPU with {threads} thread{'s' * (threads > 1)}"
-    )
+    plural = "s" if threads > 1 else ""
+    cpu = f"the CPU with {threads} thread{plural}"
     lines.append(
         f"ms a map: median over repeated predictions of a map of {height}×{width} "
-        f"cells on {where}"
+        f"cells on {gpu_name(measurement.device) or cpu}"
     )
     return lines

@@ -1,8 +1,7 @@
-"""Map sheets: truth, prediction, error and uncertainty of a few maps side by side, a
-row a map.
+"""Map sheets: truth, prediction, error and uncertainty of several maps, a row per map.
 
-A quantity has one scale in all sheets of an evaluation, so that splits compare. Letters
-in shapes: B maps, H×W cells.
+A quantity has the same scale in all sheets of an evaluation, so that splits can be
+compared. Letters in shapes: B maps, H×W cells.
 """
 
 from collections.abc import Sequence
@@ -22,8 +21,8 @@ from benchnav.models.quality.scores import mutual_information, predictive_entrop
 from benchnav.viz.maps import LAMBDA, TRAVERSABILITY_COLOURS, lacking_handle
 from benchnav.viz.sheet import SheetColumn, class_patches, class_scale, sheet_of_maps
 
-# Of each layer its title, what stands under its colour bar, and its colours; classes
-# and images have no bar.
+# Title, label of the colour bar, and colours of each layer; classes and images have no
+# colour bar.
 _LAYERS: dict[str, tuple[str, str, str]] = {
     "rgb": ("Image", "", ""),
     "class_true": ("True class", "", ""),
@@ -37,17 +36,18 @@ _LAYERS: dict[str, tuple[str, str, str]] = {
     "entropy": ("Entropy", "nats", "magma"),
     "information": ("Mutual information", "nats", "magma"),
 }
-_SHOWN_SHARE = 0.995
+_SCALE_LEVEL = 0.995
+_STEPS = np.array([1, 1.5, 2, 3, 4, 5, 6, 8, 10])
 
 
 class MapSheet(NamedTuple):
-    """What a sheet shows.
+    """Layers of a map sheet.
 
     Args:
-        split: where the maps are from.
-        indices: which maps.
-        extent_m: size of a map along x and y.
-        layers: by the keys of `_LAYERS`, those that the model has, each of shape [B, H,
+        split: split of the maps.
+        indices: indices of the maps.
+        extent_m: size of a map along x and y in metres.
+        layers: by the keys of `_LAYERS`, as far as the model has them, each of shape [B, H,
             W]; `rgb` is of shape [B, H, W, 3].
     """
 
@@ -63,37 +63,36 @@ def read_sheet(
     split: str,
     indices: Sequence[int],
 ) -> MapSheet:
-    """Predicts some maps of a split.
+    """Predict several maps of a split.
 
     Args:
         model: any model.
-        dataset: where the maps are.
+        dataset: dataset of the maps.
         split: name of a split.
-        indices: which maps.
+        indices: indices of the maps.
 
     Raises:
-        DatasetError: there is no such split or map, or its data are damaged.
+        DatasetError: If the split or a map does not exist, or its data are damaged.
     """
     terrain = dataset.terrain(split, indices)
+    has_truth = dataset.truth_of(split) == "generated"
+    layers = {"rgb": terrain.rgb.movedim(1, -1)}
     with torch.inference_mode():
         predicted = predict(model, terrain)
-        known = dataset.truth_of(split) == "generated"
-        true = (
-            Oracle().predict_terrain(terrain).mean()
-            if known
-            else terrain.traversability
-        )
-        layers = {"rgb": terrain.rgb.movedim(1, -1)}
         if model.class_names:
             classes = predicted.class_probabilities(len(model.class_names))
-            layers |= {"class_true": terrain.class_id, "class_found": classes.argmax(1)}
+            layers["class_true"] = terrain.class_id
+            layers["class_found"] = classes.argmax(1)
             layers["entropy"] = predictive_entropy(classes)
-        layers |= {
-            "expected_true" if known else "observed": true,
-            "expected": predicted.mean(),
-            "error" if known else "error_observed": predicted.mean() - true,
-            "width": predicted.var(0.05) - predicted.var(0.95),
-        }
+        layers["expected"] = predicted.mean()
+        if has_truth:
+            true = Oracle().predict_terrain(terrain).mean()
+            layers["expected_true"] = true
+            layers["error"] = layers["expected"] - true
+        else:
+            layers["observed"] = terrain.traversability
+            layers["error_observed"] = layers["expected"] - terrain.traversability
+        layers["width"] = predicted.var(0.05) - predicted.var(0.95)
         members = model.member_probabilities(terrain.observe())
         if members is not None and len(members) > 1:
             layers["information"] = mutual_information(members)
@@ -104,39 +103,35 @@ def read_sheet(
 def shared_scales(
     sheets: Sequence[MapSheet], classes: Sequence[TerrainClass]
 ) -> dict[str, dict[str, Any]]:
-    """Finds how each layer is drawn in all sheets: keywords of `imshow`, by layer.
+    """Return keywords of `imshow` for each layer, the same in all sheets.
 
-    Scales that are not of a fixed range hold 99.5 % of the cells.
+    Scales without a fixed range cover 99.5 % of the cells.
 
     Args:
         sheets: at least one.
-        classes: of the dataset.
+        classes: classes of the dataset.
     """
-    kinds = class_scale(class_colours(classes))
+    class_keywords = class_scale(class_colours(classes))
     scales: dict[str, dict[str, Any]] = {
         "rgb": {},
-        "class_true": kinds,
-        "class_found": kinds,
+        "class_true": class_keywords,
+        "class_found": class_keywords,
     }
     for name, (_, unit, palette) in _LAYERS.items():
+        if name in scales:
+            continue
         values = [
-            sheet.layers[name].ravel()
-            for sheet in sheets
-            if name in sheet.layers and unit
+            sheet.layers[name].ravel() for sheet in sheets if name in sheet.layers
         ]
         if unit == "λ":
             scales[name] = LAMBDA
         elif values:
-            shown = np.abs(np.concatenate(values))
-            shown = shown[np.isfinite(shown)]
-            most = _round_up(
-                float(np.quantile(shown, _SHOWN_SHARE)) if len(shown) else 0.0
-            )
-            scales[name] = {
-                "cmap": palette,
-                "vmin": -most if name.startswith("error") else 0,
-                "vmax": most,
-            }
+            sizes = np.abs(np.concatenate(values))
+            sizes = sizes[np.isfinite(sizes)]
+            quantile = np.quantile(sizes, _SCALE_LEVEL) if len(sizes) else 0.0
+            vmax = _round_up(float(quantile))
+            vmin = -vmax if name.startswith("error") else 0
+            scales[name] = {"cmap": palette, "vmin": vmin, "vmax": vmax}
     return scales
 
 
@@ -146,43 +141,24 @@ def map_sheet_figure(
     classes: Sequence[TerrainClass],
     title: str,
 ) -> Figure:
-    """Draws a sheet, a row a map and a column a layer; the panel of a layer has the
-    label `LAYER ROW`.
+    """Draw a sheet, a row per map and a column per layer.
+
+    The panel of a layer has the label `LAYER ROW`.
 
     Args:
         sheet: the maps.
         scales: from `shared_scales`.
-        classes: of the dataset.
-        title: which model and dataset; the split follows.
+        classes: classes of the dataset.
+        title: names of model and dataset, followed by the split.
     """
-    columns = []
-    for name in (name for name in _LAYERS if name in sheet.layers):
-        title_of, unit, _ = _LAYERS[name]
-        layers, is_error = sheet.layers[name], name.startswith("error")
-        columns.append(
-            SheetColumn(
-                name=name,
-                title=title_of,
-                layers=np.ma.masked_equal(layers, UNLABELLED)
-                if name == "class_true"
-                else layers,
-                shades=scales[name],
-                unit=unit or None,
-                # λ ends at 0 and 1.
-                extend="neither" if unit == "λ" else "both" if is_error else "max",
-                max_intervals=2 if is_error else 4,
-            )
-        )
-    kinds = [
-        sheet.layers[name]
-        for name in ("class_true", "class_found")
-        if name in sheet.layers
+    names = [name for name in _LAYERS if name in sheet.layers]
+    columns = [_column(name, sheet.layers[name], scales[name]) for name in names]
+    class_layers = [
+        sheet.layers[name] for name in ("class_true", "class_found") if name in names
     ]
-    shown = np.setdiff1d(kinds, UNLABELLED).astype(int)
-    patches = class_patches(
-        [classes[number].name.replace("_", " ") for number in shown],
-        class_colours(classes)[shown],
-    )
+    class_ids = np.setdiff1d(class_layers, UNLABELLED).astype(int)
+    labels = [classes[class_id].name.replace("_", " ") for class_id in class_ids]
+    patches = class_patches(labels, class_colours(classes)[class_ids])
     if patches and any(bool(np.isnan(layer).any()) for layer in sheet.layers.values()):
         patches.append(lacking_handle())
     rows = [f"map {index}" for index in sheet.indices]
@@ -191,9 +167,29 @@ def map_sheet_figure(
     )
 
 
+def _column(name: str, layers: np.ndarray, shades: dict[str, Any]) -> SheetColumn:
+    """Return the column of a layer, with its colour scale."""
+    title, unit, _ = _LAYERS[name]
+    is_error = name.startswith("error")
+    if name == "class_true":
+        layers = np.ma.masked_equal(layers, UNLABELLED)
+    extend = "both" if is_error else "max"
+    if unit == "λ":  # λ ends at 0 and 1
+        extend = "neither"
+    return SheetColumn(
+        name=name,
+        title=title,
+        layers=layers,
+        shades=shades,
+        unit=unit or None,
+        extend=extend,
+        max_intervals=2 if is_error else 4,
+    )
+
+
 def _round_up(value: float) -> float:
-    """The next of 1, 1.5, 2, 3, 4, 5, 6, 8 and 10 times a power of ten; 1 for 0."""
+    """Round up to 1, 1.5, 2, 3, 4, 5, 6, 8 or 10 times a power of ten; 1 for 0."""
     if value <= 0:
         return 1.0
-    steps = 10.0 ** np.floor(np.log10(value)) * np.array([1, 1.5, 2, 3, 4, 5, 6, 8, 10])
-    return float(steps[steps >= 0.999 * value][0])
+    candidates = 10.0 ** np.floor(np.log10(value)) * _STEPS
+    return float(candidates[candidates >= 0.999 * value][0])

@@ -1,5 +1,5 @@
-"""Quality by map: sums from which every score follows (`scores_of_maps`), of one map or
-of any number of them.
+"""Quality by map: sums, over one map or several, from which `scores_of_maps` computes all
+scores.
 
 Letters in shapes: B maps of a chunk, M maps of a split, C classes, N cells.
 """
@@ -28,17 +28,18 @@ STEPS = 50  # of a sparsification curve, from no cell left out on
 
 @dataclass(frozen=True, kw_only=True)
 class CellScores:
-    """What is said of the N observed cells of some maps.
+    """Predictions and scores of the N observed cells of several maps.
 
     Args:
-        predicted: the distribution in each, of shape [1, N].
+        predicted: predicted distributions, of shape [1, N].
         observed: λ, shape [1, N].
         expected: predicted E[λ], shape [1, N].
-        transformed: its PIT, shape [1, N].
-        maps: which map each is of, int64, shape [N].
+        transformed: PIT of λ, shape [1, N].
+        maps: index of each cell's map, int64, shape [N].
         scores: `squares` of E[λ] − λ, `nll`, and `crps`, float64, each of shape [1, N].
-        labelled: which cells have a class, bool, shape [N].
-        expected_squares: of E[λ] − E[λ] in truth, of the labelled cells, float64.
+        labelled: mask of cells with a class, bool, shape [N].
+        expected_squares: squared errors of E[λ] relative to the true E[λ], of the labelled
+            cells, float64.
     """
 
     predicted: TraversabilityDistribution
@@ -52,111 +53,108 @@ class CellScores:
 
 
 class MapTally:
-    """Adds up maps, one by one.
+    """Sums over maps, added in chunks.
 
     Args:
-        classes: number of classes C, 0 of a model without any.
-        truth: whether the maps' true distribution of λ is known.
-        quantiles: add up what quantiles of every cell are needed for, which take most
-            of the time.
+        classes: number of classes C; 0 for a model without classes.
+        truth: whether the true distribution of λ is available.
+        quantiles: whether to add sums that need quantiles of all cells, which take most of
+            the time.
     """
 
     def __init__(self, classes: int, truth: bool, quantiles: bool = True) -> None:
-        """Start with no maps."""
-        self.classes, self.truth, self.quantiles = classes, truth, quantiles
-        self.names = (*_NAMES, *(_OF_QUANTILES if quantiles else ()))
+        """Start without maps."""
+        self.classes = classes
+        self.truth = truth
+        self.quantiles = quantiles
+        self.names = (*_NAMES, *_OF_QUANTILES) if quantiles else _NAMES
         self.parts: dict[str, list[np.ndarray]] = {}
         self.pit = np.zeros(PIT_BINS, dtype=np.int64)
         self.ranked = np.zeros((2, STEPS))
 
     def add(self, cells: CellScores | None, count: int) -> None:
-        """Adds `count` maps by their observed cells, None where there are none."""
+        """Add `count` maps by their observed cells, None if there are no such cells."""
         sums = {name: torch.zeros(count, dtype=torch.float64) for name in self.names}
         if cells is not None:
-            scores: dict[str, Tensor] = {
-                **cells.scores,
-                "cells": torch.ones_like(cells.observed),
-            }
-            scores["inside"] = (cells.transformed - 0.5).abs() <= LEVEL / 2
-            scores |= {
-                f"under_{round(100 * level)}": cells.transformed < 1 - level
-                for level in TAIL_LEVELS
-            }
-            if self.quantiles:
-                loss, width = lower_fifth_and_width(cells.predicted, cells.observed)
-                scores |= {
-                    "pinball": loss,
-                    "width": width,
-                    "areas": self._rank(cells, width[0], count),
-                }
-            sums |= {
-                name: _by_map(values, cells.maps, count)
-                for name, values in scores.items()
-            }
+            sums |= self._sums_of(cells, count)
             self.pit += pit_counts(cells.transformed).numpy()
-            if self.truth:
-                sums["labelled"] = _by_map(cells.labelled, cells.maps, count)
-                sums["expected_squares"] = _by_map(
-                    cells.expected_squares, cells.maps[cells.labelled], count
-                )
         for name, values in sums.items():
-            self._keep(name, values)
+            self._append(name, values)
+
+    def _sums_of(self, cells: CellScores, count: int) -> dict[str, Tensor]:
+        """Return sums of scores by map, each of shape [count]; also update the curves."""
+        scores = dict(cells.scores)
+        scores["cells"] = torch.ones_like(cells.observed)
+        scores["inside"] = (cells.transformed - 0.5).abs() <= LEVEL / 2
+        for level in TAIL_LEVELS:
+            scores[f"under_{round(100 * level)}"] = cells.transformed < 1 - level
+        if self.quantiles:
+            loss, width = lower_fifth_and_width(cells.predicted, cells.observed)
+            scores["pinball"] = loss
+            scores["width"] = width
+            scores["areas"] = self._rank(cells, width[0], count)
+        sums = {
+            name: _by_map(values, cells.maps, count) for name, values in scores.items()
+        }
+        if self.truth:
+            labelled_maps = cells.maps[cells.labelled]
+            sums["labelled"] = _by_map(cells.labelled, cells.maps, count)
+            sums["expected_squares"] = _by_map(
+                cells.expected_squares, labelled_maps, count
+            )
+        return sums
 
     def add_classes(self, probabilities: Tensor, class_id: Tensor) -> None:
-        """Adds class probabilities [B, C, H, W] of maps with true classes [B, H, W]."""
-        maps, labelled = len(class_id), class_id != UNLABELLED
-        where = (self.classes * torch.arange(maps, device=class_id.device))[
-            :, None, None
-        ].expand_as(class_id)
-        found, true, where = (
-            layer[labelled] for layer in (probabilities.argmax(1), class_id, where)
-        )
-        for name, cells in (
-            ("true", where + true),
-            ("found", where + found),
-            ("hits", (where + true)[found == true]),
-        ):
-            counts = torch.bincount(cells, minlength=maps * self.classes)
-            self._keep(name, counts.view(maps, self.classes))
+        """Add class probabilities [B, C, H, W] of maps with true classes [B, H, W]."""
+        n_maps = len(class_id)
+        labelled = class_id != UNLABELLED
+        offsets = self.classes * torch.arange(n_maps, device=class_id.device)
+        offset = offsets[:, None, None].expand_as(class_id)[labelled]
+        predicted = probabilities.argmax(1)[labelled]
+        true = class_id[labelled]
+        hits = true[predicted == true] + offset[predicted == true]
+        indices = {"true": offset + true, "found": offset + predicted, "hits": hits}
+        for name, index in indices.items():
+            counts = torch.bincount(index, minlength=n_maps * self.classes)
+            self._append(name, counts.view(n_maps, self.classes))
 
     def sums(self) -> dict[str, np.ndarray]:
-        """What was added, by name, of shape [M], of classes [M, C]."""
+        """Return the sums by name, of shape [M], those of classes of shape [M, C]."""
         return {name: np.concatenate(parts) for name, parts in self.parts.items()}
 
     def curves(self) -> np.ndarray:
-        """Share of cells that is left out; mean error of the rest, ranked by width, and
-        by error; shape [3, STEPS].
-        """
-        cells = sum(float(part.sum()) for part in self.parts["cells"])
-        return np.vstack([np.arange(STEPS) / STEPS, self.ranked / cells])
+        """Return the sparsification curves, shape [3, STEPS].
 
-    def _keep(self, name: str, values: Tensor) -> None:
+        The rows are the fraction of removed cells, and the mean error of the remaining
+        cells, ranked by width and by error.
+        """
+        n_cells = sum(float(counts.sum()) for counts in self.parts["cells"])
+        return np.vstack([np.arange(STEPS) / STEPS, self.ranked / n_cells])
+
+    def _append(self, name: str, values: Tensor) -> None:
         self.parts.setdefault(name, []).append(values.double().cpu().numpy())
 
     def _rank(self, cells: CellScores, width: Tensor, count: int) -> Tensor:
-        """The AUSE of each cell's own map, [N], while the curves are added to those of
-        all maps.
-        """
-        areas, error = (
-            torch.zeros_like(width),
-            (cells.expected - cells.observed)[0].abs(),
-        )
-        for place in range(count):
-            here = cells.maps == place
-            size = int(here.sum())
-            if not size:
+        """Return the AUSE of each cell's map, [N]; also add to the curves of all maps."""
+        areas = torch.zeros_like(width)
+        error = (cells.expected - cells.observed)[0].abs()
+        steps = torch.arange(STEPS, device=width.device)
+        for index in range(count):
+            mask = cells.maps == index
+            n_cells = int(mask.sum())
+            if not n_cells:
                 continue
-            curves = sparsification(error[here], width[here])
-            areas[here] = (curves[0] - curves[1]).mean()
-            left = size - 1 - torch.arange(STEPS, device=width.device) * size // STEPS
-            self.ranked += size * curves[:, left].cpu().numpy()
+            curves = sparsification(error[mask], width[mask])
+            areas[mask] = (curves[0] - curves[1]).mean()
+            last_cell = n_cells - 1 - steps * n_cells // STEPS
+            self.ranked += n_cells * curves[:, last_cell].cpu().numpy()
         return areas
 
 
 def _by_map(values: Tensor, maps: Tensor, count: int) -> Tensor:
-    """Adds values of N cells up by map, float64, shape [count]."""
-    empty = torch.zeros(count, dtype=torch.float64, device=values.device)
-    return empty.index_add_(0, maps, values.flatten().double())
+    """Sum values of N cells by map, float64, shape [count]."""
+    zeros = torch.zeros(count, dtype=torch.float64, device=values.device)
+    return zeros.index_add_(0, maps, values.flatten().double())
 
 
 _NAMES = (
@@ -167,21 +165,21 @@ _OF_QUANTILES = ("pinball", "width", "areas")
 
 
 def by_group(sums: Sums, groups: np.ndarray) -> dict[str, np.ndarray]:
-    """Adds maps of one group up, as of overlapping ones, which are one unit; those
-    without any cell are left out.
+    """Add the maps of each group, such as overlapping maps, into one statistical unit.
+
+    Units without cells are left out.
 
     Args:
-        sums: of shape [M], of classes [M, C].
-        groups: which maps go together: those of one number, shape [M].
+        sums: of shape [M], those of classes of shape [M, C].
+        groups: group id of each map, shape [M].
 
     Returns:
-        Sums of the units, in the order of their numbers.
+        Sums of the units, in the order of their ids.
     """
-    numbers, member = np.unique(groups, return_inverse=True)
-    together = {
-        name: np.zeros((len(numbers), *values.shape[1:]))
-        for name, values in sums.items()
-    }
+    group_ids, index = np.unique(groups, return_inverse=True)
+    totals = {}
     for name, values in sums.items():
-        np.add.at(together[name], member, values)
-    return {name: values[together["cells"] > 0] for name, values in together.items()}
+        totals[name] = np.zeros((len(group_ids), *values.shape[1:]))
+        np.add.at(totals[name], index, values)
+    has_cells = totals["cells"] > 0
+    return {name: values[has_cells] for name, values in totals.items()}

@@ -1,9 +1,9 @@
-"""How good a model's predictions are, a split at a time: of classes, and of
+"""Quality of a model's predictions per split: of class probabilities and of
 traversability.
 
-One pass over the maps with sums and counts alone, so that memory does not grow with
-them. The scores themselves stand in `scores`. Letters in shapes: B maps, H×W cells, C
-classes, N cells of all maps.
+One pass over the maps updates sums and counts only, so memory does not grow with the
+maps. The scores themselves are in `scores`. Letters in shapes: M members, B maps, H×W
+cells, C classes, N cells of all maps.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -39,8 +39,9 @@ from benchnav.models.quality.scores import (
 )
 from benchnav.models.quality.scores_of_maps import SCORES
 
-# Scores of `TraversabilityQuality` that it has by their own names.
+# Fields of `TraversabilityQuality` with the same names in `SCORES`.
 _OF_CELLS = ("rmse_observed", "rmse_expected", "nll", "crps", "coverage")
+_MAX_SLOPE_DEG = 90
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,25 +49,24 @@ class ClassQuality:
     """Quality of class probabilities.
 
     Args:
-        accuracy: share of cells whose most likely class is right.
-        miou: intersection over union, averaged over the classes that occur in truth.
-        miou_predicted: the same over those that are predicted somewhere too, of which
-            each that does not occur counts as 0.
+        accuracy: fraction of cells whose most likely class is correct.
+        miou: intersection over union, averaged over the classes that occur in the truth.
+        miou_predicted: intersection over union, averaged over the classes that are true or
+            predicted somewhere; a class that does not occur counts as 0.
         ece: expected calibration error of the most likely class, 15 bins.
-        brier: Brier score, the squared distance of the probabilities to the class that
-            is there, 0–2.
+        brier: Brier score, squared distance of the probabilities from the true class, 0–2.
         entropy: mean predictive entropy, in nats.
-        mutual_information: mean mutual information of class and member, in nats; not a
-            number for a model without several members.
-        entropy_auroc: how often the entropy is higher in a wrongly than in a rightly
-            classified cell; not a number where all or none are wrong.
-        mutual_information_auroc: the same of mutual information.
+        mutual_information: mean mutual information of class and member, in nats; NaN for a
+            model without several members.
+        entropy_auroc: probability that a misclassified cell has a higher entropy than a
+            correct one; NaN if all cells or no cells are misclassified.
+        mutual_information_auroc: the same for mutual information.
         confusion: cells by true class (row) and most likely class (column), [C][C].
-        reliability: the curve that the ECE sums up: in 15 equal bins of the probability
-            of the most likely class how many `cells` there are, their mean
-            `confidence`, and the `accuracy`, both 0 in an empty bin.
+        reliability: the curve that the ECE summarises: number of `cells`, mean
+            `confidence` and `accuracy` in 15 equal bins of the probability of the most
+            likely class; both are 0 in an empty bin.
         slope_cells: cells by true class and whole degree of slope, [C][90].
-        look_alikes: with classes that look alike merged; None where no two do.
+        look_alikes: quality with look-alike classes merged; None without look-alikes.
     """
 
     accuracy: float
@@ -86,19 +86,20 @@ class ClassQuality:
 
 @dataclass(frozen=True, kw_only=True)
 class TraversabilityQuality:
-    """Quality of predicted distributions of traversability; lower is better but for the
-    last three.
+    """Quality of predicted distributions of traversability.
+
+    Lower is better except for the last three.
 
     Args:
-        rmse_observed: root mean square of E[λ] − λ as realised.
-        rmse_expected: root mean square of E[λ] − E[λ] in truth, of labelled cells; not
-            a number where there is none or the truth is not known.
-        nll: negative log likelihood of λ as realised, density inside (0, 1) and mass at
-            0 and 1; not a number for distributions without a density.
-        crps: continuous ranked probability score of λ as realised.
-        coverage: share of λ in the central 90 % of its prediction; ideally 0.9.
-        tail_rate: share of λ under the VaR at level 0.9; ideally 0.1.
-        pit: cells in 20 equal bins of the randomised PIT; ideally all alike.
+        rmse_observed: root mean square of E[λ] − observed λ.
+        rmse_expected: root mean square of E[λ] − true E[λ] over labelled cells; NaN
+            without such cells or if the truth is not available.
+        nll: negative log-likelihood of observed λ, from the density in (0, 1) and the mass
+            at 0 and 1; NaN for distributions without a density.
+        crps: continuous ranked probability score of observed λ.
+        coverage: fraction of λ in the central 90 % of its prediction; ideally 0.9.
+        tail_rate: fraction of λ below the VaR at level 0.9; ideally 0.1.
+        pit: cells in 20 equal bins of the randomised PIT; ideally equal.
     """
 
     rmse_observed: float
@@ -115,11 +116,11 @@ class Quality:
     """Quality of a model on one split.
 
     Args:
-        maps: how many maps were predicted.
-        traversability: of the distributions.
-        classes: of the class probabilities; empty for a model that predicts no classes,
-            and on maps without any.
-        by_map: what a comparison needs, where it was asked for.
+        maps: number of maps predicted.
+        traversability: quality of the distributions.
+        classes: quality of the class probabilities; empty for a model without classes, and
+            on maps without labels.
+        by_map: sums for a comparison, if requested.
     """
 
     maps: int
@@ -131,39 +132,42 @@ class Quality:
 def choose_splits(
     model: TraversabilityModel, dataset: TerrainDataset, splits: Iterable[str] = ()
 ) -> list[str]:
-    """Tells which splits are to be measured, and refuses what cannot be.
+    """Return the splits to measure, after a check that the model can be measured.
 
     Args:
         model: any model.
         dataset: the maps.
-        splits: which splits; every test split when empty.
+        splits: names of splits; if empty, all test splits.
 
     Raises:
-        DatasetError: there is no such split, or no test split.
-        CheckpointError: the model was trained on another class table.
+        DatasetError: If a split does not exist or there is no test split.
+        CheckpointError: If the model was trained on another class table.
     """
     chosen = known_splits(dataset, splits)
-    if why := class_mismatch(model, dataset.recipe):
-        raise CheckpointError(f"{why}. Train it on a dataset with this class table.")
+    mismatch = class_mismatch(model, dataset.recipe)
+    if mismatch:
+        raise CheckpointError(
+            f"{mismatch}. Train it on a dataset with this class table."
+        )
     return chosen
 
 
 def known_splits(dataset: TerrainDataset, splits: Iterable[str] = ()) -> list[str]:
-    """Tells which splits are to be measured, as `choose_splits`, whatever the model.
+    """Return the splits to measure: those named, or all test splits if none is named.
 
     Raises:
-        DatasetError: there is no such split, or no test split.
+        DatasetError: If a split does not exist or there is no test split.
     """
-    chosen = list(dict.fromkeys(splits)) or [
-        name for name in dataset.splits if name.startswith("test/")
-    ]
+    chosen = list(dict.fromkeys(splits))
+    if not chosen:
+        chosen = [name for name in dataset.splits if name.startswith("test/")]
     if not chosen:
         raise DatasetError(
             f"Expected a test split in {dataset.path}, got {sorted(dataset.splits)}. "
             "Name one in `splits`."
         )
     for split in chosen:
-        dataset.map_count(split)  # refuses an unknown one
+        dataset.map_count(split)  # raises an error if there is no such split
     return chosen
 
 
@@ -174,21 +178,21 @@ def evaluate(
     seed: int = 0,
     device: torch.device = CPU,
 ) -> Iterator[tuple[str, Quality]]:
-    """Measures a model, a split at a time.
+    """Measure a model on several splits.
 
     Args:
         model: any model.
         dataset: the maps.
-        splits: which splits; every test split when empty.
+        splits: names of splits; if empty, all test splits.
         seed: root seed of the draws within atoms.
         device: where to compute.
 
     Yields:
-        Name of the split and the quality on it.
+        Name of a split and the quality on it.
 
     Raises:
-        DatasetError: there is no such split, or no test split.
-        CheckpointError: the model was trained on another class table.
+        DatasetError: If a split does not exist or there is no test split.
+        CheckpointError: If the model was trained on another class table.
     """
     for split in choose_splits(model, dataset, splits):
         yield split, measure_split(model, dataset, split, seed, device)
@@ -202,16 +206,16 @@ def measure_split(
     device: torch.device = CPU,
     by_map: bool = False,
 ) -> Quality:
-    """Measures a model on one split; by its λ alone where it knows other classes than
-    the maps.
+    """Measure a model on one split; only its λ if its class table is not that of the maps.
 
     Args:
         model: any model.
         dataset: the maps.
-        split: which split.
-        seed: root seed of the draws within atoms, the same for every model.
+        split: name of the split.
+        seed: root seed of the draws within atoms, the same for all models.
         device: where to compute.
-        by_map: keep what a comparison needs, which takes quantiles of every cell.
+        by_map: whether to return sums for a comparison, which need quantiles of all
+            cells.
     """
     alike = look_alike_classes(dataset.recipe.classes)
     truth = dataset.truth_of(split) == "generated"
@@ -230,81 +234,88 @@ def measure(
     by_map: bool = False,
     classes: bool = True,
 ) -> Quality:
-    """Measures a model on some maps.
+    """Measure a model on maps.
 
     Args:
         model: any model.
-        chunks: the maps, at least one, a few at a time.
+        chunks: chunks of maps; at least one map.
         generator: of the draws within atoms, on the CPU.
-        alike: of each class those that look like it, itself among them; empty where
-            none do.
-        truth: whether the maps' true distribution of λ is known.
-        by_map: keep what a comparison needs, which takes quantiles of every cell.
-        classes: measure the model's classes, where it tells any.
+        alike: for each class, itself and its look-alikes; empty if there are no
+            look-alikes.
+        truth: whether the true distribution of λ is available.
+        by_map: whether to return sums for a comparison, which need quantiles of all
+            cells.
+        classes: whether to measure the model's classes, if it predicts any.
     """
-    maps = 0
-    tally = _ClassTally(len(model.class_names) if classes else 0, alike)
-    kept = MapTally(tally.count, truth, quantiles=by_map)
+    n_maps = 0
+    class_tally = _ClassTally(len(model.class_names) if classes else 0, alike)
+    map_tally = MapTally(class_tally.count, truth, quantiles=by_map)
+    is_privileged = isinstance(model, PrivilegedModel)
     for terrain in chunks:
+        n_maps += len(terrain)
         predicted, members = _predict(model, terrain)
-        kept.add(
-            _score_cells(
-                predicted, terrain, generator, isinstance(model, PrivilegedModel)
-            ),
-            len(terrain),
-        )
-        maps += len(terrain)
-        if tally.count:
-            probabilities = predicted.class_probabilities(tally.count)
-            tally.add(probabilities, members, terrain.class_id, terrain.slope_deg)
+        cells = _score_cells(predicted, terrain, generator, is_privileged)
+        map_tally.add(cells, len(terrain))
+        if class_tally.count:
+            probabilities = predicted.class_probabilities(class_tally.count)
+            class_tally.add(probabilities, members, terrain.class_id, terrain.slope_deg)
             if by_map:
-                kept.add_classes(probabilities, terrain.class_id)
-    sums = kept.sums() if maps else {}
-    if not maps or not sums["cells"].any():
-        raise DatasetError("Expected maps with an observed λ to measure on, got none.")
+                map_tally.add_classes(probabilities, terrain.class_id)
+    sums = map_tally.sums() if n_maps else {}
+    if not n_maps or not sums["cells"].any():
+        raise DatasetError(
+            "Expected maps with observed λ to measure on, got none. Record λ in some "
+            "cells."
+        )
     values = {name: SCORES[name].value(sums) for name in _OF_CELLS}
+    traversability = TraversabilityQuality(
+        **values,
+        tail_rate=SCORES["tail_rate_90"].value(sums),
+        pit=tuple(map_tally.pit.tolist()),
+    )
     return Quality(
-        maps=maps,
-        traversability=TraversabilityQuality(
-            **values,
-            tail_rate=SCORES["tail_rate_90"].value(sums),
-            pit=tuple(kept.pit.tolist()),
-        ),
-        classes=(tally.quality(),) if tally.confusion.any() else (),
-        by_map=kept if by_map else None,
+        maps=n_maps,
+        traversability=traversability,
+        classes=(class_tally.quality(),) if class_tally.confusion.any() else (),
+        by_map=map_tally if by_map else None,
     )
 
 
 def _predict(
     model: TraversabilityModel, terrain: Terrain
 ) -> tuple[TraversabilityDistribution, Tensor]:
-    """The prediction, and the class probabilities of M members, shape [M, B, C, H, W],
-    M = 0 where there are none.
+    """Return the prediction and the members' class probabilities [M, B, C, H, W].
+
+    M is 0 for a model without members.
     """
     observation = terrain.observe()
     with exact_convolutions():
         members = model.member_probabilities(observation)
-    if isinstance(model, FusedModel) and members is not None:
+    if members is None:
+        return predict(model, terrain), torch.zeros(0)
+    if isinstance(model, FusedModel):
         return model.fuse(members, observation), members
-    return predict(model, terrain), torch.zeros(0) if members is None else members
+    return predict(model, terrain), members
 
 
 class _ClassTally:
-    """Counts of a model's class probabilities over maps, in the cells whose class is
-    known.
+    """Sums of a model's class probabilities over the labelled cells of maps.
 
     Args:
-        count: number of classes C, 0 of a model without any.
-        alike: of each class those that look like it, itself among them; empty where
-            none do.
+        count: number of classes C, 0 for a model without classes.
+        alike: for each class, itself and its look-alikes; empty if there are no
+            look-alikes.
     """
 
     def __init__(self, count: int, alike: Sequence[tuple[int, ...]]) -> None:
-        self.count, self.brier = count, 0.0
+        self.count = count
+        self.brier = 0.0
         self.confusion = torch.zeros(count, count, dtype=torch.int64)
-        self.slope_cells = torch.zeros(count, 90, dtype=torch.int64)
-        self.reliability, self.look_alikes = ReliabilityCurve(), LookAlikeTally(alike)
-        self.entropy, self.information = ErrorRanking(), ErrorRanking()
+        self.slope_cells = torch.zeros(count, _MAX_SLOPE_DEG, dtype=torch.int64)
+        self.reliability = ReliabilityCurve()
+        self.look_alikes = LookAlikeTally(alike)
+        self.entropy = ErrorRanking()
+        self.information = ErrorRanking()
 
     def add(
         self,
@@ -313,31 +324,37 @@ class _ClassTally:
         class_id: Tensor,
         slope_deg: Tensor,
     ) -> None:
-        """Adds maps: probabilities [B, C, H, W], of members [M, B, C, H, W], true
-        classes and slopes [B, H, W].
+        """Add maps.
+
+        Args:
+            probabilities: of the classes, shape [B, C, H, W].
+            members: class probabilities of the members, shape [M, B, C, H, W].
+            class_id: true classes, shape [B, H, W].
+            slope_deg: slopes in degrees, shape [B, H, W].
         """
         labelled = class_id != UNLABELLED
         if not bool(labelled.any()):
             return
+        has_members = len(members) > 1
         if not bool(labelled.all()):
             probabilities = _in_a_row(probabilities[None], labelled)[0]
-            members = _in_a_row(members, labelled) if len(members) > 1 else members
-            class_id, slope_deg = (
-                layer[labelled][None, None] for layer in (class_id, slope_deg)
-            )
-        found = probabilities.argmax(1)
-        wrong = found != class_id
-        self.confusion += multiclass_confusion_matrix(found, class_id, self.count).cpu()
+            if has_members:
+                members = _in_a_row(members, labelled)
+            class_id = class_id[labelled][None, None]
+            slope_deg = slope_deg[labelled][None, None]
+        predicted = probabilities.argmax(1)
+        is_wrong = predicted != class_id
+        confusion = multiclass_confusion_matrix(predicted, class_id, self.count)
+        self.confusion += confusion.cpu()
         self.brier += float(brier_score(probabilities, class_id).double().sum())
         self.reliability.update(probabilities, class_id)
-        self.entropy.update(predictive_entropy(probabilities), wrong)
-        if len(members) > 1:
-            self.information.update(mutual_information(members), wrong)
-        degree = slope_deg.floor().long().clamp(0, 89)
-        counted = torch.bincount(
-            (90 * class_id + degree).flatten(), minlength=self.slope_cells.numel()
-        )
-        self.slope_cells += counted.view_as(self.slope_cells).cpu()
+        self.entropy.update(predictive_entropy(probabilities), is_wrong)
+        if has_members:
+            self.information.update(mutual_information(members), is_wrong)
+        degree = slope_deg.floor().long().clamp(0, _MAX_SLOPE_DEG - 1)
+        index = (_MAX_SLOPE_DEG * class_id + degree).flatten()
+        counts = torch.bincount(index, minlength=self.slope_cells.numel())
+        self.slope_cells += counts.view_as(self.slope_cells).cpu()
         if self.look_alikes.groups:
             self.look_alikes.add(probabilities, class_id)
 
@@ -346,7 +363,13 @@ class _ClassTally:
         entropy, entropy_auroc = self.entropy.compute()
         information, information_auroc = self.information.compute()
         curve = self.reliability.compute()
-        cells, confidence, right = curve.tolist()
+        cells, confidence, bin_accuracy = curve.tolist()
+        reliability = {
+            "cells": tuple(map(int, cells)),
+            "confidence": tuple(confidence),
+            "accuracy": tuple(bin_accuracy),
+        }
+        look_alikes = self.look_alikes.quality() if self.look_alikes.groups else None
         return ClassQuality(
             accuracy=accuracy,
             miou=miou,
@@ -358,56 +381,51 @@ class _ClassTally:
             entropy_auroc=entropy_auroc,
             mutual_information_auroc=information_auroc,
             confusion=tuple(map(tuple, self.confusion.tolist())),
-            reliability={
-                "cells": tuple(map(int, cells)),
-                "confidence": tuple(confidence),
-                "accuracy": tuple(right),
-            },
+            reliability=reliability,
             slope_cells=tuple(map(tuple, self.slope_cells.tolist())),
-            look_alikes=self.look_alikes.quality() if self.look_alikes.groups else None,
+            look_alikes=look_alikes,
         )
 
 
-def _in_a_row(layers: Tensor, which: Tensor) -> Tensor:
-    """Takes N cells out of maps, from [M, B, C, H, W] to [M, 1, C, 1, N]."""
-    return layers.movedim(2, -1)[:, which].movedim(-1, 1)[:, None, :, None]
+def _in_a_row(layers: Tensor, mask: Tensor) -> Tensor:
+    """Select N cells of maps, from [M, B, C, H, W] to [M, 1, C, 1, N]."""
+    return layers.movedim(2, -1)[:, mask].movedim(-1, 1)[:, None, :, None]
 
 
 def _score_cells(
     predicted: TraversabilityDistribution,
     terrain: Terrain,
     generator: torch.Generator,
-    privileged: bool,
+    is_privileged: bool,
 ) -> CellScores | None:
-    """What is said of each cell whose λ was observed, None where there are none.
+    """Score each cell with observed λ; return None if there are no such cells.
 
-    Of a privileged model, which says nothing where no class is known, cells without a
-    class are left out as well.
+    A privileged model predicts labelled cells only, so unlabelled cells are left out.
     """
     labelled = terrain.class_id != UNLABELLED
-    known = ~terrain.traversability.isnan()
-    known = known & labelled if privileged else known
-    if not bool(known.any()):
+    mask = ~terrain.traversability.isnan()
+    if is_privileged:
+        mask = mask & labelled
+    if not bool(mask.any()):
         return None
-    predicted, observed = (
-        predicted.at(known),
-        terrain.traversability[known].unsqueeze(0),
-    )
-    expected, transformed = predicted.mean(), pit(predicted, observed, generator)
-    labelled = labelled[known]
+    labelled = labelled[mask]
+    predicted = predicted.at(mask)
+    observed = terrain.traversability[mask].unsqueeze(0)
+    expected = predicted.mean()
+    transformed = pit(predicted, observed, generator)
+    expected_error = (expected - terrain.truth.at(mask).mean())[0, labelled]
+    scores = {
+        "squares": (expected - observed).double().square(),
+        "nll": -predicted.log_prob(observed).double(),
+        "crps": predicted.crps(observed).double(),
+    }
     return CellScores(
         predicted=predicted,
         observed=observed,
         expected=expected,
         transformed=transformed,
-        maps=known.nonzero()[:, 0],
-        scores={
-            "squares": (expected - observed).double().square(),
-            "nll": -predicted.log_prob(observed).double(),
-            "crps": predicted.crps(observed).double(),
-        },
+        maps=mask.nonzero()[:, 0],
+        scores=scores,
         labelled=labelled,
-        expected_squares=(expected - terrain.truth.at(known).mean())[0, labelled]
-        .double()
-        .square(),
+        expected_squares=expected_error.double().square(),
     )

@@ -1,8 +1,6 @@
-"""Models measured on splits of a dataset, and what a reader of their numbers has to
-know, in lines of text.
-"""
+"""Measurements of models on splits of a dataset, with notes on how to read the numbers."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -20,11 +18,11 @@ from benchnav.models.quality.measure import Quality, measure_split
 
 @dataclass(kw_only=True)
 class Measurement:
-    """What was measured of some models.
+    """Measurements of several models.
 
     Args:
         dataset: the maps.
-        splits: of it.
+        splits: names of its splits.
         seed: root seed of the draws within atoms, the same for all models.
         device: where models are measured.
         qualities: by split and label of the model.
@@ -37,52 +35,53 @@ class Measurement:
     qualities: dict[tuple[str, str], Quality] = field(default_factory=dict)
 
     def measure(
-        self, pairs: Sequence[tuple[str, Candidate]], what: str, by_map: bool
+        self, pairs: Sequence[tuple[str, Candidate]], unit: str, by_map: bool
     ) -> None:
-        """Measure models on splits, with a line of progress.
+        """Measure models on splits, with a progress line.
 
         Args:
             pairs: split and model.
-            what: are counted.
-            by_map: keep what a comparison needs.
+            unit: name of the pairs in the progress line.
+            by_map: whether to store sums for a comparison.
         """
 
         def steps() -> Iterator[tuple[int, int]]:
             yield 0, len(pairs)
-            for count, (split, one) in enumerate(pairs, 1):
+            for count, (split, candidate) in enumerate(pairs, 1):
                 quality = measure_split(
-                    one.model,
+                    candidate.model,
                     self.dataset,
                     split,
                     self.seed,
                     self.device,
                     by_map=by_map,
                 )
-                self.qualities[split, one.label] = quality
+                self.qualities[split, candidate.label] = quality
                 yield count, len(pairs)
 
-        show_progress(steps(), what)
+        show_progress(steps(), unit)
 
-    def of(self, one: Candidate) -> dict[str, Quality]:
+    def of(self, candidate: Candidate) -> dict[str, Quality]:
         """Return the qualities of a model by split."""
         return {
             split: quality
             for (split, label), quality in self.qualities.items()
-            if label == one.label
+            if label == candidate.label
         }
 
     @cached_property
     def nearest_colour_accuracy(self) -> dict[str, float]:
-        """Fraction of the cells whose class the nearest colour tells, by split on which
-        classes were measured.
+        """Fraction of cells that the nearest colour classifies correctly, by split.
+
+        Only splits on which classes were measured.
         """
-        classified = {
+        has_classes = {
             split for (split, _), quality in self.qualities.items() if quality.classes
         }
         return {
             split: baselines.nearest_colour_accuracy(self.dataset, split)
             for split in self.splits
-            if split in classified
+            if split in has_classes
         }
 
     @cached_property
@@ -95,64 +94,59 @@ class Measurement:
 
     @property
     def unknown(self) -> list[str]:
-        """Splits of which the truth is unknown."""
+        """Splits without the true distribution of λ."""
         return [
             split for split in self.splits if self.dataset.truth_of(split) == "unknown"
         ]
 
     @property
     def notes_of_data(self) -> list[str]:
-        """What a reader has to know of the maps."""
+        """Notes on the maps for readers of the numbers."""
         lines = []
-        if by_colour := self.nearest_colour_accuracy:
-            listed = ", ".join(
-                f"{split} {share:.4f}" for split, share in by_colour.items()
-            )
+        if self.nearest_colour_accuracy:
+            accuracies = _listed(self.nearest_colour_accuracy)
             lines.append(
                 "baseline without a model, class of the nearest colour: accuracy "
-                f"{listed}"
+                f"{accuracies}"
             )
-        listed = ", ".join(
-            f"{split} {score:.4f}" for split, score in self.climatology_crps.items()
-        )
         lines.append(
             "baseline without a model, one distribution of λ for all cells: CRPS "
-            f"{listed}"
+            f"{_listed(self.climatology_crps)}"
         )
         if self.unknown:
-            parts = [
-                part
-                for split in self.unknown
-                for part in self.dataset.splits[split]["parts"]
-            ]
-            observed = "λ that the class table drew at least in part, not measured λ"
+            parts = []
+            for split in self.unknown:
+                parts += self.dataset.splits[split]["parts"]
+            observed = "λ drawn at least in part from the class table, not measured λ"
             if all(part.get("source", {}).get("traversability") for part in parts):
                 observed = "measured λ"
             lines.append(
                 f"the true distribution of λ is unknown on {', '.join(self.unknown)}: "
-                "RMSE E[λ] is a dash, and RMSE λ, "
-                f"NLL, CRPS, “in 90 %” and “< VaR” are against {observed}"
+                "RMSE E[λ] is a dash, and RMSE λ, NLL, CRPS, “in 90 %” and “< VaR” are "
+                f"against {observed}"
             )
         return lines
 
-    def notes_of(self, one: Candidate) -> list[str]:
-        """Return warnings of what makes a model's numbers bad or worth nothing."""
-        qualities, warnings = self.of(one), []
-        by_colour, climatology = self.nearest_colour_accuracy, self.climatology_crps
+    def notes_of(self, candidate: Candidate) -> list[str]:
+        """Return warnings if a model's numbers are poor or not meaningful."""
+        qualities = self.of(candidate)
+        warnings = []
         less_accurate = [
             split
             for split, quality in qualities.items()
-            if any(item.accuracy < by_colour[split] for item in quality.classes)
+            for classes in quality.classes
+            if classes.accuracy < self.nearest_colour_accuracy[split]
         ]
         if less_accurate:
             splits = ", ".join(less_accurate)
             warnings.append(
                 f"the model's accuracy is below that of the nearest colour on {splits}"
             )
+        climatology = self.climatology_crps
         worse = [
             split
-            for split, own in qualities.items()
-            if own.traversability.crps > climatology[split]
+            for split, quality in qualities.items()
+            if quality.traversability.crps > climatology[split]
         ]
         if worse:
             splits = ", ".join(worse)
@@ -160,32 +154,33 @@ class Measurement:
                 "the model's CRPS is worse than that of one distribution for all "
                 f"cells on {splits}"
             )
-        seen = [
-            f"{split} (its {one.trained_on[digest]})"
-            for split in qualities
-            # Checkpoints of earlier versions hold the digest of the arrays alone.
-            for digest in (
-                self.dataset.split_digest(split),
-                self.dataset.splits[split]["digest"],
-            )
-            if digest in one.trained_on
-        ]
+        seen = self._seen_splits(candidate, qualities)
         if seen:
             warnings.append(
                 "the model was trained, or selected and calibrated, on the maps of "
-                f"{', '.join(seen)}: these numbers "
-                "do not hold for unseen maps"
+                f"{', '.join(seen)}: these numbers do not hold for unseen maps"
             )
         unknown = [split for split in self.unknown if split in qualities]
-        if unknown and one.needs_truth:
+        if unknown and candidate.needs_truth:
             warnings.append(
-                f"on {', '.join(unknown)} this model gives the class table of the "
-                "recipe, not the truth of the ground"
+                f"on {', '.join(unknown)} this model predicts by the class table of the "
+                "recipe, not by the ground truth"
             )
         return [f"warning: {line}" for line in warnings]
 
-    def about(self, notes: Sequence[str]) -> dict[str, Any]:
-        """Return what JSON files say of maps and machine."""
+    def _seen_splits(self, candidate: Candidate, splits: Iterable[str]) -> list[str]:
+        """Return splits on which a model was trained, with their names in training."""
+        seen = []
+        for split in splits:
+            # Checkpoints of earlier versions contain the digest of the arrays only.
+            array_digest = self.dataset.splits[split]["digest"]
+            for digest in (self.dataset.split_digest(split), array_digest):
+                if digest in candidate.trained_on:
+                    seen.append(f"{split} (its {candidate.trained_on[digest]})")
+        return seen
+
+    def header(self, notes: Sequence[str]) -> dict[str, Any]:
+        """Return the information on maps and machine for JSON files."""
         return {
             "dataset": {"id": self.dataset.id, "digest": self.dataset.digest},
             "seed": self.seed,
@@ -194,3 +189,7 @@ class Measurement:
             "truth": {split: self.dataset.truth_of(split) for split in self.splits},
             "notes": notes,
         }
+
+
+def _listed(values: Mapping[str, float]) -> str:
+    return ", ".join(f"{split} {value:.4f}" for split, value in values.items())

@@ -1,5 +1,5 @@
-"""The files that measures of models are written to: texts, figures, and a page that
-shows and explains them.
+"""Output files of model measurements: texts, figures, and a page that shows and explains
+them.
 """
 
 import json
@@ -25,8 +25,7 @@ class Page:
 
     Args:
         title: of the page.
-        tables: the first stands under the title, before the notes; the others have
-            headings of their own.
+        tables: the first follows the title, before the notes; the others have headings.
         notes: lines.
     """
 
@@ -35,17 +34,17 @@ class Page:
     notes: Sequence[str] = ()
 
     def to_markdown(self, figures: Sequence[tuple[str, str, str]] = ()) -> str:
-        """Write the page in Markdown.
+        """Return the page as Markdown.
 
         Args:
-            figures: path of each image from the page, its title, and what it shows.
+            figures: path of each image relative to the page, its title, and its caption.
         """
-        first, *others = (to_markdown(table).rstrip() for table in self.tables)
-        parts = [f"# {self.title}", first, *self.notes]
-        for table, text in zip(self.tables[1:], others, strict=True):
+        tables = [to_markdown(table).rstrip() for table in self.tables]
+        parts = [f"# {self.title}", tables[0], *self.notes]
+        for table, text in zip(self.tables[1:], tables[1:], strict=True):
             parts += [f"## {table.title}", text]
-        for path, heading, text in figures:
-            parts += [f"![{heading}]({path})", f"**{heading}.** {text}"]
+        for path, title, caption in figures:
+            parts += [f"![{title}]({path})", f"**{title}.** {caption}"]
         return "\n\n".join(parts) + "\n"
 
 
@@ -57,47 +56,49 @@ def write_folder(
     figures: Sequence[Figure],
     data: Any,
 ) -> None:
-    """Write all files of a measurement, in place of figures that are there, and say
-    where they are.
+    """Write all files of a measurement, replace existing figures, and print the paths.
 
     Args:
-        folder: where to.
-        texts: by the name of the file.
-        name: of the file of the page.
-        page: what is shown.
-        figures: each with a name of its own.
-        data: what they are drawn from.
+        folder: output folder.
+        texts: contents by file name.
+        name: file name of the page.
+        page: the page.
+        figures: figures with distinct names.
+        data: argument of the figures.
     """
     for file, text in texts.items():
         write_text(folder / file, text)
     for old in (folder / FIGURES).glob("*.p[nd][gf]"):
         old.unlink()
 
-    def saved() -> Iterator[tuple[int, int]]:
+    def save() -> Iterator[tuple[int, int]]:
         for count, figure in enumerate(figures, 1):
-            save_twice(figure(data), folder / FIGURES / f"{figure.name}.png", dpi=DPI)
+            path = folder / FIGURES / f"{figure.name}.png"
+            save_twice(figure(data), path, dpi=DPI)
             yield count, len(figures)
 
-    show_progress(saved(), "figures")
-    shown = [
+    show_progress(save(), "figures")
+    entries = [
         (f"{FIGURES}/{figure.name}.png", figure.title, figure.caption(data))
         for figure in figures
     ]
-    write_text(folder / name, page.to_markdown(shown))
+    write_text(folder / name, page.to_markdown(entries))
     print(f"wrote {', '.join(texts)}, {name} and {len(figures)} figures in {folder}")
     print(f"columns and figures are explained in {folder / name}")
 
 
-def json_text(about: Mapping[str, Any], splits: Mapping[str, Any]) -> str:
-    """Write what was measured as JSON, with the series of its splits; NaN is null.
+def json_text(header: Mapping[str, Any], splits: Mapping[str, Any]) -> str:
+    """Return a measurement and the series of its splits as JSON; NaN becomes null.
 
     Args:
-        about: what is said of models and data.
-        splits: what was measured of each.
+        header: information on models and data.
+        splits: results by split.
     """
     all_series = {
         scenario: [{"severity": severity, "split": split} for severity, split in pairs]
         for scenario, pairs in find_series(splits).items()
     }
-    text = json.dumps({**about, "splits": splits, "series": all_series}, default=int)
-    return json.dumps(json.loads(text, parse_constant=lambda _: None), indent=1) + "\n"
+    content = {**header, "splits": splits, "series": all_series}
+    text = json.dumps(content, default=int)
+    without_nan = json.loads(text, parse_constant=lambda _: None)
+    return json.dumps(without_nan, indent=1) + "\n"

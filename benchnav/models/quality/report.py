@@ -1,6 +1,4 @@
-"""A model's quality in numbers and words: a table for each kind of file, and what
-columns and figures mean.
-"""
+"""Tables of a model's quality for the terminal, Markdown, JSON and CSV."""
 
 import math
 from collections.abc import Mapping
@@ -19,103 +17,86 @@ from benchnav.stats.tables import Column, cell_of, table_of
 
 
 def quality_table(
-    title: str, qualities: Mapping[str, Quality], whole: bool = False
+    title: str, qualities: Mapping[str, Quality], all_columns: bool = False
 ) -> Table:
-    """Formats the numbers, a row a split; a number that there is not has a dash.
+    """Return the numbers as a table with a row per split; a missing number is a dash.
 
     Args:
-        title: over the table.
+        title: title of the table.
         qualities: by split.
-        whole: with the numbers that a terminal is too narrow for.
+        all_columns: whether to include columns for which a terminal is too narrow.
     """
-    table = pd.DataFrame(
-        [numbers(quality) for quality in qualities.values()], index=list(qualities)
-    )
-    # Those that some split has, and those that the truth or the prediction may lack.
-    kept = table.columns[
-        np.isfinite(table).any() | table.columns.isin(["rmse_expected", "nll"])
-    ]
-    names = [
-        name for name in COLUMNS if name in kept and (whole or name not in FILES_ONLY)
-    ]
-    rows = [
+    rows = [numbers(quality) for quality in qualities.values()]
+    table = pd.DataFrame(rows, index=list(qualities))
+    has_values = np.isfinite(table).any()
+    # These may be missing in every split, and are shown nevertheless.
+    is_optional = table.columns.isin(["rmse_expected", "nll"])
+    available = set(table.columns[has_values | is_optional])
+    if not all_columns:
+        available -= set(FILES_ONLY)
+    names = [name for name in COLUMNS if name in available]
+    cells = [
         {"split": split, "maps": qualities[split].maps, **row}
         for split, row in table[names].to_dict("index").items()
     ]
+    split_meaning = "split of the dataset; maps: the number of its maps."
     columns = [
-        Column(
-            "split\n",
-            cell_of("split"),
-            "split of the dataset; maps: the number of its maps.",
-        ),
+        Column("split\n", cell_of("split"), split_meaning),
         Column("maps\n", cell_of("maps")),
-        *(
-            Column(COLUMNS[name][0], cell_of(name, _number), COLUMNS[name][1])
-            for name in names
-        ),
     ]
-    return table_of(rows, columns, title=title, numbers=True)
+    for name in names:
+        heading, meaning = COLUMNS[name]
+        columns.append(Column(heading, cell_of(name, _number), meaning))
+    return table_of(cells, columns, title=title, numbers=True)
 
 
 def _number(value: float) -> str:
     return NOTHING if math.isnan(value) else f"{value:.4f}"
 
 
-def quality_json(about: Mapping[str, Any], qualities: Mapping[str, Quality]) -> str:
-    """Writes everything that was measured as JSON; a number that there is not is null.
+def quality_json(header: Mapping[str, Any], qualities: Mapping[str, Quality]) -> str:
+    """Return all results as JSON; a missing number is null.
 
     Args:
-        about: what is said of model and data.
+        header: information on model and data.
         qualities: by split.
     """
-    return json_text(
-        about,
-        {
-            split: {"maps": quality.maps, **_everything(quality)}
-            for split, quality in qualities.items()
-        },
-    )
+    splits = {
+        split: {"maps": quality.maps, **_everything(quality)}
+        for split, quality in qualities.items()
+    }
+    return json_text(header, splits)
 
 
 def quality_csv(qualities: Mapping[str, Quality]) -> str:
-    """Writes the numbers as CSV, a row a split, with scenario and severity where it is
-    of a series.
+    """Return the numbers as CSV, a row per split, with scenario and severity in series.
 
-    `std` stands at severity 0 with no scenario, as it begins every series.
+    `std` has severity 0 and no scenario, because every series starts with it.
     """
-    rows: dict[str, dict[str, Any]] = {
-        split: {
-            "split": split,
-            "scenario": "",
-            "maps": quality.maps,
-            **numbers(quality),
-        }
-        for split, quality in qualities.items()
-    }
+    rows: dict[str, dict[str, Any]] = {}
+    for split, quality in qualities.items():
+        rows[split] = {"split": split, "scenario": "", "maps": quality.maps}
+        rows[split] |= numbers(quality)
     for scenario, series in find_series(qualities).items():
         for severity, split in series:
-            rows[split] |= {
-                "scenario": scenario if severity else "",
-                "severity": severity,
-            }
-    table = pd.DataFrame(
-        rows.values(), columns=["split", "scenario", "severity", "maps", *COLUMNS]
-    )
+            rows[split]["scenario"] = scenario if severity else ""
+            rows[split]["severity"] = severity
+    columns = ["split", "scenario", "severity", "maps", *COLUMNS]
+    table = pd.DataFrame(rows.values(), columns=columns)
     if table[LOOK_ALIKES[0]].isna().all():
         table = table.drop(columns=list(LOOK_ALIKES))
-    return table.replace((math.inf, -math.inf), math.nan).to_csv(
-        index=False, float_format="%.6g"
-    )
+    finite = table.replace((math.inf, -math.inf), math.nan)
+    return finite.to_csv(index=False, float_format="%.6g")
 
 
 def numbers(quality: Quality) -> dict[str, float]:
-    """The single numbers of a split's quality by name, in the order of `COLUMNS`."""
+    """Return the scalar results of a split by name, in the order of `COLUMNS`."""
     values = _everything(quality)
     return {name: float(values[name]) for name in COLUMNS if name in values}
 
 
 def _everything(quality: Quality) -> dict[str, Any]:
-    """Everything of a split by name; what is of look-alikes only where there are any."""
+    """Return all results of a split by name; those of look-alikes only if there are any."""
     values: dict[str, Any] = {}
     for item in quality.classes:
         values |= asdict(item)

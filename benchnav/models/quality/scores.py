@@ -1,27 +1,27 @@
-"""Scores of predicted probabilities: of distributions of traversability, of classes,
-and of their uncertainty.
+"""Scores of predictions: distributions of traversability, class probabilities and their
+uncertainty.
 
-Calibration of λ is read off the probability integral transform (PIT) of what was
-observed: uniform when the predicted distributions are right. Where the distribution has
-an atom, as where λ was clipped, the PIT is drawn uniformly within it, so it is uniform
-there too. Sources: Gneiting and Raftery (2007), "Strictly proper scoring rules" (Brier
-score); Czado et al. (2009), "Predictive model assessment for count data" (randomised
-PIT); Guo et al. (2017), "On calibration of modern neural networks" (reliability, ECE).
+Calibration of λ is measured by the probability integral transform (PIT) of the
+observations, which is uniform if the predicted distributions are correct. At an atom of
+the distribution, such as where λ was clipped, the PIT is drawn uniformly within the
+atom, so it is uniform there too. Sources: Gneiting and Raftery (2007), "Strictly proper
+scoring rules, prediction, and estimation" (Brier score); Czado et al. (2009),
+"Predictive model assessment for count data" (randomised PIT); Guo et al. (2017), "On
+calibration of modern neural networks" (reliability, ECE).
 
-The entropy of a prediction is its whole uncertainty. Of an ensemble, the part that its
-members do not share (mutual information of class and member, "BALD") is the epistemic
-one: what more training
-data would settle. In nats. Sources: Houlsby et al. (2011), "Bayesian active learning
+The entropy of a prediction, in nats, is its total uncertainty. For an ensemble, the
+mutual information of class and member ("BALD") is the epistemic part, which more
+training data would reduce. Sources: Houlsby et al. (2011), "Bayesian active learning
 for classification and preference learning"; Lakshminarayanan et al. (2017), "Simple and
 scalable predictive uncertainty estimation using deep ensembles". Sparsification: Ilg et
 al. (2018), "Uncertainty estimates and multi-hypotheses networks for optical flow".
 
-Of classes that look alike, which are shown together, a perfect classifier says 1/2
-each. So accuracy is also given with them merged into one class, and of the shares of
-the single classes within that one whether they are what they should be.
+For two look-alike classes a perfect classifier predicts 1/2 each. Accuracy is therefore
+also computed with look-alikes merged into one class, and the probabilities within the
+merged class are scored separately.
 
-Letters in shapes: M members, B maps, C classes, G look-alikes, H×W cells, *B any
-leading dimensions.
+Letters in shapes: M members, B maps, C classes, G look-alikes, H×W cells, N cells, *B
+any leading dimensions.
 """
 
 import math
@@ -40,10 +40,9 @@ PIT_BINS = 20
 LOWER_FIFTH = tuple(percent / 100 for percent in range(1, 21))
 TAIL_LEVELS = (0.8, 0.9, 0.95)
 
-_DROPPED_BITS = (
-    13  # of a float32's 23 fraction bits: scores that differ by over 0.1 % are distinct
-)
-_PLACES = 2 ** (31 - _DROPPED_BITS)
+# Of a float32's 23 fraction bits: scores that differ by over 0.1 % stay distinct.
+_DROPPED_BITS = 13
+_N_STEPS = 2 ** (31 - _DROPPED_BITS)
 
 
 def pit(
@@ -51,23 +50,23 @@ def pit(
     observed: Tensor,
     generator: torch.Generator,
 ) -> Tensor:
-    """Randomised probability integral transform of what was observed.
+    """Return the randomised probability integral transform of the observations.
 
     Args:
-        distribution: predicted, of shape [*B, H, W].
+        distribution: predictions, of shape [*B, H, W].
         observed: λ in [0, 1], shape [*B, H, W].
         generator: of the draws within atoms, on the CPU.
 
     Returns:
-        Shape [*B, H, W]; uniform on [0, 1] when the prediction is right.
+        Shape [*B, H, W]; uniform on [0, 1] if the predictions are correct.
     """
     lower, upper = distribution.cdf_limits(observed)
-    drawn = torch.rand(observed.shape, generator=generator).to(observed.device)
-    return lower + drawn * (upper - lower)
+    uniform = torch.rand(observed.shape, generator=generator).to(observed.device)
+    return lower + uniform * (upper - lower)
 
 
 def coverage(transformed: Tensor) -> float:
-    """Share of observations in the central interval that should hold 90 % of them.
+    """Return the fraction of observations in the central 90 % interval.
 
     Args:
         transformed: from `pit`, any shape.
@@ -76,9 +75,9 @@ def coverage(transformed: Tensor) -> float:
 
 
 def tail_rate(transformed: Tensor, level: float = LEVEL) -> float:
-    """Share of observations under the VaR at a level α; ideally 1 − α.
+    """Return the fraction of observations below the VaR at level α; ideally 1 − α.
 
-    Where the VaR is 0 or 1 it lies on an atom, and the draw within the atom decides.
+    If the VaR lies on an atom at 0 or 1, the draw within the atom decides.
 
     Args:
         transformed: from `pit`, any shape.
@@ -90,56 +89,58 @@ def tail_rate(transformed: Tensor, level: float = LEVEL) -> float:
 def lower_fifth_and_width(
     distribution: TraversabilityDistribution, observed: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Pinball loss of the lower fifth, and width of the central 90 %.
+    """Return the pinball loss of the lower fifth and the width of the central 90 %.
 
     The loss is the mean over the levels u = 0.01, 0.02, …, 0.20 of max(u·(λ − Q(u)), (u
-    − 1)·(λ − Q(u))), a proper score of these quantiles alone (Koenker and Bassett,
-    1978; Gneiting and Raftery, 2007, 6.1).
+    − 1)·(λ − Q(u))), a proper score of these quantiles only. Sources: Koenker and
+    Bassett (1978), "Regression quantiles"; Gneiting and Raftery (2007), 6.1.
 
     Args:
-        distribution: predicted, of shape [*B, H, W].
+        distribution: predictions, of shape [*B, H, W].
         observed: λ in [0, 1], shape [*B, H, W].
 
     Returns:
         Loss, and Q(0.95) − Q(0.05), each float64, of shape [*B, H, W].
     """
     loss = torch.zeros_like(observed, dtype=torch.float64)
-    low = loss
+    lower = loss
     for level in LOWER_FIFTH:
         quantile = distribution.quantile(level).double()
-        gap = observed - quantile
-        loss = loss + torch.maximum(level * gap, (level - 1) * gap) / len(LOWER_FIFTH)
-        low = quantile if level == 0.05 else low
-    return loss, distribution.quantile(0.95).double() - low
+        error = observed - quantile
+        pinball = torch.maximum(level * error, (level - 1) * error)
+        loss = loss + pinball / len(LOWER_FIFTH)
+        if level == 0.05:
+            lower = quantile
+    return loss, distribution.quantile(0.95).double() - lower
 
 
 def sparsification(error: Tensor, uncertainty: Tensor) -> Tensor:
-    """Mean error of the cells that are left when the most uncertain ones are left out,
-    one after another.
+    """Return the mean error of the remaining cells as uncertain cells are removed.
 
-    Cells whose uncertainty is within 0.1 % of each other count as equally uncertain, so
-    that none of them goes first. The mean of the first row less the second is the area
-    under the sparsification error curve (AUSE): 0 where the uncertainty ranks cells as
-    their errors do.
+    Cells whose uncertainties differ by less than 0.1 % are tied: each counts with their
+    mean error. The mean of the first row minus the second is the area under the
+    sparsification error curve (AUSE). It is 0 if the uncertainty ranks cells as their
+    errors do.
 
     Args:
-        error: of each cell, ≥ 0, shape [N].
-        uncertainty: of each cell, ≥ 0, shape [N].
+        error: error of each cell, ≥ 0, shape [N].
+        uncertainty: uncertainty of each cell, ≥ 0, shape [N].
 
     Returns:
-        Of the 1, 2, …, N least uncertain cells, and of those with the least error,
-        float64, shape [2, N].
+        Mean errors of the 1, 2, …, N least uncertain cells, and of those with the
+        smallest errors, float64, shape [2, N].
     """
     error = error.double()
-    _, member = torch.unique(_in_order(uncertainty), return_inverse=True)
-    cells = torch.bincount(member)
-    tied = torch.bincount(member, error) / cells
-    ranked = torch.stack([tied.repeat_interleave(cells), error.sort().values])
-    return ranked.cumsum(1) / torch.arange(1, len(error) + 1, device=error.device)
+    _, group = torch.unique(_score_step(uncertainty), return_inverse=True)
+    n_tied = torch.bincount(group)
+    tied_error = torch.bincount(group, error) / n_tied
+    ranked = torch.stack([tied_error.repeat_interleave(n_tied), error.sort().values])
+    n_cells = torch.arange(1, len(error) + 1, device=error.device)
+    return ranked.cumsum(1) / n_cells
 
 
 def pit_counts(transformed: Tensor) -> Tensor:
-    """Counts observations in 20 equal bins of the PIT.
+    """Count observations in 20 equal bins of the PIT.
 
     Args:
         transformed: from `pit`, any shape.
@@ -147,101 +148,100 @@ def pit_counts(transformed: Tensor) -> Tensor:
     Returns:
         int64 on the CPU, shape [20].
     """
-    return torch.bincount(
-        _bin(transformed.double(), PIT_BINS), minlength=PIT_BINS
-    ).cpu()
+    bins = _bin(transformed.double(), PIT_BINS)
+    return torch.bincount(bins, minlength=PIT_BINS).cpu()
 
 
 def brier_score(probabilities: Tensor, class_id: Tensor) -> Tensor:
-    """Σ_c (p_c − y_c)² of each cell, y being 1 at the class that is there (Brier,
-    1950).
+    """Return Σ_c (p_c − y_c)² of each cell, with y = 1 at the true class.
+
+    Source: Brier (1950), "Verification of forecasts expressed in terms of probability".
 
     Args:
         probabilities: shape [B, C, H, W].
         class_id: true classes, int64, shape [B, H, W].
 
     Returns:
-        In [0, 2], shape [B, H, W].
+        Scores in [0, 2], shape [B, H, W].
     """
-    right = probabilities.gather(1, class_id.unsqueeze(1)).squeeze(1)
-    return probabilities.square().sum(1) - 2 * right + 1
+    true_probability = probabilities.gather(1, class_id.unsqueeze(1)).squeeze(1)
+    return probabilities.square().sum(1) - 2 * true_probability + 1
 
 
 def class_scores(confusion: Tensor) -> tuple[float, float, float]:
-    """Scores of the most likely classes.
+    """Return accuracy and mean intersection over union of the most likely classes.
 
     Args:
         confusion: cells by true class (row) and most likely class (column), int64,
             shape [C, C].
 
     Returns:
-        Accuracy; intersection over union in the mean over the classes that occur in
-        truth; and over those that are true or predicted somewhere.
+        Accuracy; intersection over union averaged over the classes that occur in the
+        truth; and averaged over the classes that are true or predicted somewhere.
     """
-    hits, true = confusion.diagonal().float(), confusion.float().sum(1)
-    either = true + confusion.float().sum(0) - hits
-    overlap = torch.where(either > 0, hits / either, 0.0)
-    accuracy = confusion.diagonal().sum() / confusion.sum()
-    return (
-        float(accuracy),
-        float(overlap[true > 0].mean()),
-        float((overlap / (either > 0).sum()).sum()),
-    )
+    hits = confusion.diagonal().float()
+    true = confusion.float().sum(1)
+    union = true + confusion.float().sum(0) - hits
+    overlap = torch.where(union > 0, hits / union, 0.0)
+    accuracy = float(confusion.diagonal().sum() / confusion.sum())
+    miou = float(overlap[true > 0].mean())
+    miou_predicted = float((overlap / (union > 0).sum()).sum())
+    return accuracy, miou, miou_predicted
 
 
 class ReliabilityCurve:
-    """How often the most likely class is right, by how likely it was said to be, in 15
-    equal bins.
+    """Accuracy of the most likely class by its probability, in 15 equal bins.
 
-    Unlike torchmetrics' calibration error it keeps sums a bin rather than every cell.
+    Unlike torchmetrics' calibration error it stores sums per bin, not all cells.
     """
 
     def __init__(self) -> None:
-        """Starts with no cells."""
+        """Start without cells."""
         self.sums = torch.zeros(3, CONFIDENCE_BINS, dtype=torch.float64)
 
     def update(self, probabilities: Tensor, class_id: Tensor) -> None:
-        """Adds maps: class probabilities [B, C, H, W] and true classes [B, H, W]."""
-        confidence, found = probabilities.max(1)
-        terms = (
-            torch.stack([torch.ones_like(confidence), confidence, found == class_id])
-            .double()
-            .flatten(1)
-        )
-        self.sums.index_add_(1, _bin(confidence, CONFIDENCE_BINS).cpu(), terms.cpu())
+        """Add maps: class probabilities [B, C, H, W] and true classes [B, H, W]."""
+        confidence, predicted = probabilities.max(1)
+        is_correct = predicted == class_id
+        terms = torch.stack([torch.ones_like(confidence), confidence, is_correct])
+        bins = _bin(confidence, CONFIDENCE_BINS).cpu()
+        self.sums.index_add_(1, bins, terms.double().flatten(1).cpu())
 
     def compute(self) -> Tensor:
-        """Cells, mean confidence and accuracy of each bin, float64, shape [3, 15]; 0 in
-        empty bins.
+        """Return cells, mean confidence and accuracy per bin, float64, shape [3, 15].
+
+        Confidence and accuracy are 0 in empty bins.
         """
-        cells, confidence, right = self.sums
-        filled = cells.clamp(min=1)
-        return torch.stack([cells, confidence / filled, right / filled])
+        cells, confidence, correct = self.sums
+        n_cells = cells.clamp(min=1)
+        return torch.stack([cells, confidence / n_cells, correct / n_cells])
 
 
 def calibration_error(curve: Tensor) -> float:
-    """Expected calibration error: |accuracy − confidence| averaged over cells.
+    """Return the expected calibration error: |accuracy − confidence| over cells.
 
     Args:
         curve: of `ReliabilityCurve`, shape [3, 15].
     """
     cells, confidence, accuracy = curve
-    return float((cells * (accuracy - confidence).abs()).sum() / cells.sum())
+    gaps = (accuracy - confidence).abs()
+    return float((cells * gaps).sum() / cells.sum())
 
 
 def _bin(values: Tensor, count: int) -> Tensor:
-    """The bin of each value among equal ones of [0, 1], int64, shape [N]."""
+    """Return the bin of each value among equal bins of [0, 1], int64, shape [N]."""
     return (values * count).floor().long().clamp(0, count - 1).flatten()
 
 
-def _in_order(score: Tensor) -> Tensor:
-    """The place of each score ≥ 0 in steps of 0.1 %, int64, of the same shape."""
-    # The bits of a float ≥ 0, read as an integer, are in the order of the floats.
-    return score.float().clamp(min=0).abs().view(torch.int32).long() >> _DROPPED_BITS
+def _score_step(score: Tensor) -> Tensor:
+    """Return scores ≥ 0 in steps of 0.1 %, int64, of the same shape."""
+    # The bits of floats ≥ 0, read as integers, are in the order of the floats.
+    bits = score.float().clamp(min=0).abs().view(torch.int32)
+    return bits.long() >> _DROPPED_BITS
 
 
 def predictive_entropy(probabilities: Tensor) -> Tensor:
-    """Entropy −Σ_c p_c ln p_c of the class in each cell.
+    """Return the entropy −Σ_c p_c ln p_c of the class in each cell.
 
     Args:
         probabilities: summing to 1 over C, shape [*B, C, H, W].
@@ -253,72 +253,71 @@ def predictive_entropy(probabilities: Tensor) -> Tensor:
 
 
 def mutual_information(member_probabilities: Tensor) -> Tensor:
-    """Mutual information of class and member: the entropy of the mean less the mean of
-    the entropies.
+    """Return the mutual information of class and member of an ensemble.
+
+    It is the entropy of the mean minus the mean of the entropies.
 
     Args:
-        member_probabilities: of M equally trusted members, shape [M, B, C, H, W].
+        member_probabilities: of M members with equal weights, shape [M, B, C, H, W].
 
     Returns:
-        Nats in [0, ln min(M, C)], 0 where all members agree, shape [B, H, W].
+        Nats in [0, ln min(M, C)], 0 if all members agree, shape [B, H, W].
     """
     members = member_probabilities.double()
-    shared = predictive_entropy(members).mean(0)
-    return (
-        (predictive_entropy(members.mean(0)) - shared)
-        .clamp(min=0)
-        .to(member_probabilities.dtype)
-    )
+    mean_entropy = predictive_entropy(members).mean(0)
+    information = predictive_entropy(members.mean(0)) - mean_entropy
+    return information.clamp(min=0).to(member_probabilities.dtype)
 
 
 class ErrorRanking:
-    """A measure of uncertainty over cells: its mean, and its AUROC as a sign of error.
+    """A measure of uncertainty over cells: its mean, and its AUROC as an indicator of errors.
 
-    That is how often a wrong cell has a higher one than a right cell. Measures are
-    counted by size in steps of 0.1 %, fine at every scale, so memory is bounded however
-    many cells there are; a tie counts half. torchmetrics' AUROC would need 262 144
-    thresholds for the same, all of which it goes through for each batch.
+    The AUROC is the probability that a misclassified cell has a higher value than a correct
+    one; a tie counts half. Values are counted in relative steps of 0.1 %, so memory does
+    not grow with the number of cells. torchmetrics' AUROC would need 262 144 thresholds for
+    this resolution, and would loop over all of them for each batch.
     """
 
     def __init__(self) -> None:
-        """Starts with no cells."""
-        self.counts = torch.zeros(2, _PLACES, dtype=torch.int64)
+        """Start without cells."""
+        self.counts = torch.zeros(2, _N_STEPS, dtype=torch.int64)
         self.total = 0.0
 
     def update(self, score: Tensor, wrong: Tensor) -> None:
-        """Adds cells: scores ≥ 0, and whether each is wrongly classified, of one shape."""
-        counted = torch.bincount(
-            (_in_order(score) + wrong * _PLACES).flatten(), minlength=2 * _PLACES
-        )
-        self.counts += counted.view(2, _PLACES).cpu()
+        """Add cells: scores ≥ 0, and a mask of misclassified cells, of one shape."""
+        index = (_score_step(score) + wrong * _N_STEPS).flatten()
+        counts = torch.bincount(index, minlength=2 * _N_STEPS)
+        self.counts += counts.view(2, _N_STEPS).cpu()
         self.total += float(score.double().sum())
 
     def compute(self) -> tuple[float, float]:
-        """The mean, and the AUROC; neither is a number where there are no cells.
+        """Return the mean and the AUROC; both are NaN without cells.
 
-        The AUROC is in [0, 1], 0.5 for a score that tells nothing; not a number where
-        all or none are wrong.
+        The AUROC is in [0, 1], and 0.5 for a score without information. It is NaN if all
+        cells or no cells are misclassified.
         """
-        right, wrong = self.counts.double()
-        lower = right.cumsum(0) - right / 2
-        auroc = (wrong * lower).sum() / (right.sum() * wrong.sum())
-        cells = int(self.counts.sum())
-        return self.total / cells if cells else math.nan, float(auroc)
+        correct, wrong = self.counts.double()
+        n_lower = correct.cumsum(0) - correct / 2
+        auroc = (wrong * n_lower).sum() / (correct.sum() * wrong.sum())
+        n_cells = int(self.counts.sum())
+        mean = self.total / n_cells if n_cells else math.nan
+        return mean, float(auroc)
 
 
 @dataclass(frozen=True, kw_only=True)
 class LookAlikeQuality:
-    """Quality of class probabilities where classes look alike.
+    """Quality of class probabilities with respect to look-alike classes.
 
     Args:
-        look_alike_accuracy: share of cells whose most likely class is right,
-            look-alikes merged into one.
-        look_alike_miou: intersection over union, look-alikes merged, averaged over the
-            classes that occur in truth.
-        look_alike_share_error: over the cells of classes with look-alikes, mean
-            distance of the share of the true class within them to that which a perfect
-            classifier says: 1/2 of two.
-        look_alike_share_ece: expected calibration error of the larger share, 15 bins.
+        look_alike_accuracy: fraction of cells whose most likely class is correct, with
+            look-alikes merged into one class.
+        look_alike_miou: intersection over union with look-alikes merged, averaged over
+            the classes that occur in the truth.
+        look_alike_share_error: mean distance, over the cells of look-alike classes, of the
+            true class's fraction of the group's probability from that of a perfect
+            classifier: 1/2 for two.
+        look_alike_share_ece: expected calibration error of the largest of these fractions,
+            15 bins.
     """
 
     look_alike_accuracy: float
@@ -328,53 +327,55 @@ class LookAlikeQuality:
 
 
 class LookAlikeTally:
-    """Counts of class probabilities over maps, look-alikes merged.
+    """Sums over maps for the quality of look-alike classes.
 
     Args:
-        alike: of each class those that look like it, itself among them; empty where
-            none do.
+        alike: for each class, itself and its look-alikes; empty if there are no
+            look-alikes.
     """
 
     def __init__(self, alike: Sequence[tuple[int, ...]]) -> None:
-        """Starts with no cells."""
-        self.groups = sorted({own for own in alike if len(own) > 1})
-        names = sorted({min(own) for own in alike})
-        self.merged = torch.tensor([names.index(min(own)) for own in alike])
-        self.size = max(2, len(names))  # of fewer there are no scores
+        """Start without cells."""
+        self.groups = sorted({group for group in alike if len(group) > 1})
+        first_classes = sorted({min(group) for group in alike})
+        merged = [first_classes.index(min(group)) for group in alike]
+        self.merged = torch.tensor(merged)
+        self.size = max(2, len(first_classes))  # scores need two classes
         self.confusion = torch.zeros(self.size, self.size, dtype=torch.int64)
         self.curve = ReliabilityCurve()
-        self.distance, self.cells = 0.0, 0
+        self.distance = 0.0
+        self.cells = 0
 
     def add(self, probabilities: Tensor, class_id: Tensor) -> None:
-        """Adds maps: class probabilities [B, C, H, W] and true classes [B, H, W]."""
-        kinds = self.merged.to(class_id.device)
+        """Add maps: class probabilities [B, C, H, W] and true classes [B, H, W]."""
+        merged_id = self.merged.to(class_id.device)
         merged = torch.zeros_like(probabilities[:, :1]).repeat(1, self.size, 1, 1)
-        merged.index_add_(1, kinds, probabilities)
-        self.confusion += multiclass_confusion_matrix(
-            merged.argmax(1), kinds[class_id], self.size
-        ).cpu()
+        merged.index_add_(1, merged_id, probabilities)
+        confusion = multiclass_confusion_matrix(
+            merged.argmax(1), merged_id[class_id], self.size
+        )
+        self.confusion += confusion.cpu()
         for group in self.groups:
-            match = class_id.unsqueeze(-1) == torch.tensor(
-                group, device=class_id.device
-            )  # [B, H, W, G]
-            here = match.any(-1)
-            own = probabilities[:, list(group)].movedim(1, -1)[here].double()  # [N, G]
-            total = own.sum(1, keepdim=True)
-            shares = torch.where(total > 0, own / total, 1 / len(group))
-            place = match[here].int().argmax(1)
-            right = shares.gather(1, place.unsqueeze(1))
-            self.distance += float((right - 1 / len(group)).abs().sum())
-            self.cells += len(shares)
-            self.curve.update(shares.T[None, :, None], place[None, None])
+            members = torch.tensor(group, device=class_id.device)
+            is_member = class_id.unsqueeze(-1) == members  # [B, H, W, G]
+            mask = is_member.any(-1)
+            group_probabilities = probabilities[:, list(group)].movedim(1, -1)
+            joint = group_probabilities[mask].double()  # [N, G]
+            total = joint.sum(1, keepdim=True)
+            fractions = torch.where(total > 0, joint / total, 1 / len(group))
+            true_index = is_member[mask].int().argmax(1)
+            true_fraction = fractions.gather(1, true_index.unsqueeze(1))
+            self.distance += float((true_fraction - 1 / len(group)).abs().sum())
+            self.cells += len(fractions)
+            self.curve.update(fractions.T[None, :, None], true_index[None, None])
 
     def quality(self) -> LookAlikeQuality:
-        """What was counted; the shares are not a number where no look-alike occurred."""
+        """Return the quality; fractions are NaN if no look-alike occurred."""
         accuracy, miou, _ = class_scores(self.confusion)
+        error = self.distance / self.cells if self.cells else math.nan
         return LookAlikeQuality(
             look_alike_accuracy=accuracy,
             look_alike_miou=miou,
-            look_alike_share_error=self.distance / self.cells
-            if self.cells
-            else math.nan,
+            look_alike_share_error=error,
             look_alike_share_ece=calibration_error(self.curve.compute()),
         )

@@ -1,7 +1,7 @@
-"""Scores of models that follow from sums over maps (`map_sums`): how they are computed,
-and which way is better.
+"""Scores of models as functions of sums over maps (`map_sums`), and the direction that is
+better.
 
-Headings and meanings are those of `columns`, which the tables of one model have too.
+Headings and meanings are those of `columns`, shared with the tables of a single model.
 """
 
 from typing import Any
@@ -16,36 +16,33 @@ _COMPARED = {
     "pinball": (
         "pinball\nfifth",
         "pinball loss of the lower fifth: u·(λ − Q(u)) where λ is at least the "
-        "quantile Q(u), else (1 − u)·(Q(u) − λ), "
-        "averaged over the levels u = 0.01, 0.02, …, 0.20. It scores the bad end of "
-        "the prediction; lower is better.",
+        "quantile Q(u), otherwise (1 − u)·(Q(u) − λ), averaged over the levels u = "
+        "0.01, 0.02, …, 0.20. It scores the lower tail of the prediction; lower is "
+        "better.",
     ),
     "width": (
         "width\n90 %",
         "sharpness: mean width Q(0.95) − Q(0.05) of the central 90 % interval; "
-        "narrower is better where “in 90 %” is "
-        "right.",
+        "narrower is better if “in 90 %” is calibrated.",
     ),
     "tail_error": (
         "tail\nerror",
-        "tail calibration: mean gap between the share of observed λ below VaR₀.₈, "
-        "VaR₀.₉ and VaR₀.₉₅, and 0.2, 0.1 and "
-        "0.05; 0 is perfect.",
+        "tail calibration: mean gap between the fractions of observed λ below VaR₀.₈, "
+        "VaR₀.₉ and VaR₀.₉₅, and 0.2, 0.1 and 0.05; 0 is perfect.",
     ),
     "ause": (
         "AUSE\n",
         "area under the sparsification error curve: cells are removed by uncertainty, "
-        "and by error; the area between "
-        "the two curves of the mean error |λ − E[λ]| of the rest is averaged over "
-        "maps. 0 is perfect; noise of the "
-        "ground keeps any model above it.",
+        "and by error; the area between the two curves of the mean error |λ − E[λ]| "
+        "of the remaining cells is averaged over maps. 0 is perfect; noise of λ keeps "
+        "any model above it.",
     ),
 }
 _UNDER = {level: f"under_{round(100 * level)}" for level in TAIL_LEVELS}
 
 
-def _ratio(part: np.ndarray, whole: np.ndarray) -> np.ndarray:
-    quotient: np.ndarray = part.sum(-1) / whole.sum(-1)
+def _ratio(numerator: np.ndarray, denominator: np.ndarray) -> np.ndarray:
+    quotient: np.ndarray = numerator.sum(-1) / denominator.sum(-1)
     return quotient
 
 
@@ -53,23 +50,19 @@ def _root(squares: np.ndarray, cells: np.ndarray) -> np.ndarray:
     return np.sqrt(_ratio(squares, cells))
 
 
-def _miou(hits: np.ndarray, true: np.ndarray, found: np.ndarray) -> np.ndarray:
-    """Return the intersection over union, averaged over the classes that occur in
-    truth.
-    """
-    union = true + found - hits
+def _miou(hits: np.ndarray, true: np.ndarray, predicted: np.ndarray) -> np.ndarray:
+    """Return the intersection over union, averaged over classes that occur in truth."""
+    union = true + predicted - hits
     overlap: np.ndarray = np.where(true > 0, hits / np.where(union > 0, union, 1), 0.0)
     mean: np.ndarray = overlap.sum(-1) / (true > 0).sum(-1)
     return mean
 
 
 def _tail_error(cells: np.ndarray, *under: np.ndarray) -> np.ndarray:
-    """Return by how far the fractions of λ under the VaR at each level are from 1 −
-    level, on average.
-    """
+    """Return the mean distance of the fractions of λ below each VaR from 1 − level."""
     gaps = [
-        abs(_ratio(part, cells) - (1 - level))
-        for part, level in zip(under, TAIL_LEVELS, strict=True)
+        abs(_ratio(count, cells) - (1 - level))
+        for count, level in zip(under, TAIL_LEVELS, strict=True)
     ]
     return np.mean(gaps, axis=0)
 
@@ -89,7 +82,7 @@ def _score(
     )
 
 
-# Of the width neither way is better: a narrow interval is good only if it covers λ.
+# The width has no better direction: a narrow interval is good only if it covers λ.
 COMPARED = (
     _score("accuracy", "hits", "true", better="higher"),
     _score("miou", "hits", "true", "found", of=_miou, better="higher"),
@@ -103,7 +96,7 @@ COMPARED = (
     _score("tail_error", "cells", *_UNDER.values(), of=_tail_error),
     _score("ause", "areas", "cells"),
 )
-# Fractions of λ under the VaR at each level, which `tail_error` sums up.
+# Fractions of λ below the VaR at each level, which `tail_error` summarises.
 TAIL_RATES = tuple(
     _score(f"tail_rate_{round(100 * level)}", part, "cells", better="")
     for level, part in _UNDER.items()

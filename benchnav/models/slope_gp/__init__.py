@@ -1,3 +1,3 @@
-"""Traversability over slope, class by class: Gaussian processes and soft spots, and the
-cells they learn from.
+"""Traversability as a function of slope per class: Gaussian processes, soft spots and
+their training cells.
 """

@@ -1,10 +1,10 @@
-"""A robot's own slip logs, what the class-wise GPs learn from beside maps.
+"""Slip logs of a robot: training data of the class-wise GPs besides maps.
 
-They are tables with a row for each place driven over, CSV, TSV or Parquet. Columns:
-`class` (a class's name, or its integer id), `slope_deg` (0–90) and `traversability` (λ,
-0–1; 1 minus the slip ratio where the robot holds its commanded speed), and perhaps
-`drive` (its name). Others are ignored, and so are rows in which slope or traversability
-is missing.
+A log is a table (CSV, TSV or Parquet) with one row per location driven over. Columns:
+`class` (name or integer id), `slope_deg` (0–90), `traversability` (λ, 0–1; 1 minus the
+slip ratio if the robot maintains its commanded speed), and optionally `drive` (its
+name). Other columns are ignored, and so are rows whose slope or traversability is
+missing.
 """
 
 import hashlib
@@ -29,20 +29,21 @@ from benchnav.models.slope_gp.cells import Cells
 
 _LIMITS = {"slope_deg": (0, 90), "traversability": (0, 1)}
 COLUMNS = ("class", *_LIMITS)
-_ENOUGH = 20  # rows of which some would be steeper than 1.6° if slopes were in degrees
-_MOST_CLASSES = 256  # class ids are stored in a byte
+# From this many rows on, some slope in degrees would exceed 1.6°.
+_MIN_ROWS_TO_CHECK_UNIT = 20
+_MAX_CLASSES = 256  # class ids are stored in a byte
 
 
 class SlipLogs(NamedTuple):
-    """What is learned from of a slip log.
+    """Training data of a slip log.
 
     Args:
         class_names: the class table.
-        cells: the rows with a slope and a traversability, in order, under the ids of
-            that table.
+        cells: rows with a slope and a traversability, in order; `class_id` indexes the
+            class table.
         digest: SHA-256 of the file.
-        drive: number of the drive of each of these rows, int64, shape [N]; None where
-            the log does not tell drives.
+        drive: index of the drive of each of these rows, int64, shape [N]; None if the
+            log has no drives.
     """
 
     class_names: tuple[str, ...]
@@ -52,18 +53,18 @@ class SlipLogs(NamedTuple):
 
 
 def read_slip_logs(path: str | Path, class_names: tuple[str, ...] = ()) -> SlipLogs:
-    """Reads a slip log.
+    """Read a slip log.
 
     Args:
         path: a file that ends in one of `ENDINGS`.
-        class_names: the class table, into which integer ids of the log are indices.
-            Where none is given it is that of
-            the log: its classes in alphabetical order; for integer ids "0", "1", … up
-                to the largest.
+        class_names: the class table, which integer ids of the log index. If empty, it
+            is derived from the log: its class names in alphabetical order, or "0",
+            "1", … up to the largest integer id.
 
     Raises:
-        DatasetError: there is no such file, it cannot be read, lacks a column or rows,
-            has a class that the table lacks, or a value is no number or out of range.
+        DatasetError: If the file does not exist, cannot be read, or has no usable
+            rows; if a column is missing; if a class is not in the table; or if a
+            value is not numeric or out of range.
     """
     path = Path(path)
     rows = read_log(path)
@@ -73,69 +74,67 @@ def read_slip_logs(path: str | Path, class_names: tuple[str, ...] = ()) -> SlipL
     observed = rows.dropna(subset=list(_LIMITS))
     if observed.empty:
         raise DatasetError(
-            f"Expected rows with a slope and a traversability in {path}, got none "
-            f"among {len(rows)}. "
-            "Log places that the robot has driven over."
+            f"Expected rows with a slope and a traversability in {path}, got 0 of "
+            f"{len(rows)}. Log locations that the robot has driven over."
         )
     steepest = observed["slope_deg"].max()
-    if 0 < steepest <= np.pi / 2 and len(observed) >= _ENOUGH:
+    is_checked = len(observed) >= _MIN_ROWS_TO_CHECK_UNIT
+    if is_checked and 0 < steepest <= np.pi / 2:
         raise DatasetError(
             f"Expected `slope_deg` in degrees in {path}, got at most {steepest:.4g} "
-            f"in {len(observed)} rows, as of "
-            "radians. Multiply radians by 57.2958. Ground that level in degrees looks "
-            "the same: log steeper too."
+            f"in {len(observed)} rows, as in radians. Multiply radians by 57.2958. If "
+            "the slopes are in degrees, log steeper terrain too."
         )
     class_names, class_id = _read_classes(observed, path, class_names)
-    slope, value = (
-        torch.from_numpy(observed[name].to_numpy(np.float32)) for name in _LIMITS
-    )
+    slope = torch.from_numpy(observed["slope_deg"].to_numpy(np.float32))
+    value = torch.from_numpy(observed["traversability"].to_numpy(np.float32))
     cells = Cells(class_id=class_id, slope_deg=slope, traversability=value)
     drive = None
     if "drive" in observed:
-        drive = torch.from_numpy(
-            np.unique(read_names(observed, "drive", path), return_inverse=True)[1]
-        )
-    return SlipLogs(
-        class_names, cells, hashlib.sha256(path.read_bytes()).hexdigest(), drive
-    )
+        drive_names = read_names(observed, "drive", path)
+        drive_index = np.unique(drive_names, return_inverse=True)[1]
+        drive = torch.from_numpy(drive_index)
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    return SlipLogs(class_names, cells, digest, drive)
 
 
 def _read_classes(
     rows: pd.DataFrame, path: Path, names: tuple[str, ...]
 ) -> tuple[tuple[str, ...], Tensor]:
-    """Gives the class table, that of the log where it has no names yet, and the id of
-    each row.
-    """
-    found = read_names(rows, "class", path)
-    # pandas writes ids so where some are missing: 0.0
-    if all(re.fullmatch(r"\d+(\.\d*)?", name, re.ASCII) for name in found):
-        ids = found.astype(float)
-        if len(broken := found[ids % 1 > 0]):
+    """Return the class table (of the log if `names` is empty) and the id of each row."""
+    labels = read_names(rows, "class", path)
+    log_classes: Any
+    # pandas writes an integer id as 0.0 in a column with missing values.
+    if all(re.fullmatch(r"\d+(\.\d*)?", label, re.ASCII) for label in labels):
+        class_ids = labels.astype(float)
+        fractional = labels[class_ids % 1 > 0]
+        if len(fractional):
             raise DatasetError(
-                f"Expected class ids as whole numbers in {path}, got {broken[0]}. "
-                "Number or name the classes."
+                f"Expected class ids as whole numbers in {path}, got {fractional[0]}. "
+                "Use integer ids or names for the classes."
             )
-        count = int(ids.max()) + 1
-        own: Any = range(count)
-        if names and count > len(names):
+        n_classes = int(class_ids.max()) + 1
+        log_classes = range(n_classes)
+        if names and n_classes > len(names):
             raise DatasetError(
                 f"Expected class ids in 0–{len(names) - 1} in the slip log, got "
-                f"{count - 1}. "
-                "Number the classes as in the class table."
+                f"{n_classes - 1}. Number the classes as in the class table."
             )
     else:
-        own = np.unique(found)
-        count = len(own)
-        if names and (others := [name for name in own if name not in names]):
-            near = hint(others[0], names) or " Name classes as in the class table."
+        log_classes = np.unique(labels)
+        n_classes = len(log_classes)
+        unknown = [name for name in log_classes if name not in names]
+        if names and unknown:
+            remedy = hint(unknown[0], names) or " Name classes as in the class table."
             raise DatasetError(
                 f"Expected classes among {', '.join(names)} in the slip log, got "
-                f"{str(others[0])!r}.{near}"
+                f"{str(unknown[0])!r}.{remedy}"
             )
-        ids = pd.Index(names or own).get_indexer(found)
-    if count > _MOST_CLASSES:
+        class_ids = pd.Index(names or log_classes).get_indexer(labels)
+    if n_classes > _MAX_CLASSES:
         raise DatasetError(
-            f"Expected at most {_MOST_CLASSES} classes in {path}, got {count}. Number "
-            "classes from 0."
+            f"Expected at most {_MAX_CLASSES} classes in {path}, got {n_classes}. "
+            "Number classes from 0."
         )
-    return names or tuple(map(str, own)), torch.from_numpy(ids.astype(np.int64))
+    class_names = names or tuple(map(str, log_classes))
+    return class_names, torch.from_numpy(class_ids.astype(np.int64))

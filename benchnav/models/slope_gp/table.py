@@ -1,11 +1,10 @@
-"""The class-wise GPs as tables over slope: what prediction reads instead of computing
-them again.
+"""Class-wise GPs as tables over slope, which prediction reads instead of evaluating the
+GPs.
 
-Between nodes the tables are linear; for a function g that is off by at most
-h²/8·max|g''| on the step h = 0.1°. `tabulation_error` in the tests bounds |g''|, and
-with it the error, from the parameters
-of the GPs: under 10⁻⁴ for those fitted to the shipped maps, and growing with h².
-Letters in shapes: C classes, G nodes, *B any leading dimensions, H×W cells.
+The tables are linear between nodes. For a function g the error is at most h²/8·max|g''|
+at step h = 0.1°. `tabulation_error` in the tests bounds |g''|, and so the error, from
+the parameters of the GPs: below 10⁻⁴ for those fitted to the shipped maps. Letters in
+shapes: C classes, G nodes, *B any leading dimensions, H×W cells.
 """
 
 from dataclasses import dataclass
@@ -22,20 +21,19 @@ STEEPEST_DEG = 90.0
 
 
 def table_slopes() -> Tensor:
-    """The nodes 0°, 0.1°, …, 90°, float64, shape [G]."""
-    return torch.linspace(
-        0, STEEPEST_DEG, round(STEEPEST_DEG / STEP_DEG) + 1, dtype=torch.float64
-    )
+    """Return the nodes 0°, 0.1°, …, 90°, float64, shape [G]."""
+    n_nodes = round(STEEPEST_DEG / STEP_DEG) + 1
+    return torch.linspace(0, STEEPEST_DEG, n_nodes, dtype=torch.float64)
 
 
 class SoftModes(NamedTuple):
-    """A second mode of each class's traversability, the same at any slope.
+    """A second mode of each class's traversability, independent of slope.
 
     Args:
-        weight: share of the class's cells, in [0, 1), 0 for a class without one; shape
-            [C].
-        mean: λ there before clipping, shape [C].
-        std: its standard deviation, > 0, shape [C].
+        weight: fraction of the class's cells, in [0, 1), 0 for a class without a second
+            mode; shape [C].
+        mean: mean λ of the mode before clipping, shape [C].
+        std: standard deviation of the mode before clipping, > 0, shape [C].
     """
 
     weight: Tensor
@@ -49,9 +47,9 @@ class SlopeTable:
 
     Args:
         mean: latent mean, shape [C, G].
-        std: of the latent function and the noise together, shape [C, G].
-        noise_std: of the noise alone, shape [C].
-        soft: the second modes; None where no class has one.
+        std: standard deviation of latent function plus noise, shape [C, G].
+        noise_std: standard deviation of the noise only, shape [C].
+        soft: the second modes; None if no class has one.
     """
 
     mean: Tensor
@@ -60,68 +58,65 @@ class SlopeTable:
     soft: SoftModes | None = None
 
     def __post_init__(self) -> None:
-        """Checks shapes and values."""
-        is_finite = all(
-            bool(values.isfinite().all()) for values in self.to_tensors().values()
-        )
-        fits = (
-            is_finite
-            and bool((self.std > 0).all())
-            and self.mean.shape[1:] == table_slopes().shape
-        )
+        """Check shapes and values."""
+        tensors = self.to_tensors().values()
+        is_finite = all(bool(values.isfinite().all()) for values in tensors)
+        is_positive = is_finite and bool((self.std > 0).all())
+        n_nodes = len(table_slopes())
         expect(
-            fits,
-            f"finite tables of {len(table_slopes())} slopes and `std` > 0, got others.",
+            is_positive and self.mean.shape[1:] == (n_nodes,),
+            f"finite tables of {n_nodes} slopes and `std` > 0, got others.",
         )
 
     def lookup(self, slope_deg: Tensor) -> tuple[Tensor, Tensor]:
-        """Reads every class at each cell's slope; of a class with a second mode the
-        main one.
+        """Read the table of every class at each cell's slope; the main mode only.
 
         Args:
-            slope_deg: in [0, 90]; beyond is read at the nearer end, shape [*B, H, W].
+            slope_deg: slopes in degrees, clamped to [0, 90], shape [*B, H, W].
 
         Returns:
-            Means and standard deviations, dtype and device of the slopes, each [*B, C,
-            H, W].
+            Means and standard deviations, dtype and device of the slopes, each of shape [*B,
+            C, H, W].
         """
         mean, std = self._read(slice(None), slope_deg)
         return mean.movedim(0, -3), std.movedim(0, -3)
 
     def own(self, class_id: Tensor, slope_deg: Tensor) -> TraversabilityMixture:
-        """Reads each cell with its own class.
+        """Return the mixture of each cell's own class at its slope.
 
         Args:
             class_id: int64, shape [*B, H, W].
-            slope_deg: in [0, 90]; beyond is read at the nearer end, shape [*B, H, W].
+            slope_deg: slopes in degrees, clamped to [0, 90], shape [*B, H, W].
 
         Returns:
-            Parameters of shape [*B, K, H, W]: K = 1, or 2 where classes have second
-            modes.
+            A mixture with parameters of shape [*B, K, H, W]: K = 1, or 2 if classes have
+            second modes.
         """
         mean, std = self._read(class_id, slope_deg)
-        components: list[tuple[Tensor, ...]] = [(torch.ones_like(mean), mean, std)]
-        if soft := self.soft:
-            weight, *others = (values.to(slope_deg)[class_id] for values in soft)
-            components = [(1 - weight, mean, std), (weight, *others)]
-        weights, means, stds = (
-            torch.stack(values, -3) for values in zip(*components, strict=True)
-        )
-        return TraversabilityMixture(weights, means, stds, (0,) * len(components))
+        if self.soft is None:
+            weights = torch.ones_like(mean).unsqueeze(-3)
+            means = mean.unsqueeze(-3)
+            stds = std.unsqueeze(-3)
+            return TraversabilityMixture(weights, means, stds, (0,))
+        soft = SoftModes(*(values.to(slope_deg)[class_id] for values in self.soft))
+        weights = torch.stack([1 - soft.weight, soft.weight], -3)
+        means = torch.stack([mean, soft.mean], -3)
+        stds = torch.stack([std, soft.std], -3)
+        return TraversabilityMixture(weights, means, stds, (0, 0))
 
     def to_tensors(self) -> dict[str, Tensor]:
-        """Gives the tables by name, for a checkpoint."""
+        """Return the tables by name, for a checkpoint."""
         tables = {name: values for name, values in vars(self).items() if name != "soft"}
         soft = self.soft._asdict() if self.soft else {}
         return tables | {f"soft_{name}": values for name, values in soft.items()}
 
     @classmethod
     def from_tensors(cls, tensors: dict[str, Tensor]) -> "SlopeTable":
-        """Rebuilds the tables of `to_tensors`.
+        """Rebuild a table from the result of `to_tensors`.
 
         Raises:
-            KeyError: one is missing.
-            ConfigError: they are no tables.
+            KeyError: If a tensor is missing.
+            ConfigError: If the tensors are not valid tables.
         """
         soft = None
         if "soft_weight" in tensors:
@@ -136,19 +131,15 @@ class SlopeTable:
     def _read(
         self, classes: Tensor | slice, slope_deg: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Means and standard deviations of classes, between the node under each slope
-        and the next.
-        """
-        place = (slope_deg / STEP_DEG).clamp(0, self.mean.shape[1] - 1)
-        left = place.floor().clamp(max=self.mean.shape[1] - 2)
-        node = left.long()
-        tables = (table.to(slope_deg) for table in (self.mean, self.std))
-        mean, std = (
-            torch.lerp(
-                rows[classes, node],
-                rows[classes, node + 1],
-                (place - left).to(rows.dtype),
-            )
-            for rows in tables
-        )
-        return mean, std
+        """Return means and standard deviations, interpolated between adjacent nodes."""
+        last_node = self.mean.shape[1] - 1
+        position = (slope_deg / STEP_DEG).clamp(0, last_node)
+        lower = position.floor().clamp(max=last_node - 1)
+        node = lower.long()
+
+        def interpolate(table: Tensor) -> Tensor:
+            rows = table.to(slope_deg)
+            fraction = (position - lower).to(rows.dtype)
+            return torch.lerp(rows[classes, node], rows[classes, node + 1], fraction)
+
+        return interpolate(self.mean), interpolate(self.std)

@@ -1,1 +1,1 @@
-"""Training: data, the loop, and what is there already."""
+"""Training of models: data, training loop, and the checkpoint that receives the result."""

@@ -1,5 +1,5 @@
-"""The weights of the best epoch, which a training keeps, restores and protects from
-callbacks of a user.
+"""Weights of the best epoch: kept and restored by training, and protected from a user's
+callbacks.
 """
 
 import hashlib
@@ -12,26 +12,23 @@ from lightning.pytorch.callbacks import Callback, Checkpoint
 
 from benchnav.core.errors import ConfigError
 
-_OURS = (
-    "lightning.",
-    "benchnav.models.training.",
-)  # callbacks that leave the weights as they are
+# Modules whose callbacks leave the weights unchanged.
+_TRUSTED = ("lightning.", "benchnav.models.training.")
 
 
 class KeepBest(Callback):
-    """A callback that keeps and restores the weights of the epoch with the lowest
-    validation loss, or of the last.
+    """A callback that keeps and restores the weights of the best epoch, or of the last.
 
-    They are part of what a training goes on from. Lightning's `ModelCheckpoint` would
-    put them into a second file, which a kill could leave from another epoch than the
-    first, and knows only the loss of all that was measured.
+    The best epoch has the lowest validation loss. The weights are part of the state that a
+    training resumes from. Lightning's `ModelCheckpoint` would write them to a second file,
+    which after a kill could be from another epoch, and would store only the loss.
 
     Args:
-        last: keep the last epoch's whose loss is finite.
+        last: whether to keep the last epoch with a finite loss.
     """
 
     def __init__(self, last: bool = False) -> None:
-        """Start with no weights."""
+        """Start without weights."""
         self.last = last
         self.guard = WeightGuard()
         self.best: dict[str, Any] = {"loss": float("inf"), "metrics": {}, "weights": {}}
@@ -40,63 +37,58 @@ class KeepBest(Callback):
     def on_validation_epoch_end(
         self, trainer: lightning.Trainer, module: lightning.LightningModule
     ) -> None:
-        """Copy the weights where they are the best."""
+        """Copy the weights if they are the best."""
         self.validated = True
         metrics = {
             name: value
             for name, value in measured(trainer).items()
             if name.startswith("valid_")
         }
+        loss = metrics["valid_loss"]
         limit = float("inf") if self.last else self.best["loss"]
-        if metrics["valid_loss"] < limit:
+        if loss < limit:
             metrics["epoch"] = trainer.current_epoch + 1
             weights = {
                 name: value.detach().clone()
                 for name, value in module.state_dict().items()
             }
-            self.best = {
-                "loss": metrics["valid_loss"],
-                "metrics": metrics,
-                "weights": weights,
-            }
+            self.best = {"loss": loss, "metrics": metrics, "weights": weights}
 
     def on_train_end(
         self, trainer: lightning.Trainer, module: lightning.LightningModule
     ) -> None:
-        """Note the weights before callbacks of a user can change them."""
+        """Note the weights before a user's callbacks can change them."""
         self.guard.note(module)
 
     def on_fit_end(
         self, trainer: lightning.Trainer, module: lightning.LightningModule
     ) -> None:
-        """Put the best weights back."""
+        """Restore the best weights."""
         self.guard.check_module(module)
         if not self.best["weights"]:
             raise ConfigError(
                 "Expected a finite validation loss, got none. Train with a lower "
                 "`learning_rate`."
                 if self.validated
-                else "Expected `trainer` to measure the split valid, got none: "
-                "training ended before the first "
-                "validation. Train for longer, or validate more often."
+                else "Expected `trainer` to measure the split valid, got none: training "
+                "ended before the first validation. Train for longer, or validate more "
+                "often."
             )
         module.load_state_dict(self.best["weights"])
-        # The trainer's own metrics are what comes back from processes that it has
-        # started.
+        # Processes started by the trainer return its own metrics.
         metrics = self.best["metrics"].items()
-        trainer.callback_metrics.update(
-            {name: torch.tensor(value) for name, value in metrics}
-        )
+        tensors = {name: torch.tensor(value) for name, value in metrics}
+        trainer.callback_metrics.update(tensors)
         self.guard.note(module)
 
     def teardown(
         self, trainer: lightning.Trainer, module: lightning.LightningModule, stage: str
     ) -> None:
-        """Note the weights that the module leaves."""
+        """Note the final weights of the module."""
         self.guard.note(module)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return what `load_state_dict` takes."""
+        """Return the state for `load_state_dict`."""
         return self.best
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -105,20 +97,20 @@ class KeepBest(Callback):
 
 
 class WeightGuard(Checkpoint):
-    """A callback that raises where another one changes weights after training.
+    """A callback that raises an error if another one changes weights after training.
 
-    Lightning calls a hook of a `Checkpoint` after those of all other callbacks, and
-    before the module's. So weights that differ here from those that `note` read in the
-    same hook of the first callback were changed by one between them. Digests of bytes
-    are compared, since a NaN does not equal itself.
+    Lightning calls a hook of a `Checkpoint` after those of all other callbacks, and before
+    the module's. Weights that differ from those noted in the same hook of the first
+    callback were therefore changed by a callback in between. Digests of bytes are compared,
+    because NaN does not equal itself.
     """
 
     def __init__(self) -> None:
-        """Start with no weights."""
+        """Start without weights."""
         self.digest = ""
 
     def note(self, module: torch.nn.Module) -> None:
-        """Read the weights that callbacks have to leave as they are."""
+        """Store the digest of the weights that callbacks must not change."""
         self.digest = _digest_of_weights(module)
 
     def on_train_end(
@@ -148,29 +140,28 @@ class WeightGuard(Checkpoint):
         names = [
             kind.__name__
             for kind in classes
-            if not getattr(kind, hook).__module__.startswith(_OURS)
+            if not getattr(kind, hook).__module__.startswith(_TRUSTED)
         ]
+        owner = " or ".join(names) or "a callback"
         raise ConfigError(
-            "Expected callbacks that leave the trained weights as they are, got "
-            f"weights that `{hook}` of "
-            f"{' or '.join(names) or 'a callback'} changed. What is exported are the "
-            "weights of the best epoch. "
-            "Leave the callback out."
+            "Expected callbacks that leave the trained weights unchanged, got weights "
+            f"that `{hook}` of {owner} changed. The weights of the best epoch are "
+            "exported. Leave the callback out."
         )
 
     def check_module(self, module: torch.nn.Module) -> None:
-        """Reject weights that the module itself has changed since its callbacks ended,
-        which restoring would undo.
+        """Check that the module did not change its weights after its callbacks ended.
+
+        Restoring the best epoch would undo such changes.
 
         Raises:
-            ConfigError: If it has.
+            ConfigError: If it did.
         """
         if self.digest and _digest_of_weights(module) != self.digest:
             raise ConfigError(
-                "Expected weights as they were trained, got weights that "
-                f"`on_train_end` of {type(module).__name__} "
-                "changed, which the weights of the best epoch would replace. Change "
-                "them in `on_fit_end` of the model."
+                "Expected trained weights to stay unchanged, got weights that "
+                f"`on_train_end` of {type(module).__name__} changed; restoring the best "
+                "epoch would replace them. Change them in `on_fit_end` of the model."
             )
 
 
@@ -184,5 +175,5 @@ def _digest_of_weights(module: torch.nn.Module) -> str:
 
 
 def measured(trainer: lightning.Trainer) -> dict[str, float]:
-    """What was measured so far, by name."""
+    """Return the metrics of the trainer so far, by name."""
     return {name: float(value) for name, value in trainer.callback_metrics.items()}

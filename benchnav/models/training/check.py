@@ -1,5 +1,5 @@
-"""What is refused before anything is trained: inputs, maps, settings of the trainer,
-and hooks that do not fit.
+"""Checks before training: inputs, maps, settings of the trainer, and hooks of the
+network.
 """
 
 import json
@@ -29,20 +29,20 @@ from benchnav.models.nets.trainable import (
 )
 from benchnav.models.training.data import TRAIN, VALID, MapDataset, check_maps
 from benchnav.models.training.fit import FitOptions, make_trainer, quietly
-from benchnav.models.training.map_order import squares_a_map
+from benchnav.models.training.map_order import squares_per_map
 
 
 @dataclass(frozen=True, kw_only=True)
 class Trainable:
-    """What `train_networks` trains.
+    """A network to train with `train_networks`.
 
     Args:
         kind: class of the network.
         config: its settings.
-        name: of its parts; the members of an ensemble are counted behind it.
-        family: registered name of the model that checkpoints name, or the name of a
-            user's class.
-        code: digest of its code; empty where that is ours.
+        name: name of its parts; members of an ensemble have a number appended.
+        family: registered name of the model for checkpoints, or the name of a custom
+            class.
+        code: digest of the code of a custom class; empty for models of this package.
     """
 
     kind: type[TrainableNetwork]
@@ -53,84 +53,58 @@ class Trainable:
 
 
 def fields_of(network: TrainableNetwork) -> tuple[str, ...]:
-    """Fields of the maps that a network is trained on: its inputs, and what it learns."""
+    """Return the fields of the maps for training a network: its inputs and its target."""
     return (*network.inputs, network.target)
 
 
 def class_names(dataset: TerrainDataset) -> tuple[str, ...]:
-    """Names of the terrain classes of a dataset."""
+    """Return the names of the terrain classes of a dataset."""
     return tuple(item.name for item in dataset.recipe.classes)
 
 
 def check_network(
     trainable: Trainable, dataset: TerrainDataset, options: FitOptions
 ) -> None:
-    """Refuses what could not be trained before anything is: builds the trainer and
-    tries the network on a batch.
+    """Check that a network can be trained: build the trainer and try one batch.
 
     Args:
         trainable: the network.
         dataset: the maps.
-        options: how to train.
+        options: training options.
 
     Raises:
-        ConfigError: Lightning or the network does not take the settings, the maps lack
-            an input, a hook gives what it should not, or nothing would be trained or
-            measured.
-        DatasetError: there are too few maps, or none of their cells has what is
-            learned.
+        ConfigError: If Lightning or the network does not accept the settings, the maps
+            lack an input, a hook returns an invalid value, or nothing would be trained
+            or measured.
+        DatasetError: If there are too few maps, or none of their cells has a value to
+            learn.
     """
-    kind, config = trainable.kind, trainable.config
+    kind = trainable.kind
+    config = trainable.config
     network = call(f"a model of {kind.__name__}", kind, {"config": config})
     _check_settings(network)
-    check_inputs(
-        network.inputs, ["rgb", "elevation_m", "slope_deg", *dataset.layer_names, SEEN]
-    )
+    available = ["rgb", "elevation_m", "slope_deg", *dataset.layer_names, SEEN]
+    check_inputs(network.inputs, available)
     expect(
         SEEN not in network.inputs or config.masking.share > 0,
-        f"`masking.share` > 0 for the input {SEEN}, got 0: where all is seen in "
-        "training, it teaches nothing.",
+        f"`masking.share` > 0 for the input {SEEN}, got 0: if all cells are seen in "
+        "training, it carries no information.",
     )
     check_maps(dataset, kind.target, config.crop)
-    with quietly():
-        chosen = options.chosen(max_epochs=config.max_epochs)
-        trainer = make_trainer([], logger=False, **chosen)
-    every = trainer.check_val_every_n_epoch or 0
-    expect(
-        every <= config.max_epochs,
-        f"`trainer.check_val_every_n_epoch` of at most {config.max_epochs}, the "
-        f"number of epochs, got {every}.",
-    )
-    squares = squares_a_map(dataset.grid.shape, config.crop)
-    for split, name in ((TRAIN, "limit_train_batches"), (VALID, "limit_val_batches")):
-        places = dataset.map_count(split) * (squares if split == TRAIN else 1)
-        limit, batches = getattr(trainer, name), -(-places // config.batch_size)
-        expect(
-            (batches * limit if isinstance(limit, float) else limit) >= 1,
-            f"`trainer.{name}` that leaves a batch of the {batches} of split {split}, "
-            f"got {limit}. "
-            "Leave it out to take all.",
-        )
-    places = dataset.map_count(TRAIN) * squares
-    together = min(2, places // -(-places // config.batch_size))
-    indices = [index % dataset.map_count(TRAIN) for index in range(together)]
-    maps = MapDataset(dataset.path, TRAIN, fields_of(network)).read(indices)
-    crop = config.crop or None
-    maps = {
-        name: values[..., :crop, :crop].to(options.place)
-        for name, values in maps.items()
-    }
+    _check_trainer(config, dataset, options)
+    maps = _first_batch(network, dataset, options)
     try:
         network.build(map_classes=class_names(dataset)).to(options.place)
     except BenchnavError:
         raise
-    except Exception as error:  # a user's code may raise anything
+    except Exception as error:  # custom code may raise anything
         raise _unfit(network, maps, error) from error
     try_network(network, maps)
-    if (
+    has_own_predict = (
         isinstance(network, TrainableModel)
         and type(network).predict is not TrainableModel.predict
-    ):
+    )
+    if has_own_predict:
         observation = dataset.terrain(TRAIN, [0]).to(options.place).observe()
         side = config.crop or max(dataset.grid.shape)
         rows, columns = (slice(min(side, size)) for size in dataset.grid.shape)
@@ -138,31 +112,79 @@ def check_network(
             predict_observation(network.eval(), take_cells(observation, rows, columns))
         except BenchnavError:
             raise
-        except Exception as error:  # a user's code may raise anything
+        except Exception as error:  # custom code may raise anything
             raise _unfit(network, maps, error) from error
 
 
+def _check_trainer(
+    config: TrainingConfig, dataset: TerrainDataset, options: FitOptions
+) -> None:
+    """Check that Lightning accepts the settings and that each split has a batch."""
+    with quietly():
+        settings = options.chosen(max_epochs=config.max_epochs)
+        trainer = make_trainer([], logger=False, **settings)
+    interval = trainer.check_val_every_n_epoch or 0
+    expect(
+        interval <= config.max_epochs,
+        f"`trainer.check_val_every_n_epoch` of at most {config.max_epochs}, the "
+        f"number of epochs, got {interval}.",
+    )
+    for split, name in ((TRAIN, "limit_train_batches"), (VALID, "limit_val_batches")):
+        n_samples = dataset.map_count(split)
+        if split == TRAIN:
+            n_samples *= squares_per_map(dataset.grid.shape, config.crop)
+        n_batches = -(-n_samples // config.batch_size)
+        limit = getattr(trainer, name)
+        n_used = n_batches * limit if isinstance(limit, float) else limit
+        expect(
+            n_used >= 1,
+            f"`trainer.{name}` that leaves a batch of the {n_batches} of split {split}, "
+            f"got {limit}. Leave it out to take all.",
+        )
+
+
+def _first_batch(
+    network: TrainableNetwork, dataset: TerrainDataset, options: FitOptions
+) -> dict[str, Tensor]:
+    """Return one or two training maps, cropped, as a batch."""
+    config = network.config
+    n_maps = dataset.map_count(TRAIN)
+    n_samples = n_maps * squares_per_map(dataset.grid.shape, config.crop)
+    n_batches = -(-n_samples // config.batch_size)
+    size = min(2, n_samples // n_batches)
+    indices = [index % n_maps for index in range(size)]
+    maps = MapDataset(dataset.path, TRAIN, fields_of(network)).read(indices)
+    crop = config.crop or None
+    return {
+        name: values[..., :crop, :crop].to(options.place)
+        for name, values in maps.items()
+    }
+
+
 def _check_settings(network: TrainableNetwork) -> None:
-    """Refuses a network of which a checkpoint could not keep the settings, and inputs
-    that are no list of names.
+    """Check that a checkpoint can store the settings, and types of simple hooks.
+
+    Raises:
+        ConfigError: If JSON cannot store the settings, or `inputs` or `stride` is
+            invalid.
     """
     name = type(network).__name__
     try:
-        inputs, settings = tuple(network.inputs), network.settings()
-        kept = json.loads(json.dumps(settings))
-        kept.pop("temperature")
-        again = read(type(network.config), kept, of(name))
+        inputs = tuple(network.inputs)
+        stored = json.loads(json.dumps(network.settings()))
+        stored.pop("temperature")
+        restored = read(type(network.config), stored, of(name))
     except BenchnavError:
         raise
-    except Exception as error:  # a user's code may raise anything
+    except Exception as error:  # custom code may raise anything
         raise ConfigError(
-            f"Expected {name} with `inputs` and settings that JSON can keep, numbers, "
-            "text and lists of them, got: "
-            f"{one_line(error)}. Does its __init__ call super().__init__(config)?"
+            f"Expected {name} with `inputs` and settings that JSON can store, numbers, "
+            f"text and lists of them, got: {one_line(error)}. Does its __init__ call "
+            "super().__init__(config)?"
         ) from error
     expect(
-        again == network.config,
-        f"settings of {name} that JSON gives back as they were, got {kept!r}.",
+        restored == network.config,
+        f"settings of {name} that JSON preserves, got {stored!r}.",
     )
     expect(
         all(isinstance(item, str) for item in inputs),
@@ -176,44 +198,61 @@ def _check_settings(network: TrainableNetwork) -> None:
 
 
 def try_network(network: TrainableNetwork, maps: Mapping[str, Tensor]) -> None:
-    """Tries the hooks of a network that has been built on one batch, without a step.
+    """Call the hooks of a built network on one batch, without a training step.
 
     Args:
-        network: what is to be trained.
-        maps: B maps by field, its inputs and what it learns among them.
+        network: the network to train.
+        maps: B maps by field, which include its inputs and its target.
 
     Raises:
-        ConfigError: it does not take the maps, or a hook gives what it should not.
+        ConfigError: If it does not accept the maps, or a hook returns an invalid value.
     """
-    name, outputs = type(network).__name__, None
+    name = type(network).__name__
+    target = maps[network.target]
+    outputs = None
     try:
         with torch.random.fork_rng(devices=[]):
             loss, _ = network.train().assess(maps)
             if isinstance(network, TrainableModel):
                 with torch.no_grad():
-                    outputs = network.eval().to_distribution(
-                        in_single_precision(network(maps))
-                    )
+                    raw = in_single_precision(network.eval()(maps))
+                    outputs = network.to_distribution(raw)
     except BenchnavError:
         raise
-    except Exception as error:  # a user's code may raise anything
+    except Exception as error:  # custom code may raise anything
         raise _unfit(network, maps, error) from error
-    got = (
-        f"shape {list(loss.shape)}" if isinstance(loss, Tensor) else type(loss).__name__
-    )
+    _check_loss(loss, target, name)
+    if isinstance(network, TrainableModel):
+        check_distribution(outputs, tuple(target.shape), target.device, name)
+    try:
+        network.configure_schedule(torch.optim.AdamW(network.parameters()), 2)
+        network.metrics.to(target.device)
+        with torch.random.fork_rng(devices=[]), torch.no_grad():
+            network.eval().tally(maps)
+        network.metrics.compute()
+        network.metrics.reset()
+    except BenchnavError:
+        raise
+    except Exception as error:  # custom code may raise anything
+        raise _unfit(network, maps, error) from error
+
+
+def _check_loss(loss: Any, target: Tensor, name: str) -> None:
+    """Check that a loss is a finite scalar with a gradient, on the target's device."""
+    got = type(loss).__name__
+    if isinstance(loss, Tensor):
+        got = f"shape {list(loss.shape)}"
     expect(
         got == "shape []",
         f"`configure_losses` of {name} to give a loss that is one number, got {got}.",
     )
-    device = maps[network.target].device
     expect(
-        loss.device == device,
-        f"a loss of {name} on {device}, got one on {loss.device}.",
+        loss.device == target.device,
+        f"a loss of {name} on {target.device}, got one on {loss.device}.",
     )
-    seen = bool(maps[network.target].isfinite().any())
-    hint = (
-        "" if seen else " λ, NaN where it was not observed, is so in the whole batch."
-    )
+    hint = ""
+    if not bool(target.isfinite().any()):
+        hint = " λ is NaN (not observed) in the whole batch."
     expect(
         bool(loss.isfinite()),
         f"`configure_losses` of {name} to give a finite loss, got {loss.item()}.{hint}",
@@ -223,100 +262,86 @@ def try_network(network: TrainableNetwork, maps: Mapping[str, Tensor]) -> None:
         f"a loss of {name} that has a gradient, got one without. Use the outputs in "
         "it.",
     )
-    if isinstance(network, TrainableModel):
-        check_distribution(outputs, tuple(maps[network.target].shape), device, name)
-    try:
-        network.configure_schedule(torch.optim.AdamW(network.parameters()), 2)
-        network.metrics.to(device)
-        with torch.random.fork_rng(devices=[]), torch.no_grad():
-            network.eval().tally(maps)
-        network.metrics.compute()
-        network.metrics.reset()
-    except BenchnavError:
-        raise
-    except Exception as error:  # a user's code may raise anything
-        raise _unfit(network, maps, error) from error
 
 
 def check_distribution(
-    given: Any, shape: tuple[int, ...], device: torch.device, name: str
+    predicted: Any, shape: tuple[int, ...], device: torch.device, name: str
 ) -> None:
-    """Refuses what is no distribution of λ for each cell of a batch.
+    """Check that a prediction is a distribution of λ for each cell of a batch.
 
     Args:
-        given: what `to_distribution` gave.
+        predicted: result of `to_distribution`.
         shape: (B, H, W) of the batch.
-        device: of the batch.
-        name: of the model's class.
+        device: device of the batch.
+        name: name of the model's class.
 
     Raises:
-        ConfigError: it is of another type, shape or device, or its mean is not in [0,
-            1].
+        ConfigError: If it has another type, shape or device, or its mean, quantiles or
+            CDF are invalid.
     """
-    where = f"`to_distribution` of {name} to give"
+    owner = f"`to_distribution` of {name} to give"
+    kind = type(predicted).__name__
     expect(
-        isinstance(given, TraversabilityDistribution),
-        f"{where} a TraversabilityDistribution, got {type(given).__name__}.",
+        isinstance(predicted, TraversabilityDistribution),
+        f"{owner} a TraversabilityDistribution, got {kind}.",
     )
     expect(
-        is_dataclass(given),
-        f"{where} a frozen dataclass of maps, got {type(given).__name__}, which is "
-        "none.",
+        is_dataclass(predicted),
+        f"{owner} a frozen dataclass of maps, got {kind}, which is not a dataclass.",
     )
     expect(
-        tuple(given.shape) == shape,
-        f"{where} one of shape {list(shape)}, got {list(given.shape)}.",
+        tuple(predicted.shape) == shape,
+        f"{owner} one of shape {list(shape)}, got {list(predicted.shape)}.",
     )
     expect(
-        given.device == device, f"{where} one on {device}, got one on {given.device}."
+        predicted.device == device,
+        f"{owner} one on {device}, got one on {predicted.device}.",
     )
-    mean = given.mean()
+    mean = predicted.mean()
     expect(
         bool(((mean >= 0) & (mean <= 1)).all()),
-        f"{where} means of λ in [0, 1], got values outside or not a number.",
+        f"{owner} means of λ in [0, 1], got values outside or NaN.",
     )
-    ranks = torch.stack(
-        [given.quantile(share).double() for share in (0.01, 0.2, 0.5, 0.8, 0.99)]
-    )
+    levels = (0.01, 0.2, 0.5, 0.8, 0.99)
+    quantiles = torch.stack([predicted.quantile(level).double() for level in levels])
+    is_in_range = (quantiles[0] >= 0).all() and (quantiles[-1] <= 1).all()
     expect(
-        bool(
-            (ranks.diff(dim=0) >= -1e-6).all()
-            and (ranks[0] >= 0).all()
-            and (ranks[-1] <= 1).all()
-        ),
-        f"{where} one whose `quantile` ascends within [0, 1], got another. "
-        "`benchnav.testing.check_model` tells more.",
+        bool((quantiles.diff(dim=0) >= -1e-6).all() and is_in_range),
+        f"{owner} one whose `quantile` ascends within [0, 1], got another. See "
+        "`benchnav.testing.check_model`.",
     )
-    shares = torch.stack(
-        [given.cdf(value).double() for value in (0.0, 0.2, 0.5, 0.8, 1.0)]
-    )
+    values = (0.0, 0.2, 0.5, 0.8, 1.0)
+    cdf = torch.stack([predicted.cdf(value).double() for value in values])
     expect(
-        bool((shares.diff(dim=0) >= -1e-6).all() and (shares[-1] == 1).all()),
-        f"{where} one whose `cdf` ascends to 1 at λ = 1, got another. "
-        "`benchnav.testing.check_model` tells more.",
+        bool((cdf.diff(dim=0) >= -1e-6).all() and (cdf[-1] == 1).all()),
+        f"{owner} one whose `cdf` ascends to 1 at λ = 1, got another. See "
+        "`benchnav.testing.check_model`.",
     )
 
 
 def _unfit(
     network: TrainableNetwork, maps: Mapping[str, Tensor], error: Exception
 ) -> BenchnavError:
-    """Says what a batch of maps raised: where in the file of the class, or of which
-    architecture and encoder.
+    """Return the error for a batch that a network rejects.
+
+    It names the line of custom code, or else the architecture and encoder.
     """
-    config, (batch, height, width) = network.config, maps[network.target].shape
-    what, remedy = type(network).__name__, "Choose another."
-    if hasattr(config, "architecture") and hasattr(config, "encoder"):
-        what = f"{config.architecture} of {config.encoder}"
-    frames = traceback.extract_tb(error.__traceback__)
-    if own := [
-        at
-        for at in frames
-        if "site-packages" not in at.filename and str(PACKAGE) not in at.filename
-    ]:
-        at, what = own[-1], type(network).__name__
-        remedy = f"See {Path(at.filename).name}, line {at.lineno}, in `{at.name}`."
+    config = network.config
+    batch, height, width = maps[network.target].shape
+    owner = type(network).__name__
+    remedy = "Choose another."
+    custom = [
+        frame
+        for frame in traceback.extract_tb(error.__traceback__)
+        if "site-packages" not in frame.filename and str(PACKAGE) not in frame.filename
+    ]
+    if custom:
+        frame = custom[-1]
+        file = Path(frame.filename).name
+        remedy = f"See {file}, line {frame.lineno}, in `{frame.name}`."
+    elif hasattr(config, "architecture") and hasattr(config, "encoder"):
+        owner = f"{config.architecture} of {config.encoder}"
     return out_of_memory(error) or ConfigError(
         f"Expected a network that takes batches of {batch} maps of {height}×{width} "
-        f"cells, got {what}, which does not: "
-        f"{one_line(error).rstrip('.')}. {remedy}"
+        f"cells, got {owner}, which does not: {one_line(error).rstrip('.')}. {remedy}"
     )

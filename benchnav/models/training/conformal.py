@@ -1,5 +1,5 @@
-"""Halves of `valid` for conformal recalibration: maps for stopping and temperature, and
-maps for scores.
+"""Halves of `valid` for conformal recalibration: maps for early stopping and temperature,
+and maps for scores.
 """
 
 import numpy as np
@@ -13,47 +13,43 @@ from benchnav.models.base import TraversabilityModel, predict
 from benchnav.models.conformal import ConformalTable, fit_table
 from benchnav.models.training.data import VALID
 
-_LEAST_MAPS = 4
+_MIN_MAPS = 4
 
 
 def stopping_every(conformal: bool) -> int:
-    """The n of which stopping and temperature see every n-th map of `valid`, from the
-    first on.
-    """
+    """Return n: early stopping and temperature use every n-th map of `valid`, from the first."""
     return 2 if conformal else 1
 
 
 def scored_maps(count: int) -> range:
-    """Indices of the maps of a split of so many that `stopping_every` leaves out."""
+    """Return the indices of the `count` maps of a split that `stopping_every` leaves out."""
     return range(1, count, 2)
 
 
 def check_valid(dataset: TerrainDataset) -> None:
-    """Refuses a dataset whose split `valid` cannot be halved.
+    """Check that the split `valid` of a dataset can be halved.
 
     Raises:
-        ConfigError: it has too few maps.
+        ConfigError: If it has too few maps.
     """
-    count = dataset.map_count(VALID)
+    n_maps = dataset.map_count(VALID)
     expect(
-        count >= _LEAST_MAPS,
-        f"at least {_LEAST_MAPS} maps in split {VALID} of {dataset.path} for "
-        "`conformal`, which takes every second "
-        f"one, got {count}. Its least level is 1 / (n + 1) for n maps: give {VALID} "
-        "more maps.",
+        n_maps >= _MIN_MAPS,
+        f"at least {_MIN_MAPS} maps in split {VALID} of {dataset.path} for "
+        f"`conformal`, which takes every second one, got {n_maps}. With n such maps "
+        f"the lowest level is 1 / (n + 1). Add maps to {VALID}.",
     )
 
 
 def conformal_table(
     model: TraversabilityModel, dataset: TerrainDataset, seed: int, device: torch.device
 ) -> ConformalTable:
-    """Predicts every second map of `valid` and finds the levels that a model's
-    quantiles are to be read at.
+    """Predict every second map of `valid` and fit the levels for a model's quantiles.
 
     Args:
-        model: trained, and calibrated, on other maps.
-        dataset: where the maps are.
-        seed: root seed of the scores of atoms.
+        model: a model trained and calibrated on other maps.
+        dataset: dataset of the maps.
+        seed: root seed of the draws within atoms.
         device: where to compute.
     """
     scores = [
@@ -70,15 +66,13 @@ def _scores(
     seed: int,
     device: torch.device,
 ) -> ndarray:
-    """PIT values of the observed cells of a map, float64."""
+    """Return the PIT of the observed cells of a map, float64."""
     terrain = dataset.terrain(VALID, [index]).to(device)
     observed = terrain.traversability
     with torch.no_grad():
-        lower, upper = (
-            share.double()
-            for share in predict(model, terrain).cdf_limits(observed.nan_to_num())
-        )
+        limits = predict(model, terrain).cdf_limits(observed.nan_to_num())
+    lower, upper = (limit.double() for limit in limits)
     key = rng.stream_key(seed, "models", "conformal")
-    drawn = rng.uniform(key, np.array([index]), tuple(observed.shape[1:]))
-    inside = torch.lerp(lower, upper, torch.from_numpy(drawn).to(lower))
-    return inside[observed.isfinite()].cpu().numpy()
+    uniform = rng.uniform(key, np.array([index]), tuple(observed.shape[1:]))
+    transformed = torch.lerp(lower, upper, torch.from_numpy(uniform).to(lower))
+    return transformed[observed.isfinite()].cpu().numpy()

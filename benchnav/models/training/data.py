@@ -1,10 +1,9 @@
-"""Training data: maps or squares cut from them, read as they are asked for, or held in
-memory.
+"""Training data: maps or squares cut from them, read on demand or stored in memory.
 
-What a batch holds is a pure function of (seed, epoch, place in the epoch): order and
-augmentation come from named random streams, so a training that is resumed sees what it
-would have seen, however many
-processes read for it. Letters in shapes: B maps in all, b maps in a batch, H×W cells.
+The content of a batch is a pure function of seed, epoch and index. Order and
+augmentation are drawn from named random streams, so a resumed training sees the same
+batches, for any number of reading processes. Letters in shapes: B maps in all, b maps
+in a batch, H×W cells.
 """
 
 from collections.abc import Iterator, Sequence
@@ -32,18 +31,16 @@ from benchnav.models.training.map_order import (
     MapKey,
     MapSampler,
     crop_origins,
-    draw_looks,
-    squares_a_map,
+    draw_visibility,
+    squares_per_map,
 )
 from benchnav.models.training.masks import RandomMasks
 
 TRAIN, VALID = "train", "valid"
 
-_SYMMETRIES = tuple(
-    range(8)
-)  # of the square: four rotations, each as it is or mirrored
-_SYMMETRIES_OF_RECTANGLE = (0, 1, 4, 5)  # those that leave height and width as they are
-_LEAST_VARIANCE = 1e-4
+_SYMMETRIES = tuple(range(8))  # of the square: four rotations, each plain or mirrored
+_SYMMETRIES_OF_RECTANGLE = (0, 1, 4, 5)  # those that preserve height and width
+_MIN_VARIANCE = 1e-4
 
 Batch = dict[str, Tensor]
 
@@ -52,16 +49,15 @@ class MapDataset(TerrainMaps):
     """Maps by field, indexed by a whole batch at a time.
 
     Args:
-        path: of the dataset.
+        path: path of the dataset.
         split: name of one of its splits.
-        fields: which to give; `rgb` is uint8, [b, 3, H, W], and `seen` 1 where a cell
-            was seen.
-        in_memory: read all maps at once.
-        crop: cells of a side of the squares that are cut from maps; 0 takes whole maps.
+        fields: fields to return; `rgb` is uint8, [b, 3, H, W], and `seen` is 1 in observed
+            cells.
+        in_memory: whether to read all maps at once.
+        crop: side in cells of the squares cut from maps; 0 for whole maps.
         seed: root seed of the squares that `chunks` cuts.
-        every: n where it is every n-th map that counts, the first among them; the
-            others are never given.
-        masks: what of the maps is seen; all where there are none.
+        step: n to use every n-th map only, from the first.
+        masks: masks of the maps; None if all cells are observed.
     """
 
     def __init__(
@@ -72,148 +68,143 @@ class MapDataset(TerrainMaps):
         in_memory: bool = False,
         crop: int = 0,
         seed: int = 0,
-        every: int = 1,
+        step: int = 1,
         masks: RandomMasks | None = None,
     ) -> None:
-        """Checks split and fields, and reads the maps where that is asked for."""
+        """Check split and fields, and read the maps if `in_memory`."""
         stored = [name for name in fields if name != SEEN]
         if masks and "slope_deg" in fields and "elevation_m" not in fields:
-            stored.append(
-                "elevation_m"
-            )  # slopes are those of the elevation that is seen
+            stored.append("elevation_m")  # slopes are those of observed elevation
         super().__init__(path, split, stored)
-        self.crop, self.seed, self.every = crop, seed, every
-        self.given, self.masks = tuple(fields), masks
+        self.crop = crop
+        self.seed = seed
+        self.step = step
+        self.output_fields = tuple(fields)
+        self.masks = masks
         if in_memory:
             self._memory = super().read(range(self._maps))
 
     def __len__(self) -> int:
-        """Number of maps that count."""
-        return len(range(0, self._maps, self.every))
+        """Return the number of maps in use."""
+        return len(range(0, self._maps, self.step))
 
     def read(self, indices: Sequence[int]) -> Batch:
-        """Reads maps by their indices among those that count, all of which are seen."""
-        return self._with_seen(super().read([self.every * index for index in indices]))
+        """Read maps without masks, by their indices among those in use."""
+        return self._with_seen(super().read([self.step * index for index in indices]))
 
     def __getitem__(self, key: MapKey) -> Batch:  # type: ignore[override]
-        """Gives every field of the maps in `key`, shape [b, *, H, W]."""
-        which, place = key.maps.unique(
-            return_inverse=True
-        )  # squares of one map are cut from one reading
-        read = self.read(which.tolist())
+        """Return all fields of the maps in `key`, shape [b, *, H, W]."""
+        # Squares of the same map are cut from one reading.
+        map_ids, positions = key.maps.unique(return_inverse=True)
+        maps = self.read(map_ids.tolist())
+        squares = list(
+            zip(positions, key.origin.tolist(), key.symmetry.tolist(), strict=True)
+        )
         batch = {}
-        for name, values in read.items():
-            cut = (
-                self._cut(values[at], origin)
-                for at, origin in zip(place, key.origin.tolist(), strict=True)
-            )
-            turned = zip(cut, key.symmetry.tolist(), strict=True)
-            batch[name] = torch.stack(
-                [apply_symmetry(layer, symmetry, name) for layer, symmetry in turned]
-            )
+        for name, layers in maps.items():
+            augmented = []
+            for position, origin, symmetry in squares:
+                square = self._cut(layers[position], origin)
+                augmented.append(apply_symmetry(square, symmetry, name))
+            batch[name] = torch.stack(augmented)
         if "rgb" in batch:
             batch["rgb"] = apply_jitter(batch["rgb"], key.factors)
-        return self._masked(batch, key.look)
+        return self._masked(batch, key.visibility)
 
     def chunks(self, device: torch.device = CPU) -> Iterator[tuple[range, Batch]]:
-        """All maps neither turned nor jittered, in order, some at a time, with their
-        indices; on a device.
+        """Yield all maps in order without augmentation, in chunks with their indices.
+
+        Args:
+            device: device of the chunks.
         """
-        origins = crop_origins(
-            self.dataset.grid.shape, self.crop, self.seed, 0, len(self)
-        )
-        looks = torch.from_numpy(draw_looks(self.seed, 0, len(self)))
+        shape = self.dataset.grid.shape
+        origins = crop_origins(shape, self.crop, self.seed, 0, len(self))
+        visibility = torch.from_numpy(draw_visibility(self.seed, 0, len(self)))
         size = self.dataset.grid.maps_in(CHUNK_CELLS)
-        for first in range(0, len(self), size):
-            indices = range(len(self))[first : first + size]
-            maps = self.dataset.read(
-                self.split, [self.every * index for index in indices], self.fields
-            )
-            batch = self._with_seen(
-                {name: torch.from_numpy(values) for name, values in maps.items()}
-            )
+        for start in range(0, len(self), size):
+            indices = range(len(self))[start : start + size]
+            chunk = slice(indices.start, indices.stop)
+            map_ids = [self.step * index for index in indices]
+            maps = self.dataset.read(self.split, map_ids, self.fields)
+            tensors = {name: torch.from_numpy(values) for name, values in maps.items()}
+            batch = self._with_seen(tensors)
             if self.crop:
-                chosen = origins[indices.start : indices.stop].tolist()
                 batch = {
-                    name: torch.stack(
-                        [self._cut(*pair) for pair in zip(values, chosen, strict=True)]
-                    )
-                    for name, values in batch.items()
+                    name: self._cut_all(layers, origins[chunk].tolist())
+                    for name, layers in batch.items()
                 }
-            batch = self._masked(batch, looks[indices.start : indices.stop])
+            batch = self._masked(batch, visibility[chunk])
             yield indices, {name: values.to(device) for name, values in batch.items()}
 
     def _with_seen(self, maps: Batch) -> Batch:
-        """Adds the layer `seen` where it is to be given."""
+        """Add the layer `seen` if it is requested."""
+        if SEEN not in self.output_fields:
+            return maps
         shape = next(iter(maps.values())).shape
-        return (
-            {**maps, SEEN: torch.ones(shape[0], *shape[-2:])}
-            if SEEN in self.given
-            else maps
-        )
+        return {**maps, SEEN: torch.ones(shape[0], *shape[-2:])}
 
-    def _masked(self, batch: Batch, look: Tensor) -> Batch:
-        """Masks a batch, and leaves out what was read for that alone."""
+    def _masked(self, batch: Batch, visibility: Tensor) -> Batch:
+        """Mask a batch, and drop the fields that were read for the masks only."""
         if self.masks is None:
             return batch
-        seen = self.masks.apply(batch, look)
-        return {name: seen[name] for name in self.given}
+        masked = self.masks.apply(batch, visibility)
+        return {name: masked[name] for name in self.output_fields}
 
     def _cut(self, layer: Tensor, origin: Sequence[int]) -> Tensor:
-        """The square of a layer, [*, H, W], from a cell on; the layer itself where none
-        is asked for.
-        """
+        """Return the square of a layer, [*, H, W], at an origin, or the whole layer."""
+        if not self.crop:
+            return layer
         row, column = origin
-        return (
-            layer[..., row : row + self.crop, column : column + self.crop]
-            if self.crop
-            else layer
-        )
+        return layer[..., row : row + self.crop, column : column + self.crop]
+
+    def _cut_all(self, layers: Tensor, origins: Sequence[Sequence[int]]) -> Tensor:
+        pairs = zip(layers, origins, strict=True)
+        return torch.stack([self._cut(layer, origin) for layer, origin in pairs])
 
 
 def apply_jitter(rgb: Tensor, factors: Tensor) -> Tensor:
-    """Changes brightness, contrast and saturation of each image, in this order.
+    """Change brightness, contrast and saturation of each image, in this order.
 
     Args:
         rgb: uint8, shape [b, 3, H, W].
-        factors: of the three, each 1 where nothing is to change, shape [b, 3].
+        factors: factors of the three, 1 for no change, shape [b, 3].
     """
     if bool((factors == 1).all()):
         return rgb
-    changed = []
-    for image, (brightness, contrast, saturation) in zip(
-        rgb, factors.tolist(), strict=True
-    ):
+    images = []
+    for image, image_factors in zip(rgb, factors.tolist(), strict=True):
+        brightness, contrast, saturation = image_factors
         image = photometry.adjust_brightness(image, brightness)
         image = photometry.adjust_contrast(image, contrast)
-        changed.append(photometry.adjust_saturation(image, saturation))
-    return torch.stack(changed)
+        images.append(photometry.adjust_saturation(image, saturation))
+    return torch.stack(images)
 
 
-def apply_symmetry(maps: Tensor, which: int, name: str = "") -> Tensor:
-    """Turns maps by 90° `which // 2` times and then, if `which` is odd, mirrors them
-    left to right.
+def apply_symmetry(maps: Tensor, symmetry: int, name: str = "") -> Tensor:
+    """Rotate maps by 90° `symmetry // 2` times, then mirror them if `symmetry` is odd.
 
     Args:
         maps: shape [*B, H, W].
-        which: 0–7; 0 changes nothing.
-        name: of the field; directions turn with the map.
+        symmetry: 0–7; 0 changes nothing.
+        name: name of the field; directions turn with the map.
     """
-    turned = torch.rot90(maps, which // 2, (-2, -1))
-    turned = turned.flip(-1) if which % 2 else turned
-    if which and is_azimuth(name):
-        turned = turned - 90 * (which // 2)
-        turned = (180 - turned if which % 2 else turned) % 360
-    return turned
+    n_turns, is_mirrored = divmod(symmetry, 2)
+    result = torch.rot90(maps, n_turns, (-2, -1))
+    if is_mirrored:
+        result = result.flip(-1)
+    if symmetry and is_azimuth(name):
+        result = result - 90 * n_turns
+        result = (180 - result if is_mirrored else result) % 360
+    return result
 
 
 @dataclass(frozen=True, kw_only=True)
 class Augmentation:
-    """How training maps are varied.
+    """Augmentation of training maps.
 
     Args:
-        jitter: largest relative change of brightness, contrast and saturation.
-        symmetries: whether maps are turned and mirrored.
+        jitter: maximum relative change of brightness, contrast and saturation.
+        symmetries: whether maps are rotated and mirrored.
     """
 
     jitter: float = 0.0
@@ -222,12 +213,12 @@ class Augmentation:
 
 @dataclass(frozen=True, kw_only=True)
 class Loading:
-    """How maps are read.
+    """Settings for reading maps.
 
     Args:
-        in_memory: hold all maps in memory.
-        workers: processes that read ahead; 0 reads in this one.
-        valid_every: n if only every n-th map of `valid` counts.
+        in_memory: whether to store all maps in memory.
+        workers: number of processes that read ahead; 0 reads in this process.
+        valid_every: n to use every n-th map of `valid` only.
     """
 
     in_memory: bool = False
@@ -238,24 +229,24 @@ class Loading:
 class MapData(lightning.LightningDataModule):
     """The maps of the splits `train` and `valid`.
 
-    Training maps are turned and mirrored at random, all fields alike. Of synthetic maps
-    that stays
-    physical: the light comes from a random direction. A photo's light comes from one.
-    Where processes train together, each takes its part of every batch.
+    Training maps are rotated and mirrored at random, all fields in the same way.
+    Synthetic maps stay physical, because their light comes from a random direction; a
+    photo has a fixed direction of light. If several processes train together, each
+    takes its part of every batch.
 
     Args:
-        dataset: where they are.
-        batch_size: most maps a batch.
+        dataset: dataset of the maps.
+        batch_size: maximum number of maps per batch.
         seed: root seed of order and augmentation.
-        fields: which to read.
-        augmentation: how training maps are varied.
-        crop: cells of a side of the squares to train and to measure on; 0 takes whole
+        fields: fields to read.
+        augmentation: augmentation of training maps.
+        crop: side in cells of the squares for training and validation; 0 for whole
             maps.
-        loading: how maps are read.
-        masks: what of the maps is seen; all where there are none.
+        loading: settings for reading maps.
+        masks: masks of the maps; None if all cells are observed.
 
     Raises:
-        DatasetError: a split is missing.
+        DatasetError: If a split is missing.
     """
 
     def __init__(
@@ -269,65 +260,49 @@ class MapData(lightning.LightningDataModule):
         loading: Loading = Loading(),
         masks: RandomMasks | None = None,
     ) -> None:
-        """Opens the splits."""
+        """Open the splits."""
         super().__init__()
-        self.batch_size, self.seed, self.workers = batch_size, seed, loading.workers
+        self.batch_size = batch_size
+        self.seed = seed
+        self.workers = loading.workers
         self.augmentation = augmentation
-        self.train, self.valid = (
-            MapDataset(
-                dataset.path, split, fields, loading.in_memory, crop, seed, every, masks
+
+        def open_split(split: str, step: int) -> MapDataset:
+            return MapDataset(
+                dataset.path, split, fields, loading.in_memory, crop, seed, step, masks
             )
-            for split, every in ((TRAIN, 1), (VALID, loading.valid_every))
-        )
+
+        self.train = open_split(TRAIN, 1)
+        self.valid = open_split(VALID, loading.valid_every)
 
     def scale(self, inputs: Sequence[str]) -> dict[str, LayerScale]:
-        """What layers of the training maps are scaled by, from all their cells that are
-        known; `seen` by nothing.
+        """Return the scales of layers, from all training cells with a value.
+
+        The layer `seen` is not scaled.
         """
-        told = (
-            {SEEN: LayerScale(torch.zeros(1), torch.ones(1), torch.ones(()))}
-            if SEEN in inputs
-            else {}
-        )
-        inputs = [name for name in inputs if name != SEEN]
+        layers = [name for name in inputs if name not in (SEEN, "rgb")]
+        stored = [name for name in inputs if name != SEEN]
         counts = torch.zeros(3, 256, dtype=torch.int64)
-        sums: dict[str, Tensor] = {
-            name: torch.zeros(2, dtype=torch.float64) for name in inputs
-        }
-        cells = dict.fromkeys(inputs, 0)
-        for _, maps in self.train.dataset.chunks(TRAIN, inputs):
-            for name in inputs:
+        sums = {name: torch.zeros(2, dtype=torch.float64) for name in layers}
+        n_cells = dict.fromkeys(layers, 0)
+        for _, maps in self.train.dataset.chunks(TRAIN, stored):
+            if "rgb" in inputs:
+                counts += _colour_counts(torch.from_numpy(maps["rgb"]))
+            for name in layers:
                 values = torch.from_numpy(maps[name])
-                if name == "rgb":
-                    channels = values.unbind(1)
-                    counts += torch.stack(
-                        [
-                            channel.flatten().bincount(minlength=256)
-                            for channel in channels
-                        ]
-                    )
-                    continue
-                known = torch.where(values.isfinite(), values, 0).double()
-                sums[name] += torch.stack([known.sum(), known.square().sum()])
-                cells[name] += int(values.isfinite().sum())
-        scale = {
-            name: _layer_scale(name, sums[name], cells[name])
-            for name in inputs
-            if name != "rgb"
-        }
+                is_finite = values.isfinite()
+                finite = torch.where(is_finite, values, 0).double()
+                sums[name] += torch.stack([finite.sum(), finite.square().sum()])
+                n_cells[name] += int(is_finite.sum())
+        scale = {name: _layer_scale(name, sums[name], n_cells[name]) for name in layers}
         if "rgb" in inputs:
-            share = counts.double() / counts.sum(1, keepdim=True)
-            level = torch.arange(256.0, dtype=torch.float64)
-            mean = (share * level).sum(1)
-            variance = (share * level**2).sum(1) - mean**2
-            # Ground of one colour would have no scale.
-            scale["rgb"] = LayerScale(
-                mean.float(), variance.clamp(min=1).sqrt().float(), torch.ones(())
-            )
-        return scale | told
+            scale["rgb"] = _colour_scale(counts)
+        if SEEN in inputs:
+            scale[SEEN] = LayerScale(torch.zeros(1), torch.ones(1), torch.ones(()))
+        return scale
 
     def train_dataloader(self) -> DataLoader[Batch]:
-        """Augmented batches in random order."""
+        """Return augmented batches in random order."""
         height, width = self.train.dataset.grid.shape
         square = height == width or self.train.crop
         symmetries = _SYMMETRIES if square else _SYMMETRIES_OF_RECTANGLE
@@ -341,26 +316,25 @@ class MapData(lightning.LightningDataModule):
         )
 
     def val_dataloader(self) -> DataLoader[Batch]:
-        """Batches as stored, in order."""
+        """Return batches as stored, in order."""
         return self._load(self.valid)
 
     def _load(self, maps: MapDataset, **order: Any) -> DataLoader[Batch]:
-        share = (
-            (self.trainer.global_rank, self.trainer.world_size)
-            if self.trainer
-            else (0, 1)
-        )
+        process = (0, 1)
+        if self.trainer:
+            process = (self.trainer.global_rank, self.trainer.world_size)
+        shards = maps.dataset.pieces[maps.split]
         sampler = MapSampler(
             len(maps),
             self.batch_size,
             self.seed,
-            share=share,
+            process=process,
             crop=maps.crop,
             shape=maps.dataset.grid.shape,
-            shards=tuple(piece.maps for piece in maps.dataset.pieces[maps.split]),
+            shards=tuple(shard.maps for shard in shards),
             **order,
         )
-        # A generator of its own keeps the loader from drawing on PyTorch's global one.
+        # Its own generator prevents the loader from drawing from PyTorch's global one.
         return DataLoader(
             maps,
             batch_size=None,
@@ -371,73 +345,101 @@ class MapData(lightning.LightningDataModule):
         )
 
 
-def _layer_scale(name: str, sums: Tensor, cells: int) -> LayerScale:
-    """The scale of a layer from its sum and its sum of squares over so many known
-    cells; directions keep theirs.
-    """
-    if is_azimuth(name):
-        return LayerScale(torch.zeros(2), torch.ones(2), torch.ones(()))
-    mean, square = (sums / max(1, cells)).unbind()
-    # A layer that is the same everywhere would have no scale.
-    std = (square - mean**2).clamp(min=_LEAST_VARIANCE).sqrt()
-    return LayerScale(
-        mean.float().view(1), std.float().view(1), square.clamp(min=1).sqrt().float()
+def _colour_counts(rgb: Tensor) -> Tensor:
+    """Count the values 0–255 of each channel of images, int64, shape [3, 256]."""
+    channels = rgb.unbind(1)
+    return torch.stack(
+        [channel.flatten().bincount(minlength=256) for channel in channels]
     )
 
 
+def _colour_scale(counts: Tensor) -> LayerScale:
+    """Return the scale of colours from counts of the values of each channel."""
+    fraction = counts.double() / counts.sum(1, keepdim=True)
+    level = torch.arange(256.0, dtype=torch.float64)
+    mean = (fraction * level).sum(1)
+    variance = (fraction * level**2).sum(1) - mean**2
+    # Terrain of a single colour would have no scale.
+    std = variance.clamp(min=1).sqrt()
+    return LayerScale(mean.float(), std.float(), torch.ones(()))
+
+
+def _layer_scale(name: str, sums: Tensor, n_cells: int) -> LayerScale:
+    """Return the scale of a layer; directions are not scaled.
+
+    Args:
+        name: name of the layer.
+        sums: sum and sum of squares of its values, shape [2].
+        n_cells: number of cells with a value.
+    """
+    if is_azimuth(name):
+        return LayerScale(torch.zeros(2), torch.ones(2), torch.ones(()))
+    mean, square = (sums / max(1, n_cells)).unbind()
+    # A constant layer would have no scale.
+    std = (square - mean**2).clamp(min=_MIN_VARIANCE).sqrt()
+    rms = square.clamp(min=1).sqrt()
+    return LayerScale(mean.float().view(1), std.float().view(1), rms.float())
+
+
 def open_dataset(data: str) -> TerrainDataset:
-    """Opens a dataset to train on, by path or id.
+    """Open a dataset to train on, by path or id.
 
     Raises:
-        DatasetError: it has no splits to train and to measure on.
+        DatasetError: If it has no splits `train` and `valid`.
     """
     dataset = TerrainDataset(find_dataset(data))
     if not {TRAIN, VALID} <= set(dataset.splits):
         raise DatasetError(
             f"Expected splits train and valid in {dataset.path} to train on, got "
-            f"{sorted(dataset.splits)}. "
-            "Make a dataset with them, for example `benchnav-datagen create paper-v1`."
+            f"{sorted(dataset.splits)}. Create a dataset with them, for example "
+            "`benchnav-datagen create paper-v1`."
         )
     return dataset
 
 
 def check_maps(dataset: TerrainDataset, field: str, crop: int = 0) -> None:
-    """Refuses a dataset that a network cannot learn from.
+    """Check that a network can learn from a dataset.
 
     Args:
         dataset: the maps.
-        field: `class_id` or `traversability`, which is to be learned.
-        crop: cells of a side of the squares that are cut from maps; 0 takes whole maps.
+        field: field to learn, `class_id` or `traversability`.
+        crop: side in cells of the squares cut from maps; 0 for whole maps.
 
     Raises:
-        ConfigError: the squares are larger than the maps.
-        DatasetError: there are fewer than two maps or squares to train on, or none to
-            measure on; or in one of these splits no cell has what is learned.
+        ConfigError: If the squares are larger than the maps.
+        DatasetError: If there are fewer than two maps or squares for training, or none
+            for validation; or if no cell of a split has a value to learn.
     """
-    height, width = dataset.grid.shape
+    shape = dataset.grid.shape
     expect(
-        crop == 0 or 8 <= crop <= min(height, width),
-        f"`crop` in 8–{min(height, width)} cells, the shorter side of the maps, or 0, "
+        crop == 0 or 8 <= crop <= min(shape),
+        f"`crop` in 8–{min(shape)} cells, the shorter side of the maps, or 0, "
         f"got {crop}.",
     )
-    what = {
+    values_to_learn = {
         "class_id": "cells with a class",
         "traversability": "observed traversability",
     }[field]
-    for split, least in ((TRAIN, 2), (VALID, 1)):
-        place, count = f"split {split} of {dataset.path}", dataset.map_count(split)
-        if count * squares_a_map((height, width), crop) < least:
+    for split, min_maps in ((TRAIN, 2), (VALID, 1)):
+        location = f"split {split} of {dataset.path}"
+        n_maps = dataset.map_count(split)
+        if n_maps * squares_per_map(shape, crop) < min_maps:
             raise DatasetError(
-                f"Expected at least {least} maps in {place}, got {count}."
+                f"Expected at least {min_maps} maps in {location}, got {n_maps}. Add "
+                "maps to it."
             )
         chunks = (maps[field] for _, maps in dataset.chunks(split, (field,)))
-        if not any(
-            bool((np.isfinite(values) & (values != UNLABELLED)).any())
-            for values in chunks
-        ):
-            raise DatasetError(f"Expected {what} in {place} to learn from, got none.")
+        if not any(map(_has_values, chunks)):
+            raise DatasetError(
+                f"Expected {values_to_learn} in {location} to learn from, got none. "
+                "Train on another dataset."
+            )
+
+
+def _has_values(values: np.ndarray) -> bool:
+    return bool((np.isfinite(values) & (values != UNLABELLED)).any())
 
 
 def training_digest(dataset: TerrainDataset) -> str:
-    """Digest of what of a dataset is trained on, and of what its maps mean."""
+    """Return a digest of the splits to train on, including the meaning of their maps."""
     return ",".join(f"{name}:{dataset.split_digest(name)}" for name in (TRAIN, VALID))

@@ -1,30 +1,27 @@
-"""One training with Lightning: quiet, with progress and logs, and able to go on after a
-kill.
+"""One training with Lightning: without its messages, with progress and logs, resumable
+after a kill.
 
-A training that is given a folder leaves there, after every epoch, all that it needs to
-go on (`last.ckpt`, a Lightning checkpoint) and what was measured (`metrics.csv`, and
-TensorBoard's events). Gone on from there it ends with the weights that an unbroken one
-would have, bit for bit on a CPU: what a batch holds depends on seed and epoch alone.
+If a training has a folder, it writes after each epoch the state to resume from
+(`last.ckpt`, a Lightning checkpoint) and the metrics (`metrics.csv`, and TensorBoard's
+events). A resumed training ends with the weights of an uninterrupted one, bit for bit
+on a CPU, because the content of a batch depends only on seed and epoch.
 """
 
 import inspect
 import json
-import math
 import os
 import pickle
 import signal
 import sys
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, field
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import lightning
-import pandas as pd
 import torch
-from lightning.fabric.plugins.io import TorchCheckpointIO
 from lightning.pytorch.callbacks import (
     Callback,
     Checkpoint,
@@ -36,29 +33,29 @@ from lightning.pytorch.loggers import Logger, TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
-from benchnav.core.command import tell
 from benchnav.core.device import find_device
 from benchnav.core.errors import (
     CheckpointError,
     ConfigError,
-    TrainingError,
     expect,
     out_of_memory,
     quiet,
 )
 from benchnav.core.settings import check_known, one_line
-from benchnav.core.store import MAX_JOBS, replacing, sole_writer, write_text
+from benchnav.core.store import MAX_JOBS, sole_writer, write_text
 from benchnav.models.config import TrainOptions
 from benchnav.models.training.best import KeepBest, measured
+from benchnav.models.training.history import AtomicCheckpointIO, History
 from benchnav.models.training.trackers import described, make_callbacks, make_loggers
 
-STATE, SETTINGS, HISTORY = "last.ckpt", "settings.json", "metrics.csv"
+STATE = "last.ckpt"
+SETTINGS = "settings.json"
+HISTORY = "metrics.csv"
 
-_PARTIAL = f".{STATE}.*.partial"  # what a kill in the middle of writing has left
+_PARTIAL = f".{STATE}.*.partial"  # left by a kill during a write
 
-# Settings of Lightning's trainer that are made here, and those that the outcome does
-# not depend on.
-_OWN = {
+# Settings of Lightning's trainer that this module determines.
+_FIXED = {
     "self",
     "plugins",
     "default_root_dir",
@@ -76,25 +73,22 @@ _OWN = {
     "profiler",
 }
 _DEFAULTS = inspect.signature(lightning.Trainer.__init__).parameters
-_TRACKERS = (
-    "logger",
-    "callbacks",
-)  # which are made from text, see `models.training.trackers`
-_LOSSES = ("train_loss", "valid_loss", "loss")
-_OF_NO_ACCOUNT = {"max_epochs", "log_every_n_steps", "detect_anomaly", "accelerator"}
+_TRACKERS = ("logger", "callbacks")  # created from text by `training.trackers`
+# Settings that do not affect the result.
+_WITHOUT_EFFECT = {"max_epochs", "log_every_n_steps", "detect_anomaly", "accelerator"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class FitOptions(TrainOptions):
-    """How to train, whatever is trained.
+    """Training options, independent of the model.
 
     Args:
-        folder: where logs and what is needed to go on are kept, in a folder for each
-            part of a model; nothing is written when None.
+        folder: folder for logs and for the state to resume from, with a subfolder per
+            part of a model; if None, nothing is written.
 
     Raises:
-        ConfigError: `workers` is below 0; there is no such device; the trainer has no
-            such setting, or it is set here.
+        ConfigError: If `workers` is out of range, the device does not exist, or the
+            trainer has no such setting or does not allow it.
     """
 
     folder: Path | None = None
@@ -105,24 +99,24 @@ class FitOptions(TrainOptions):
             0 <= self.workers <= MAX_JOBS,
             f"`workers` in 0–{MAX_JOBS}, got {self.workers}.",
         )
-        asked = self.trainer or {}
+        requested = self.trainer or {}
         expect(
-            "accelerator" not in asked,
+            "accelerator" not in requested,
             "no `trainer.accelerator`, which is now `device`: auto, cpu or cuda.",
         )
-        for name in asked:
-            check_known("settings of `trainer`", name, sorted(_DEFAULTS.keys() - _OWN))
-        self.make_loggers(
-            None
-        )  # so that what cannot be made is refused before anything is trained
+        options = sorted(_DEFAULTS.keys() - _FIXED)
+        for name in requested:
+            check_known("settings of `trainer`", name, options)
+        # Invalid trackers are rejected before any training.
+        self.make_loggers(None)
         self.make_callbacks()
-        devices, processors = asked.get("devices", 1), os.cpu_count() or 1
+        devices = requested.get("devices", 1)
+        n_processors = os.cpu_count() or 1
+        is_cpu_count = self.place.type == "cpu" and isinstance(devices, int)
         expect(
-            self.place.type != "cpu"
-            or not isinstance(devices, int)
-            or 1 <= devices <= processors,
-            f"`trainer.devices` in 1–{processors}, as many as there are processors, "
-            f"got {devices}.",
+            not is_cpu_count or 1 <= devices <= n_processors,
+            f"`trainer.devices` in 1–{n_processors}, the number of processors, got "
+            f"{devices}.",
         )
 
     @property
@@ -132,40 +126,41 @@ class FitOptions(TrainOptions):
 
     @property
     def trainer_settings(self) -> dict[str, Any]:
-        """The settings of the trainer on which the outcome of a network's training
-        depends, as plain data.
-        """
-        chosen = {
+        """Settings of the trainer that affect the result of training, as plain data."""
+        settings = {
             name: value
             for name, value in self.chosen().items()
-            if name not in _OF_NO_ACCOUNT and value != _DEFAULTS[name].default
+            if name not in _WITHOUT_EFFECT and value != _DEFAULTS[name].default
         }
-        if (asked := (self.trainer or {}).get("callbacks")) is not None:
-            chosen["callbacks"] = described(asked)
-        return json.loads(json.dumps(chosen, default=str, sort_keys=True))
+        callbacks = (self.trainer or {}).get("callbacks")
+        if callbacks is not None:
+            settings["callbacks"] = described(callbacks)
+        return json.loads(json.dumps(settings, default=str, sort_keys=True))
 
     def make_loggers(self, folder: Path | None) -> list[Logger] | None:
-        """Make the requested loggers, which write in a folder; None for the default."""
-        asked = (self.trainer or {}).get("logger")
-        return None if asked is None or asked is True else make_loggers(asked, folder)
+        """Create the requested loggers, which write to a folder; None for the default."""
+        specs = (self.trainer or {}).get("logger")
+        return None if specs is None or specs is True else make_loggers(specs, folder)
 
     def make_callbacks(self) -> list[Callback]:
-        """Make the requested callbacks."""
-        asked = (self.trainer or {}).get("callbacks")
-        return [] if asked is None else make_callbacks(asked)
+        """Create the requested callbacks."""
+        specs = (self.trainer or {}).get("callbacks")
+        return [] if specs is None else make_callbacks(specs)
 
-    def chosen(self, **trainer: Any) -> dict[str, Any]:
-        """All settings of the trainer but loggers and callbacks, of those given here
-        and others, by name.
+    def chosen(self, **defaults: Any) -> dict[str, Any]:
+        """Return all settings of the trainer except loggers and callbacks, by name.
+
+        Args:
+            defaults: settings where the options have none.
         """
-        kind = self.place.type
-        first = {"precision": default_precision(kind), "devices": 1}
-        asked = {
+        accelerator = self.place.type
+        common = {"precision": default_precision(accelerator), "devices": 1}
+        requested = {
             name: value
             for name, value in (self.trainer or {}).items()
             if name not in _TRACKERS
         }
-        return {**first, **trainer, **asked, "accelerator": kind}
+        return {**common, **defaults, **requested, "accelerator": accelerator}
 
 
 def fit(
@@ -175,62 +170,57 @@ def fit(
     settings: Mapping[str, Any],
     callbacks: list[Callback],
     data: Mapping[str, Any],
-    **usual: Any,
+    **defaults: Any,
 ) -> dict[str, float]:
     """Train a module in place.
 
     Args:
-        module: what to train.
-        part: name of the part of a model that it is.
-        options: how.
-        settings: plain data on which the outcome depends; an interrupted training of
-            others is not gone on with.
-        callbacks: what else is to happen.
+        module: module to train.
+        part: name of the part of a model.
+        options: training options.
+        settings: plain data that affect the result; an interrupted training with
+            other settings is not resumed.
+        callbacks: additional callbacks.
         data: loaders or data module, as arguments of the trainer's `fit`.
-        usual: settings of Lightning's trainer, where the options say nothing; of
-            `precision`, which may be left out, `default_precision`.
+        defaults: settings of Lightning's trainer where the options have none; without
+            `precision`, `default_precision` applies.
 
     Returns:
-        What was measured, by name.
+        Metrics by name.
 
     Raises:
-        CheckpointError: the interrupted training is damaged or has other settings.
+        CheckpointError: If the interrupted training is damaged or has other settings.
         ConfigError: If a callback changes the weights after training.
         TrainingError: If a loss is not finite.
-        KeyboardInterrupt: the user has stopped it.
+        KeyboardInterrupt: If the user interrupts the training.
     """
     folder = options.folder / part if options.folder else None
-    held = (
-        sole_writer(folder, str(folder))
-        if folder and is_first_process()
-        else nullcontext()
-    )
-    in_terminal, state = sys.stderr.isatty(), None
-    callbacks = [
-        *callbacks,
-        *options.make_callbacks(),
-        History(folder / HISTORY if folder else None, "" if in_terminal else part),
-    ]
-    if in_terminal:
+    lease: AbstractContextManager[Any] = nullcontext()
+    if folder and is_first_process():
+        lease = sole_writer(folder, str(folder))
+    callbacks = [*callbacks, *options.make_callbacks()]
+    history_path = folder / HISTORY if folder else None
+    if sys.stderr.isatty():
+        callbacks.append(History(history_path, ""))
         callbacks.append(RichProgressBar(console_kwargs={"stderr": True}))
+    else:
+        callbacks.append(History(history_path, part))
     loggers = options.make_loggers(folder)
     trainer_settings: dict[str, Any] = {"logger": False}
-    with quietly(), held:
+    state = None
+    with quietly(), lease:
         if folder:
-            trainers = {
-                f"trainer.{name}": value
-                for name, value in options.trainer_settings.items()
-            }
-            state = _prepare(folder, options.resume, {**settings, **trainers})
-            last = ModelCheckpoint(
+            named = {f"trainer.{n}": v for n, v in options.trainer_settings.items()}
+            state = _prepare(folder, options.resume, {**settings, **named})
+            checkpoint = ModelCheckpoint(
                 folder,
                 Path(STATE).stem,
                 save_on_train_epoch_end=True,
                 enable_version_counter=False,
             )
-            callbacks.append(last)
-            events = TensorBoardLogger(folder, name="", version="")
-            trainer_settings = {"logger": events, "plugins": [WholeFiles()]}
+            callbacks.append(checkpoint)
+            trainer_settings["logger"] = TensorBoardLogger(folder, name="", version="")
+            trainer_settings["plugins"] = [AtomicCheckpointIO()]
         if loggers is not None:
             trainer_settings["logger"] = loggers
             for logger in loggers:
@@ -238,53 +228,59 @@ def fit(
         callbacks += [
             callback.guard for callback in callbacks if isinstance(callback, KeepBest)
         ]
-        trainer = make_trainer(callbacks, **trainer_settings, **options.chosen(**usual))
-        handler = signal.getsignal(signal.SIGINT)
-        devices = [options.place] if options.place.type == "cuda" else []
-        try:
-            with torch.random.fork_rng(
-                devices=devices
-            ):  # which training seeds anew each epoch
-                trainer.fit(
-                    module,
-                    **data,
-                    ckpt_path=state,
-                    weights_only=True if state else None,
-                )
-        except (
-            SystemExit
-        ):  # so the trainer ends when interrupted, deaf to further interruptions
-            signal.signal(signal.SIGINT, handler)
-            raise KeyboardInterrupt from None
-        except MisconfigurationException as error:
-            raise _unusable(error) from error
-        except (RuntimeError, EOFError, KeyError, pickle.UnpicklingError) as error:
-            if "conditioned on metric" in str(
-                error
-            ):  # of a callback that monitors what is not measured
-                raise _unusable(error) from error
-            if state is None or trainer.global_step:
-                raise
-            raise CheckpointError(
-                f"{state} is damaged: {type(error).__name__} {error}. Pass "
-                "--overwrite to restart."
-            ) from error
+        trainer_settings |= options.chosen(**defaults)
+        trainer = make_trainer(callbacks, **trainer_settings)
+        _run(trainer, module, data, state, options.place)
         return measured(trainer)
 
 
+def _run(
+    trainer: lightning.Trainer,
+    module: lightning.LightningModule,
+    data: Mapping[str, Any],
+    state: Path | None,
+    device: torch.device,
+) -> None:
+    """Train with a trainer, and convert its exceptions."""
+    handler = signal.getsignal(signal.SIGINT)
+    devices = [device] if device.type == "cuda" else []
+    try:
+        # Training seeds the generators in each epoch.
+        with torch.random.fork_rng(devices=devices):
+            trainer.fit(
+                module,
+                **data,
+                ckpt_path=state,
+                weights_only=True if state else None,
+            )
+    except SystemExit:  # an interrupted trainer exits and ignores further interrupts
+        signal.signal(signal.SIGINT, handler)
+        raise KeyboardInterrupt from None
+    except MisconfigurationException as error:
+        raise _unusable(error) from error
+    except (RuntimeError, EOFError, KeyError, pickle.UnpicklingError) as error:
+        # A callback monitors a metric that is not measured.
+        if "conditioned on metric" in str(error):
+            raise _unusable(error) from error
+        if state is None or trainer.global_step:
+            raise
+        raise CheckpointError(
+            f"{state} is damaged: {type(error).__name__} {error}. Pass --overwrite to "
+            "restart."
+        ) from error
+
+
 say = rank_zero_only(print)
-"""Prints a line once, also where several processes train together."""
+"""Print a line once, even if several processes train together."""
 
 
 def is_first_process() -> bool:
-    """Return whether this process is the only one, or the first of those that train
-    together.
-    """
+    """Return whether this is the only process, or the first of those training together."""
     return not getattr(rank_zero_only, "rank", 0)
 
 
 def interrupted(options: FitOptions, parts: Sequence[str]) -> list[str]:
-    """Return the parts whose training was interrupted in the folder of some options."""
+    """Return the parts whose interrupted training is in the folder of the options."""
     return [
         part
         for part in parts
@@ -293,56 +289,63 @@ def interrupted(options: FitOptions, parts: Sequence[str]) -> list[str]:
 
 
 def forget(options: FitOptions, part: str) -> None:
-    """Remove what a part's training would resume from; its logs stay."""
+    """Remove the state to resume a part's training from; its logs stay."""
     if options.folder and is_first_process():
         _drop(options.folder / part, STATE, _PARTIAL)
 
 
 def differing(expected: Mapping[str, Any], stored: Mapping[str, Any]) -> str:
-    """Return the settings in which two trainings differ, such as "another `seed`";
-    empty where there are none.
-    """
-    a, b = (
-        json.loads(json.dumps(settings, default=str)) for settings in (expected, stored)
-    )
-    for settings in (a, b):
-        settings |= settings.pop("config", {})  # those of a network, each by its name
+    """Return the settings that differ, such as "another `seed`"; empty if none."""
+    a = _flat(expected)
+    b = _flat(stored)
     names = sorted(name for name in {**a, **b} if a.get(name) != b.get(name))
     return f"another {' and '.join(f'`{name}`' for name in names)}" if names else ""
 
 
+def _flat(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings as plain data, with those of a network at the top level."""
+    plain = json.loads(json.dumps(settings, default=str))
+    return plain | plain.pop("config", {})
+
+
 def default_precision(accelerator: str) -> str:
-    """bf16-mixed where what is trained on, "cpu" or a GPU, has bfloat16 arithmetic,
-    32-true elsewhere.
+    """Return bf16-mixed if the device has bfloat16 arithmetic, otherwise 32-true.
+
+    Args:
+        accelerator: "cpu", or else a GPU.
     """
     if accelerator != "cpu":
-        known = torch.cuda.is_bf16_supported(including_emulation=False)
+        has_bf16 = torch.cuda.is_bf16_supported(including_emulation=False)
     else:
-        known = bool(
+        has_bf16 = bool(
             torch.backends.mkldnn.is_available()
             and torch.ops.mkldnn._is_mkldnn_bf16_supported()
         )
-    return "bf16-mixed" if known else "32-true"
+    return "bf16-mixed" if has_bf16 else "32-true"
 
 
 def _prepare(folder: Path, resume: bool, settings: Mapping[str, Any]) -> Path | None:
-    """Make the folder; return the state to resume from, if any."""
+    """Create the folder; return the state to resume from, if any.
+
+    Raises:
+        CheckpointError: If the interrupted training has other settings.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    state, described = (
-        folder / STATE,
-        json.dumps(settings, default=str, indent=1) + "\n",
-    )
+    state = folder / STATE
     if resume and state.exists():
-        if others := differing(settings, json.loads((folder / SETTINGS).read_text())):
+        stored = json.loads((folder / SETTINGS).read_text())
+        differences = differing(settings, stored)
+        if differences:
             raise CheckpointError(
                 f"Expected the settings of the interrupted training in {folder} to "
-                f"resume it, got {others}. "
-                "Repeat its settings, or pass --overwrite to restart."
+                f"resume it, got {differences}. Repeat its settings, or pass "
+                "--overwrite to restart."
             )
         return state
     if is_first_process():
         _drop(folder, STATE, _PARTIAL, HISTORY, "events.out.tfevents.*")
-        write_text(folder / SETTINGS, described)
+        text = json.dumps(settings, default=str, indent=1) + "\n"
+        write_text(folder / SETTINGS, text)
     return None
 
 
@@ -353,26 +356,24 @@ def _drop(folder: Path, *patterns: str) -> None:
 
 
 def make_trainer(callbacks: list[Callback], **settings: Any) -> lightning.Trainer:
-    """Make Lightning's trainer.
+    """Create Lightning's trainer.
 
     Raises:
-        ConfigError: it does not take the settings.
+        ConfigError: If it does not accept the settings.
     """
+    has_checkpoint = any(isinstance(c, Checkpoint) for c in callbacks)
+    has_progress_bar = any(isinstance(c, ProgressBar) for c in callbacks)
     try:
         return lightning.Trainer(
             callbacks=callbacks,
-            enable_checkpointing=any(
-                isinstance(callback, Checkpoint) for callback in callbacks
-            ),
-            enable_progress_bar=any(
-                isinstance(callback, ProgressBar) for callback in callbacks
-            ),
+            enable_checkpointing=has_checkpoint,
+            enable_progress_bar=has_progress_bar,
             enable_model_summary=False,
             num_sanity_val_steps=0,
             use_distributed_sampler=False,
             **settings,
         )
-    except Exception as error:  # Lightning raises of settings what its code meets
+    except Exception as error:  # Lightning raises various exceptions for settings
         raise out_of_memory(error) or _unusable(error) from error
 
 
@@ -384,87 +385,7 @@ def _unusable(error: Exception) -> ConfigError:
 
 @contextmanager
 def quietly() -> Iterator[None]:
-    """Keep Lightning's hints to its developers out of a user's terminal."""
+    """Suppress Lightning's hints for its developers."""
     with quiet("lightning.pytorch", "lightning.fabric"), warnings.catch_warnings():
         warnings.filterwarnings("ignore", module=r"lightning\..*")
         yield
-
-
-@dataclass(eq=False)
-class History(Callback):
-    """A callback that writes what was measured to a table, a row an epoch, and prints
-    it on standard error.
-
-    Lightning's `CSVLogger` writes training and validation to rows of their own, and
-    begins anew when it is resumed.
-
-    Args:
-        path: the table, CSV; None where none is kept.
-        part: what is trained; empty where nothing is said, since Lightning's bar is
-            shown in a terminal.
-        rows: what the table holds.
-    """
-
-    path: Path | None
-    part: str
-    rows: list[dict[str, float]] = field(default_factory=list)
-
-    def on_train_epoch_end(
-        self, trainer: lightning.Trainer, module: lightning.LightningModule
-    ) -> None:
-        """Add a row; reject a loss that is not finite."""
-        measures, epoch = measured(trainer), trainer.current_epoch + 1
-        rate = float(trainer.optimizers[0].param_groups[0]["lr"])
-        self.rows.append(
-            {
-                "epoch": epoch,
-                "step": trainer.global_step,
-                "learning_rate": rate,
-                **measures,
-            }
-        )
-        if self.path and trainer.is_global_zero:
-            write_text(self.path, pd.DataFrame(self.rows).to_csv(index=False))
-        if self.part and trainer.is_global_zero:
-            text = in_words(measures, "valid_") or in_words(measures)
-            tell(f"{self.part}: epoch {epoch}/{trainer.max_epochs}, {text}")
-        for name, value in measures.items():
-            if name in _LOSSES and not math.isfinite(value):
-                raise TrainingError(
-                    f"{name} became {value} in epoch {epoch}. Train with a lower "
-                    "`learning_rate`, or mend the loss. "
-                    "Nothing was kept of this epoch."
-                )
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return what `load_state_dict` takes."""
-        return {"rows": self.rows}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Resume from an earlier state."""
-        self.rows = list(state["rows"])
-
-
-class WholeFiles(TorchCheckpointIO):
-    """A writer of Lightning checkpoints, each whole or not at all.
-
-    Lightning's own way moves a temporary file, which is no one step where these are on
-    another disk.
-    """
-
-    def save_checkpoint(
-        self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None
-    ) -> None:
-        """Write it next to its name, then rename it."""
-        with replacing(Path(path), durable=False) as partial:
-            torch.save(checkpoint, partial)
-
-
-def in_words(metrics: Mapping[str, float], prefix: str = "") -> str:
-    """Those of some measures whose names begin with a prefix, without it."""
-    chosen = {
-        name.removeprefix(prefix): value
-        for name, value in metrics.items()
-        if name.startswith(prefix)
-    }
-    return ", ".join(f"{name} {value:.4f}" for name, value in chosen.items())

@@ -1,4 +1,4 @@
-"""Training the class-wise GPs of a fused model, on maps or on a robot's slip logs."""
+"""Training of the class-wise GPs of a fused model, on maps or on a robot's slip logs."""
 
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -12,8 +12,9 @@ from torch.utils.data import DataLoader
 from benchnav.core.command import Device, tell
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.files.robot_logs import ENDINGS
-from benchnav.models.checkpoint import GP, Checkpoint, Part
+from benchnav.models.checkpoint import Checkpoint, Part
 from benchnav.models.config import LatentGPConfig, check_seed
+from benchnav.models.parts import GP
 from benchnav.models.slope_gp.cells import (
     Cells,
     SlopeSums,
@@ -30,19 +31,18 @@ from benchnav.models.training.data import TRAIN, VALID, open_dataset, training_d
 from benchnav.models.training.fit import FitOptions, fit, say
 from benchnav.models.training.target import existing, fresh_checkpoint, open_target
 
-_HELD_OUT = 0.1  # of slip logs
-_FEW_ROWS = 10  # of a class in slip logs
+_HELD_OUT = 0.1  # fraction of the rows of slip logs
+_MIN_ROWS = 10  # of a class in slip logs; fewer raise a warning
 
 
 def fit_gps(
     config: LatentGPConfig, sums: SlopeSums, device: Device = "cpu"
 ) -> LatentGPs:
-    """Trains the class-wise GPs on sums over cells, in float64 on one device; nothing
-    is drawn.
+    """Train the class-wise GPs on sums over cells, in float64 and without randomness.
 
     Args:
-        config: what to train.
-        sums: of the cells of all classes, from maps or from a robot's logs.
+        config: settings.
+        sums: sums over the cells of all classes, from maps or from a robot's logs.
         device: where to train.
 
     Returns:
@@ -52,20 +52,20 @@ def fit_gps(
     if config.second_component and censored:
         soft, bins = find_soft_modes(sums)
     else:
-        soft, bins = None, sums.bins(censored)
+        soft = None
+        bins = sums.bins(censored)
     model = LatentGPs(config, sums.steepest_deg, soft)
-    # All cells are in each batch. A generator of its own keeps the loader from drawing
-    # on PyTorch's global one.
+    # Each batch has all cells. Its own generator prevents the loader from drawing from
+    # PyTorch's global one.
     batches: Any = [bins] * config.epoch_steps
     loader = DataLoader(batches, batch_size=None, generator=torch.Generator())
-    data = {"train_dataloaders": loader}
     fit(
         model,
         GP,
         FitOptions(device=device),
         {},
         [],
-        data,
+        {"train_dataloaders": loader},
         max_epochs=config.epochs,
         precision="64-true",
     )
@@ -73,120 +73,115 @@ def fit_gps(
 
 
 def train_gps(data: str, out: str, config: LatentGPConfig, options: FitOptions) -> None:
-    """Trains the GPs on a dataset or on slip logs, into a checkpoint.
+    """Train the GPs on a dataset or on slip logs, into a checkpoint.
 
     Args:
         data: path or id of a dataset, or path of slip logs.
         out: folder of the checkpoint.
-        config: what to train.
-        options: how to train.
+        config: settings of the GPs.
+        options: training options.
     """
     check_seed(options.seed)
     if data.endswith(ENDINGS):
         _train_on_logs(data, out, config, options)
         return
     dataset = open_dataset(data)
-    target = open_target(
-        out, fresh_checkpoint(dataset), [GP], training_digest(dataset), options, dataset
-    )
+    digest = training_digest(dataset)
+    fresh = fresh_checkpoint(dataset)
+    target = open_target(out, fresh, [GP], digest, options, dataset)
     target.add(GP, train_gps_on_maps(config, dataset, options))
 
 
 def train_gps_on_maps(
     config: LatentGPConfig, dataset: TerrainDataset, options: FitOptions
 ) -> Part:
-    """Trains the GPs on the split `train` and gives them as a part of a checkpoint."""
+    """Train the GPs on the split `train` and return them as a part of a checkpoint."""
     names = [item.name for item in dataset.recipe.classes]
     model = _fit_and_say(config, sum_split(dataset, TRAIN), names, options.device)
-    known = dataset.truth_of(VALID) == "generated"
-    found = measure_latent(model.tabulate(), dataset.terrain_chunks(VALID), known)
-    errors = (
-        f"RMSE of the latent mean {found['latent_rmse']:.4f}, largest error of the "
-        f"noise {found['noise_error']:.1%}, "
-        if known
-        else "(errors unknown, since the true distribution of λ of this ground is "
-        "unknown) "
-    )
-    say(f"gp: validation {errors}NLL {found['nll']:.4f}")
-    metrics = {f"valid_{name}": value for name, value in found.items()}
+    has_truth = dataset.truth_of(VALID) == "generated"
+    chunks = dataset.terrain_chunks(VALID)
+    scores = measure_latent(model.tabulate(), chunks, has_truth)
+    errors = "(errors unknown, since the true distribution of λ is unknown) "
+    if has_truth:
+        errors = (
+            f"RMSE of the latent mean {scores['latent_rmse']:.4f}, largest error of "
+            f"the noise {scores['noise_error']:.1%}, "
+        )
+    say(f"gp: validation {errors}NLL {scores['nll']:.4f}")
+    metrics = {f"valid_{name}": value for name, value in scores.items()}
     return _part(model, options.seed, metrics, dataset.id, training_digest(dataset))
 
 
 def _train_on_logs(
     data: str, out: str, config: LatentGPConfig, options: FitOptions
 ) -> None:
-    """Trains the GPs on slip logs, into a checkpoint, whose class table the logs are
-    read with if it is there.
+    """Train the GPs on slip logs, into a checkpoint.
+
+    The logs are read with the class table of the checkpoint if it exists.
     """
-    there = existing(Path(out), options.overwrite)
-    names, cells, sha256, drive = read_slip_logs(
-        data, there.class_names if there else ()
-    )
-    sums, digest = SlopeSums.of(cells, len(names)), f"file:{sha256}"
+    checkpoint = existing(Path(out), options.overwrite)
+    known_classes = checkpoint.class_names if checkpoint else ()
+    names, cells, sha256, drive = read_slip_logs(data, known_classes)
+    sums = SlopeSums.of(cells, len(names))
+    digest = f"file:{sha256}"
     target = open_target(out, Checkpoint(class_names=names), [GP], digest, options)
     counts = dict(zip(names, sums.count.tolist(), strict=True))
-    if few := [
-        f"{name} {count}" for name, count in counts.items() if count < _FEW_ROWS
-    ]:
-        lost = (
-            f"; the GPs that {out} held for them are dropped"
-            if there and GP in there.parts
-            else ""
-        )
+    rare = [f"{name} {count}" for name, count in counts.items() if count < _MIN_ROWS]
+    if rare:
+        replaced = ""
+        if checkpoint and GP in checkpoint.parts:
+            replaced = f"; the GPs for them in {out} are dropped"
         tell(
-            f"benchnav-train: warning: {data} has fewer than {_FEW_ROWS} rows of "
-            f"{len(few)} of {len(counts)} classes "
-            f"({', '.join(few)}); their GPs stay close to the prior, which is "
-            f"vague{lost}"
+            f"benchnav-train: warning: {data} has fewer than {_MIN_ROWS} rows of "
+            f"{len(rare)} of {len(counts)} classes ({', '.join(rare)}); their GPs stay "
+            f"close to the prior, which is vague{replaced}"
         )
     metrics = {}
-    if measured_on := _held_out(cells, drive, options.seed):
-        kept, held, whose = measured_on
-        trial = fit_gps(config, SlopeSums.of(kept, len(names)), options.device)
-        metrics["held_out_nll"] = cell_nll(held, trial.tabulate())
+    halves = _held_out(cells, drive, options.seed)
+    if halves:
+        training, held_out, description = halves
+        training_sums = SlopeSums.of(training, len(names))
+        preliminary = fit_gps(config, training_sums, options.device)
+        metrics["held_out_nll"] = cell_nll(held_out, preliminary.tabulate())
         say(
-            f"gp: NLL {metrics['held_out_nll']:.4f} on {len(held)} held-out rows, "
-            f"{whose}; training on all rows next"
+            f"gp: NLL {metrics['held_out_nll']:.4f} on {len(held_out)} held-out rows, "
+            f"{description}; training on all rows next"
         )
     model = _fit_and_say(config, sums, names, options.device)
-    say(
-        "gp: training rows: "
-        f"{', '.join(f'{name} {count}' for name, count in counts.items())}"
-    )
+    rows = ", ".join(f"{name} {count}" for name, count in counts.items())
+    say(f"gp: training rows: {rows}")
     target.add(GP, _part(model, options.seed, metrics, Path(data).name, digest))
 
 
 def _held_out(
     cells: Cells, drive: Tensor | None, seed: int
 ) -> tuple[Cells, Cells, str] | None:
-    """Rows to learn from, rows to measure on, and which these are; None where there are
-    too few.
-    """
-    if drive is not None and (drives := len(drive.unique())) > 1:
-        held = hold_out_drives(drive, _HELD_OUT, seed)
-        return (
-            cells.select(~held),
-            cells.select(held),
-            f"all of {len(drive[held].unique())} of {drives} drives",
-        )
+    """Return rows to learn from, held-out rows and their description; None if too few."""
+    n_drives = 0 if drive is None else len(drive.unique())
+    if drive is not None and n_drives > 1:
+        mask = hold_out_drives(drive, _HELD_OUT, seed)
+        n_held_out = len(drive[mask].unique())
+        description = f"all of {n_held_out} of {n_drives} drives"
+        return cells.select(~mask), cells.select(mask), description
     if int(cells.class_id.bincount().max()) < 1 / _HELD_OUT:
         return None
-    return *hold_out(cells, _HELD_OUT, seed), "which follow one another in each class"
+    training, held_out = hold_out(cells, _HELD_OUT, seed)
+    return training, held_out, "which follow one another in each class"
 
 
 def _fit_and_say(
     config: LatentGPConfig, sums: SlopeSums, class_names: Sequence[str], device: Device
 ) -> LatentGPs:
-    """Trains the GPs, and names the classes that were found to have a second mode."""
+    """Train the GPs, and print the classes with a second mode."""
     model = fit_gps(config, sums, device)
-    if soft := model.soft:
-        modes = zip(class_names, *(values.tolist() for values in soft), strict=True)
-        found = [
-            f"{name} {share:.1%} of N({mean:.3f}, {std:.3f})"
-            for name, share, mean, std in modes
-            if share
+    if model.soft:
+        modes = zip(class_names, *(v.tolist() for v in model.soft), strict=True)
+        soft_spots = [
+            f"{name} {weight:.1%} of N({mean:.3f}, {std:.3f})"
+            for name, weight, mean, std in modes
+            if weight
         ]
-        say(f"gp: soft spots of {', '.join(found)}")
+        say(f"gp: soft spots of {', '.join(soft_spots)}")
     return model
 
 

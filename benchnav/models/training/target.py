@@ -1,8 +1,8 @@
-"""The checkpoint that a training goes into: what may be written there, and what is
-there already.
+"""Target of a training: the checkpoint that receives the parts, and checks of its present
+content.
 
-Every refusal comes before any work is done. Where processes train together, the first
-alone refuses and writes.
+All checks precede any work. If several processes train together, only the first checks
+and writes.
 """
 
 from collections.abc import Mapping
@@ -21,12 +21,12 @@ from benchnav.models.checkpoint import (
     FUSED,
     Checkpoint,
     Part,
-    is_member,
     load_checkpoint,
     open_place,
     save_checkpoint,
 )
 from benchnav.models.config import TrainingConfig
+from benchnav.models.parts import is_member
 from benchnav.models.training.fit import (
     FitOptions,
     differing,
@@ -38,15 +38,14 @@ from benchnav.models.training.fit import (
 
 @dataclass
 class Target:
-    """A checkpoint that parts are added to, one after the other, each saved as soon as
-    it is trained.
+    """A checkpoint that receives trained parts; each is saved when it is trained.
 
     Args:
-        folder: where it is saved.
-        checkpoint: what it holds so far.
-        digest: of the data that parts are trained on.
-        options: how they are trained.
-        maps: that parts are trained on; None where it is a robot's logs.
+        folder: folder of the checkpoint.
+        checkpoint: present content.
+        digest: digest of the training data.
+        options: training options.
+        maps: training data; None for a robot's logs.
         changed: whether anything was saved.
     """
 
@@ -57,59 +56,55 @@ class Target:
     maps: TerrainDataset | None = None
     changed: bool = False
 
-    def holds(self, name: str, config: Any, seed: int) -> bool:
-        """Tells whether an interrupted run has left a part, trained in the same way.
+    def has_part(self, name: str, config: Any, seed: int) -> bool:
+        """Return whether an interrupted run has trained a part with the same settings.
 
         Args:
-            name: of the part.
-            config: settings of its training; such of a `TrainingConfig` under those of
-                the trainer as well.
+            name: name of the part.
+            config: settings of its training; for a `TrainingConfig`, settings of the
+                trainer are compared as well.
             seed: its root seed.
 
         Raises:
-            CheckpointError: it was trained in another way.
+            CheckpointError: If it was trained with other settings.
         """
         part = self.checkpoint.parts.get(name)
         if part is None:
             return False
-        # A part of an earlier version does not name settings that came later, nor those
-        # of the trainer.
-        options, defaults = self.options, _defaults(type(config))
-        wanted = {**asdict(config), "seed": seed, "data": self.digest}
-        there = {key: part.config.get(key, usual) for key, usual in defaults.items()}
-        there |= {"seed": part.seed, "data": part.data_digest}
+        options = self.options
+        # Parts of earlier versions lack settings added later, and those of the trainer.
+        expected = {**asdict(config), "seed": seed, "data": self.digest}
+        stored = {
+            key: part.config.get(key, default)
+            for key, default in _defaults(type(config)).items()
+        }
+        stored |= {"seed": part.seed, "data": part.data_digest}
         if isinstance(config, TrainingConfig):
             for key in ("half_precision", "conformal"):
-                wanted[key], there[key] = getattr(options, key), getattr(part, key)
+                expected[key] = getattr(options, key)
+                stored[key] = getattr(part, key)
             if part.trainer is not None:
-                wanted |= {
-                    f"trainer.{key}": value
-                    for key, value in options.trainer_settings.items()
+                expected |= {
+                    f"trainer.{k}": v for k, v in options.trainer_settings.items()
                 }
-                there |= {
-                    f"trainer.{key}": value for key, value in part.trainer.items()
-                }
-        others = differing(wanted, there)
-        if not others:
-            forget(options, name)  # a kill may have come between saving and forgetting
+                stored |= {f"trainer.{k}": v for k, v in part.trainer.items()}
+        differences = differing(expected, stored)
+        if not differences:
+            forget(options, name)  # a kill may have prevented this after saving
             return True
         remedy = "pass --overwrite instead of --resume"
         if interrupted(options, [name]):
             remedy = (
-                "pass --overwrite with --resume to go on with the training that "
-                "replaces it"
+                "pass --overwrite with --resume to resume the training that replaces it"
             )
         raise CheckpointError(
             f"Expected the {name} in {self.folder} to be of these settings, seed and "
-            "maps, got others: of seed "
-            f"{part.seed} and {part.data_id}, {others}. Repeat its settings, or "
-            f"{remedy}."
+            f"maps, got others: of seed {part.seed} and {part.data_id}, {differences}. "
+            f"Repeat its settings, or {remedy}."
         )
 
     def add(self, name: str, part: Part) -> None:
-        """Saves a trained part with the rest, and with the statistics of the ground
-        that it was trained on.
-        """
+        """Save a trained part, and the statistics of the terrain that it was trained on."""
         self.checkpoint = self.checkpoint.with_part(name, part)
         if self.maps and not self.changed and is_first_process():
             self.checkpoint = replace(self.checkpoint, ground=_ground_of(self.maps))
@@ -117,7 +112,7 @@ class Target:
         forget(self.options, name)
 
     def set_pool_temperature(self, temperature: float) -> None:
-        """Saves the temperature of the pool of classifiers with the rest."""
+        """Save the temperature of the pool of networks."""
         if temperature != self.checkpoint.pool_temperature:
             self.checkpoint = replace(
                 self.checkpoint, pool_temperature=temperature, conformal={}
@@ -125,7 +120,7 @@ class Target:
             self._save()
 
     def set_conformal(self, table: Mapping[str, Any]) -> None:
-        """Saves the table of a conformal recalibration with the rest."""
+        """Save the table of a conformal recalibration."""
         self.checkpoint = replace(self.checkpoint, conformal=table)
         self._save()
 
@@ -142,8 +137,12 @@ class Target:
 def fresh_checkpoint(
     dataset: TerrainDataset, model: str = FUSED, code: str = ""
 ) -> Checkpoint:
-    """A checkpoint without parts, of a family of models, the classes of a dataset and
-    the digest of a class's code.
+    """Return a checkpoint without parts.
+
+    Args:
+        dataset: training data; its classes become those of the checkpoint.
+        model: family of the model.
+        code: digest of the code of a custom class.
     """
     return Checkpoint(
         class_names=tuple(item.name for item in dataset.recipe.classes),
@@ -160,84 +159,86 @@ def open_target(
     options: FitOptions,
     maps: TerrainDataset | None = None,
 ) -> Target:
-    """Opens the checkpoint that training goes into.
+    """Open the checkpoint that receives the parts.
 
     Args:
-        out: folder where it is, or will be.
-        fresh: without parts, of the family and classes that are to be trained.
+        out: folder of the checkpoint, which need not exist.
+        fresh: a checkpoint without parts, of the family and classes to train.
         parts: names of the parts to train.
-        digest: of the data that they are trained on.
-        options: how to train, and whether what is there may be replaced.
-        maps: that they are trained on; None where it is a robot's logs.
+        digest: digest of the training data.
+        options: training options, and whether parts may be replaced.
+        maps: training data; None for a robot's logs.
 
     Raises:
-        CheckpointError: what is there would be lost or does not fit.
-        ConfigError: the folder is something else.
+        CheckpointError: If parts would be lost or do not match.
+        ConfigError: If the folder is not a checkpoint.
     """
-    left = interrupted(options, parts)
-    # The first process alone refuses; those beside it begin without what it may have
-    # saved meanwhile.
-    may_replace = options.overwrite or not (options.resume or is_first_process())
-    if left and not (options.resume or may_replace):
+    unfinished = interrupted(options, parts)
+    # Only the first process checks; the others ignore what it may have saved already.
+    is_other_process = not (options.resume or is_first_process())
+    may_replace = options.overwrite or is_other_process
+    if unfinished and not (options.resume or may_replace):
         raise CheckpointError(
             f"Expected no interrupted training in {options.folder}, got one of "
-            f"{' and '.join(left)}. "
-            "Pass --resume to go on with it, or --overwrite to start again."
+            f"{' and '.join(unfinished)}. Pass --resume to resume it, or --overwrite "
+            "to restart."
         )
-    # Whether a checkpoint can be written there shows now rather than after the
-    # training.
+    # An unwritable checkpoint is reported before the training instead of after it.
     with open_place(out) as (folder, _):
         checkpoint = existing(folder, may_replace) or fresh
-    if (
-        checkpoint.code != fresh.code
-        and checkpoint.model == fresh.model
-        and not may_replace
-    ):
-        raise CheckpointError(
-            f"Expected checkpoint {folder} to be of the present code of "
-            f"{fresh.model}, got one of other code. "
-            "Pass --overwrite to replace it."
-        )
+    if not may_replace:
+        _check_family(folder, checkpoint, fresh)
     if (checkpoint.model, checkpoint.class_names) != (fresh.model, fresh.class_names):
-        if not may_replace:
-            wanted, got = (
-                f"a {item.model} model of the classes {', '.join(item.class_names)}"
-                for item in (fresh, checkpoint)
-            )
-            raise CheckpointError(
-                f"Expected checkpoint {folder} to be {wanted}, got {got}. "
-                "Choose another `out`, or pass --overwrite to replace it."
-            )
         checkpoint = fresh
     checkpoint = replace(checkpoint, code=fresh.code)
     if may_replace:
-        # Members of an ensemble stand or fall together.
-        kept = {
+        # Members of an ensemble are replaced together.
+        remaining = {
             name: part
             for name, part in checkpoint.parts.items()
             if name not in parts and not any(is_member(name, stem) for stem in parts)
         }
-        checkpoint = replace(checkpoint, parts=kept)
+        checkpoint = replace(checkpoint, parts=remaining)
     elif not options.resume and not checkpoint.parts.keys().isdisjoint(parts):
-        # The processes alone are trained in a moment, and so not gone on with.
-        resume = (
-            ", or --resume to go on with an interrupted training"
-            if options.folder
-            else ""
-        )
+        # GPs alone train quickly and have no folder to resume from.
+        resume = ""
+        if options.folder:
+            resume = ", or --resume to resume an interrupted training"
+        trained = " and ".join(sorted(checkpoint.parts))
         raise CheckpointError(
             f"Expected `out` without a trained {' or '.join(parts)}, got {folder} "
-            "with "
-            f"{' and '.join(sorted(checkpoint.parts))}. Choose another `out`, or pass "
-            "--overwrite to replace it"
+            f"with {trained}. Choose another `out`, or pass --overwrite to replace it"
             f"{resume}."
         )
     return Target(folder, checkpoint, digest, options, maps)
 
 
+def _check_family(folder: Path, checkpoint: Checkpoint, fresh: Checkpoint) -> None:
+    """Check that a checkpoint has the model, code and classes of the training.
+
+    Raises:
+        CheckpointError: If it does not.
+    """
+    if checkpoint.code != fresh.code and checkpoint.model == fresh.model:
+        raise CheckpointError(
+            f"Expected checkpoint {folder} to be of the present code of "
+            f"{fresh.model}, got one of other code. Pass --overwrite to replace it."
+        )
+    if (checkpoint.model, checkpoint.class_names) != (fresh.model, fresh.class_names):
+        expected, got = (
+            f"a {item.model} model of the classes {', '.join(item.class_names)}"
+            for item in (fresh, checkpoint)
+        )
+        raise CheckpointError(
+            f"Expected checkpoint {folder} to be {expected}, got {got}. Choose another "
+            "`out`, or pass --overwrite to replace it."
+        )
+
+
 def _ground_of(dataset: TerrainDataset) -> GroundStatistics | None:
-    """Statistics of a dataset's ground; None where no λ was observed, so that classes
-    alone can be learned.
+    """Return statistics of a dataset's terrain; None if λ was not observed.
+
+    Without observed λ only classes can be learned.
     """
     try:
         return fit_ground(dataset)
@@ -246,8 +247,10 @@ def _ground_of(dataset: TerrainDataset) -> GroundStatistics | None:
 
 
 def existing(folder: Path, overwrite: bool) -> Checkpoint | None:
-    """The checkpoint in a folder; None where there is none, or a damaged one that may
-    be replaced.
+    """Return the checkpoint in a folder.
+
+    Returns:
+        None if the folder has no checkpoint, or a damaged one that may be overwritten.
     """
     try:
         return load_checkpoint(folder) if (folder / CONFIG).is_file() else None
@@ -258,16 +261,15 @@ def existing(folder: Path, overwrite: bool) -> Checkpoint | None:
 
 
 def _defaults(kind: type) -> dict[str, Any]:
-    """Usual values of all settings, plain data; None of those that have none."""
-    usual = {
-        item.name: item.default_factory()
-        if item.default_factory is not MISSING
-        else item.default
-        for item in fields(kind)
-    }
-    return {
-        name: asdict(value)
-        if is_dataclass(value) and not isinstance(value, type)
-        else value
-        for name, value in usual.items()
-    } | {name: None for name, value in usual.items() if value is MISSING}
+    """Return the defaults of all settings as plain data; None for those without one."""
+    defaults: dict[str, Any] = {}
+    for item in fields(kind):
+        value: Any = item.default
+        if item.default_factory is not MISSING:
+            value = item.default_factory()
+        if value is MISSING:
+            value = None
+        elif is_dataclass(value) and not isinstance(value, type):
+            value = asdict(value)
+        defaults[item.name] = value
+    return defaults

@@ -1,10 +1,9 @@
-"""Loggers and callbacks of Lightning that a user names as text, and that are made when
-a training begins.
+"""Loggers and callbacks of Lightning that a user names as text and that training creates.
 
 A class is named as `CSVLogger`, `package.module.Class`, `package.module:Class` or
 `path/to/file.py:Class`; with arguments as `{class_path: …, init_args: {…}}`, and
-several as a list. Loggers do not change what is trained, callbacks
-may: these are recorded, with a digest of the code of those that are not Lightning's.
+several as a list. Loggers do not affect the training. Callbacks may; they are recorded,
+with a digest of the code of those that are not part of Lightning.
 """
 
 import importlib
@@ -29,8 +28,8 @@ from benchnav.core.sources import (
     load_file,
 )
 
-# Callbacks of Lightning whose effect on weights or rates the kept epoch would undo, and
-# what to do in place of them.
+# Callbacks of Lightning whose effect on weights or rates restoring the kept epoch would
+# undo, with a remedy.
 _UNDONE = {
     "StochasticWeightAveraging": "`fit swag` averages weights.",
     "WeightAveraging": "`fit swag` averages weights.",
@@ -44,99 +43,103 @@ _LIGHTNING = {
 }
 
 
-def make_loggers(given: Any, folder: Path | None) -> list[Logger]:
-    """Make the loggers that a user asks for.
+def make_loggers(specs: Any, folder: Path | None) -> list[Logger]:
+    """Create the loggers that a user requests.
 
     Args:
-        given: one or a list, as text, mapping or object; False for none.
-        folder: where those write that are given no `save_dir`.
+        specs: one or a list, as text, mapping or object; False for none.
+        folder: output folder of loggers without `save_dir`.
 
     Raises:
-        ConfigError: there is no such class, its package is missing, or it does not take
-            its arguments.
+        ConfigError: If a class does not exist, its package is missing, or it does not
+            accept its arguments.
     """
-    return (
-        []
-        if given is False
-        else [_made("logger", item, folder) for item in _listed(given)]
-    )
+    if specs is False:
+        return []
+    return [_create("logger", spec, folder) for spec in _as_list(specs)]
 
 
-def make_callbacks(given: Any) -> list[Callback]:
-    """Make the callbacks that a user asks for.
+def make_callbacks(specs: Any) -> list[Callback]:
+    """Create the callbacks that a user requests.
+
+    Args:
+        specs: one or a list, as text, mapping or object.
 
     Raises:
-        ConfigError: As in `make_loggers`, or if what a callback does to weights or
+        ConfigError: As in `make_loggers`, or if the effect of a callback on weights or
             rates would be undone.
     """
-    callbacks = [_made("callbacks", item, None) for item in _listed(given)]
+    callbacks = [_create("callbacks", spec, None) for spec in _as_list(specs)]
     for name, remedy in _UNDONE.items():
+        kind = getattr(lightning_callbacks, name)
         for callback in callbacks:
             expect(
-                not isinstance(callback, getattr(lightning_callbacks, name)),
-                "`trainer.callbacks` that leave weights and rates as they are, got "
-                f"{type(callback).__name__}, "
-                f"whose effect would be undone. {remedy}",
+                not isinstance(callback, kind),
+                "`trainer.callbacks` that leave weights and rates unchanged, got "
+                f"{type(callback).__name__}, whose effect would be undone. {remedy}",
             )
     return callbacks
 
 
-def described(given: Any) -> list[dict[str, Any]]:
-    """What is recorded of callbacks, as plain data: their text, arguments, and a digest
-    of code that is not ours.
-    """
-    found = []
-    for item in _listed(given):
-        if isinstance(item, Callback):
-            kind, place = type(item), f"{type(item).__module__}.{type(item).__name__}"
-            arguments: dict[str, Any] = {}
+def described(specs: Any) -> list[dict[str, Any]]:
+    """Return callbacks as plain data: class, arguments, and a digest of foreign code."""
+    records = []
+    for spec in _as_list(specs):
+        arguments: dict[str, Any] = {}
+        if isinstance(spec, Callback):
+            kind = type(spec)
+            class_path = f"{kind.__module__}.{kind.__name__}"
         else:
-            place, arguments = _split("callbacks", item)
-            kind = _class("callbacks", place)
-        foreign = not kind.__module__.startswith("lightning.")
-        found.append(
-            {
-                "class_path": place,
-                **({"init_args": arguments} if arguments else {}),
-                **({"digest": _digest(kind, place)} if foreign else {}),
-            }
-        )
-    return found
+            class_path, arguments = _split("callbacks", spec)
+            kind = _class("callbacks", class_path)
+        record: dict[str, Any] = {"class_path": class_path}
+        if arguments:
+            record["init_args"] = arguments
+        if not kind.__module__.startswith("lightning."):
+            record["digest"] = _digest(kind, class_path)
+        records.append(record)
+    return records
 
 
-def _listed(given: Any) -> list[Any]:
-    return list(given) if isinstance(given, list | tuple) else [given]
+def _as_list(specs: Any) -> list[Any]:
+    return list(specs) if isinstance(specs, list | tuple) else [specs]
 
 
-def _split(what: str, item: Any) -> tuple[str, dict[str, Any]]:
-    """The name of a class, and its arguments."""
-    if isinstance(item, str):
-        return item, {}
-    fits = isinstance(item, Mapping) and {"class_path"} <= set(item) <= {
-        "class_path",
-        "init_args",
-    }
-    expect(
-        fits
-        and isinstance(item["class_path"], str)
-        and isinstance(item.get("init_args") or {}, Mapping),
-        f"`trainer.{what}` as a class or as {{class_path: CLASS, init_args: {{…}}}}, "
-        f"got {item!r}.",
+def _split(setting: str, spec: Any) -> tuple[str, dict[str, Any]]:
+    """Return the name of a class, and its arguments."""
+    if isinstance(spec, str):
+        return spec, {}
+    is_valid = (
+        isinstance(spec, Mapping)
+        and {"class_path"} <= set(spec) <= {"class_path", "init_args"}
+        and isinstance(spec["class_path"], str)
+        and isinstance(spec.get("init_args") or {}, Mapping)
     )
-    return item["class_path"], dict(item.get("init_args") or {})
+    expect(
+        is_valid,
+        f"`trainer.{setting}` as a class or as {{class_path: CLASS, init_args: {{…}}}}, "
+        f"got {spec!r}.",
+    )
+    return spec["class_path"], dict(spec.get("init_args") or {})
 
 
-def _class(what: str, place: str) -> type:
-    module, base = _LIGHTNING[what]
-    known = [name for name in vars(module) if _is_kind(getattr(module, name), base)]
-    if place in known:
-        return getattr(module, place)
-    owner, colon, name = place.rpartition(":" if ":" in place else ".")
-    if not colon or not owner:
+def _class(setting: str, class_path: str) -> type:
+    """Return the class of a logger or callback.
+
+    Raises:
+        ConfigError: If it does not exist or has the wrong base.
+    """
+    module, base = _LIGHTNING[setting]
+    options = [name for name in vars(module) if _is_kind(getattr(module, name), base)]
+    if class_path in options:
+        return getattr(module, class_path)
+    separator = ":" if ":" in class_path else "."
+    owner, _, name = class_path.rpartition(separator)
+    if not owner:
         raise ConfigError(
-            f"Expected `trainer.{what}` among {', '.join(known)}, "
+            f"Expected `trainer.{setting}` among {', '.join(options)}, "
             "package.module.Class or path/to/file.py:Class, got "
-            f"{place!r}.{hint(place, known)}"
+            f"{class_path!r}.{hint(class_path, options)}"
         )
     if owner.endswith(".py"):
         path = Path(os.path.expanduser(owner))
@@ -144,58 +147,64 @@ def _class(what: str, place: str) -> type:
             content = path.read_bytes()
         except OSError as error:
             raise ConfigError(
-                f"Expected `trainer.{what}` in a file, got {owner!r}, which cannot be "
-                f"read: {error.strerror}."
+                f"Expected `trainer.{setting}` in a file, got {owner!r}, which cannot "
+                f"be read: {error.strerror}."
             ) from error
-        found = attribute(load_file(path.resolve(), content), owner, name)
+        kind = attribute(load_file(path.resolve(), content), owner, name)
     else:
         try:
-            found = attribute(importlib.import_module(owner), owner, name)
+            kind = attribute(importlib.import_module(owner), owner, name)
         except BenchnavError:
             raise
         except Exception as error:  # a user's module may raise anything
             raise out_of_memory(error) or ConfigError(
-                f"Expected `trainer.{what}` from a module, got {place!r}: "
+                f"Expected `trainer.{setting}` from a module, got {class_path!r}: "
                 f"{one_line(error)}"
             ) from error
     expect(
-        _is_kind(found, base),
-        f"`trainer.{what}` as a class of lightning's {base.__name__}, got {place!r}.",
+        _is_kind(kind, base),
+        f"`trainer.{setting}` as a class of lightning's {base.__name__}, got "
+        f"{class_path!r}.",
     )
-    return found
+    return kind
 
 
 def _is_kind(value: Any, base: type) -> bool:
     return inspect.isclass(value) and issubclass(value, base) and value is not base
 
 
-def _made(what: str, item: Any, folder: Path | None) -> Any:
-    if isinstance(item, _LIGHTNING[what][1]):
-        return item
-    place, arguments = _split(what, item)
-    kind = _class(what, place)
-    if what == "logger" and "save_dir" in inspect.signature(kind).parameters:
+def _create(setting: str, spec: Any, folder: Path | None) -> Any:
+    """Return a logger or callback from its specification."""
+    if isinstance(spec, _LIGHTNING[setting][1]):
+        return spec
+    class_path, arguments = _split(setting, spec)
+    kind = _class(setting, class_path)
+    if setting == "logger" and "save_dir" in inspect.signature(kind).parameters:
         arguments.setdefault("save_dir", str(folder or "."))
     try:
         return kind(**arguments)
     except ModuleNotFoundError as error:
-        wanted = re.search(
-            r"[Rr]equirement '([\w-]+)|pip install (?:-U )?'?([\w-]+)", str(error)
-        )
-        package = error.name or (wanted[1] or wanted[2] if wanted else "PACKAGE")
+        package = error.name or _package_in(str(error))
         raise ConfigError(
-            f"Expected the package that {place} needs, got none: "
+            f"Expected the package that {class_path} needs, got none: "
             f"{one_line(error)[:160]} "
             f"Install it, such as: pip install {package.partition('.')[0]}"
         ) from error
     except Exception as error:  # a user's class may raise anything
         raise out_of_memory(error) or ConfigError(
-            f"Expected arguments that {place} takes, got: {one_line(error)[:300]}"
+            f"Expected arguments that {class_path} takes, got: {one_line(error)[:300]}"
         ) from error
 
 
-def _digest(kind: type, place: str) -> str:
-    owner = place.rpartition(":")[0]
+def _package_in(message: str) -> str:
+    """Return the package that an error message of Lightning names."""
+    pattern = r"[Rr]equirement '([\w-]+)|pip install (?:-U )?'?([\w-]+)"
+    match = re.search(pattern, message)
+    return (match[1] or match[2]) if match else "PACKAGE"
+
+
+def _digest(kind: type, class_path: str) -> str:
+    owner = class_path.rpartition(":")[0]
     if owner.endswith(".py"):
         path = Path(os.path.expanduser(owner)).resolve()
         return digest_of_file_part(path, path.read_bytes())

@@ -1,3 +1,3 @@
-"""The field's ways to predict uncertainty, as trainable models: a file each, on one
-network.
+"""Trainable models with the field's methods for predictive uncertainty: one per file, on
+a common network.
 """

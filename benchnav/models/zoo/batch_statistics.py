@@ -1,7 +1,7 @@
-"""Statistics of batch normalisation for other weights than those that a network was
-trained with.
+"""Statistics of batch normalisation for weights other than the trained ones.
 
-They fit one set of weights alone. Letters in shapes: S numbers of all layers together.
+Such statistics are valid for one set of weights only. Letter in shapes: S statistics of
+all layers.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,25 +14,27 @@ from torch.func import functional_call
 
 
 def norms_of(network: nn.Module) -> dict[str, Any]:
-    """Layers of batch normalisation that keep statistics, by name."""
-    kind = nn.modules.batchnorm._BatchNorm
-    found = {
-        name: part for name, part in network.named_modules() if isinstance(part, kind)
-    }
-    return {name: norm for name, norm in found.items() if norm.track_running_stats}
+    """Return the batch normalisation layers with running statistics, by name."""
+    norms: dict[str, Any] = {}
+    for name, module in network.named_modules():
+        is_norm = isinstance(module, nn.modules.batchnorm._BatchNorm)
+        if is_norm and module.track_running_stats:
+            norms[name] = module
+    return norms
 
 
 def size_of(norms: Mapping[str, Any]) -> int:
-    """S."""
+    """Return the number of statistics S."""
     return sum(2 * norm.num_features for norm in norms.values())
 
 
 def to_buffers(norms: Mapping[str, Any], row: Tensor) -> dict[str, Tensor]:
-    """Buffers by name, from a row of all statistics, shape [S]."""
-    names = [
-        f"{name}.{kind}" for name in norms for kind in ("running_mean", "running_var")
-    ]
-    sizes = [norm.num_features for norm in norms.values() for _ in range(2)]
+    """Return buffers by name, from a row of all statistics, shape [S]."""
+    names = []
+    sizes = []
+    for name, norm in norms.items():
+        names += [f"{name}.running_mean", f"{name}.running_var"]
+        sizes += [norm.num_features, norm.num_features]
     return dict(zip(names, row.split(sizes), strict=True))
 
 
@@ -40,34 +42,31 @@ def to_buffers(norms: Mapping[str, Any], row: Tensor) -> dict[str, Tensor]:
 def statistics_of(
     network: nn.Module, weights: Mapping[str, Tensor], batches: Sequence[Any]
 ) -> Tensor:
-    """Averages the statistics of some batches; leaves the network in evaluation, with
-    its own.
+    """Average the statistics of a few batches under given weights.
+
+    The network itself is returned to evaluation with its own statistics.
 
     Args:
-        network: in which the weights are to stand.
-        weights: by name.
-        batches: arguments of the network, a tuple each.
+        network: network to evaluate.
+        weights: by name, in place of the network's own.
+        batches: arguments of the network, one tuple per batch.
 
     Returns:
         A row of all statistics, shape [S].
     """
-    norms = norms_of(network)
-    kept = [
-        (norm, norm.momentum, deepcopy(norm.state_dict())) for norm in norms.values()
-    ]
-    for norm in norms.values():
+    norms = norms_of(network).values()
+    originals = [(norm, norm.momentum, deepcopy(norm.state_dict())) for norm in norms]
+    for norm in norms:
         norm.reset_running_stats()
         norm.momentum = None  # the average of all batches
     network.train()
     for batch in batches:
         functional_call(network, dict(weights), batch)
-    made = [
-        values.clone()
-        for norm in norms.values()
-        for values in (norm.running_mean, norm.running_var)
-    ]
-    for norm, momentum, state in kept:
+    statistics = [torch.zeros(0)]
+    for norm in norms:
+        statistics += [norm.running_mean.clone(), norm.running_var.clone()]
+    for norm, momentum, state in originals:
         norm.momentum = momentum
         norm.load_state_dict(state)
     network.eval()
-    return torch.cat(made) if made else torch.zeros(0)
+    return torch.cat(statistics[1:] or statistics)

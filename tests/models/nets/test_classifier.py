@@ -208,7 +208,10 @@ def test_a_smaller_network_is_read_back_from_plain_settings() -> None:
             r"`encoder_depth` 5 and `decoder_channels` \[32, 16\]",
         ),
         ({"architecture": "fpn", "decoder_channels": (9,)}, "no such setting"),
-        ({"architecture": "fpn", "encoder_depth": 4}, "answers 64 cells with 128"),
+        (
+            {"architecture": "fpn", "encoder_depth": 4},
+            "output has 128 cells per side, not 64",
+        ),
     ],
 )
 def test_sizes_that_do_not_fit_are_refused(

@@ -135,13 +135,13 @@ def test_mass_of_a_clipped_gaussian_by_hand() -> None:
 
 @pytest.mark.parametrize("observed", [0.0, 1e-7, 0.5, 1 - 1e-7, 1.0])
 @pytest.mark.parametrize("mean", [-1e3, -1.0, 0.0, 0.5, 1.0, 2.0, 1e3])
-@pytest.mark.parametrize("std", [mdn.LEAST_STD, 0.2, 1e3])
+@pytest.mark.parametrize("std", [mdn.MIN_STD, 0.2, 1e3])
 def test_loss_and_gradients_are_finite_at_the_extremes(
     observed: float, mean: float, std: float
 ) -> None:
     logits = torch.tensor([[0.0, -200.0]]).view(1, 2, 1, 1).requires_grad_()
     means = torch.tensor([mean, 0.5]).view(1, 2, 1, 1).requires_grad_()
-    stds = torch.tensor([std, mdn.LEAST_STD]).view(1, 2, 1, 1).requires_grad_()
+    stds = torch.tensor([std, mdn.MIN_STD]).view(1, 2, 1, 1).requires_grad_()
     loss = censored_nll(
         logits.log_softmax(1), means, stds, torch.full((1, 1, 1), observed)
     )
@@ -232,7 +232,7 @@ def test_no_component_is_narrower_than_the_least() -> None:
     with torch.no_grad():
         network.head.bias[-1] = -1000
         _, _, stds = network(layers(observe(1, 32, 32)))
-    assert bool((stds[:, -1] == mdn.LEAST_STD).all())
+    assert bool((stds[:, -1] == mdn.MIN_STD).all())
 
 
 def test_initial_weights_are_a_function_of_the_seed_alone() -> None:

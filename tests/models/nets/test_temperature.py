@@ -61,7 +61,7 @@ def test_sampled_logits_stay_beside_their_class(
         def forward(self, maps: Mapping[str, torch.Tensor]) -> torch.Tensor:
             return maps["rgb"].float()
 
-    monkeypatch.setattr("benchnav.models.nets.calibration._MOST_CELLS", 200)
+    monkeypatch.setattr("benchnav.models.nets.calibration._MAX_CELLS", 200)
     logits, class_id = sample_logits(Colour(), maps)
     assert logits.shape == (200, 3)
     stored = maps.read(range(len(maps)))
@@ -103,12 +103,12 @@ class Held(MapDataset):
     """Maps of no dataset."""
 
     def __init__(self, rgb: torch.Tensor, class_id: torch.Tensor) -> None:
-        self._memory, self._maps, self.every = (
+        self._memory, self._maps, self.step = (
             {"rgb": rgb, "class_id": class_id},
             len(rgb),
             1,
         )
-        self.given, self.masks = ("rgb", "class_id"), None
+        self.output_fields, self.masks = ("rgb", "class_id"), None
 
     def chunks(
         self, device: torch.device = CPU

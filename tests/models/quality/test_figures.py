@@ -16,13 +16,9 @@ from benchnav.datagen.recipe.classes import SoftSpots
 from benchnav.datagen.recipe.latent import expected_traversability
 from benchnav.datagen.recipe.recipe import load_recipe
 from benchnav.models.predictor import Oracle
-from benchnav.models.quality.figures import (
-    PIT,
-    Confusion,
-    Latent,
-    Reliability,
-    Severity,
-)
+from benchnav.models.quality.figures import Severity
+from benchnav.models.quality.figures_of_classes import Confusion, Reliability
+from benchnav.models.quality.figures_of_traversability import PIT, Latent
 from benchnav.models.quality.measure import Quality, evaluate
 from benchnav.models.slope_gp.table import SoftModes
 from benchnav.viz.figure import Figure as BenchnavFigure

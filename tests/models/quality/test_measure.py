@@ -415,7 +415,7 @@ def test_maps_without_any_observed_traversability_are_passed_over() -> None:
     assert (
         both.classes == measure(ColourModel(), [terrain, terrain], generator()).classes
     )
-    with pytest.raises(DatasetError, match="an observed λ"):
+    with pytest.raises(DatasetError, match="maps with observed λ"):
         measure(ColourModel(), [unseen], generator())
 
 

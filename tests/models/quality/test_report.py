@@ -31,7 +31,7 @@ Qualities = dict[str, Quality]
 
 def page_of(qualities: Qualities) -> str:
     return Page(
-        title="title", tables=[quality_table("title", qualities, whole=True)]
+        title="title", tables=[quality_table("title", qualities, all_columns=True)]
     ).to_markdown()
 
 
@@ -118,7 +118,7 @@ def test_the_page_shows_table_notes_and_figures(qualities: Qualities) -> None:
     ]
     page = Page(
         title="title",
-        tables=[quality_table("title", qualities, whole=True)],
+        tables=[quality_table("title", qualities, all_columns=True)],
         notes=["a note"],
     )
     lines = page.to_markdown(figures).splitlines()

@@ -388,7 +388,7 @@ def test_a_dataset_with_look_alikes_is_measured_with_them_merged(
         vars(measured.look_alikes)
     )
     assert f"{measured.look_alikes.look_alike_accuracy:.6g}" in quality_csv(qualities)
-    page = to_markdown(quality_table("", qualities, whole=True))
+    page = to_markdown(quality_table("", qualities, all_columns=True))
     assert "mIoU look-alikes=1" in page
     assert (
         len({row.count("|") for row in page.splitlines() if row.startswith("|")}) == 1
@@ -404,7 +404,9 @@ def test_a_dataset_without_look_alikes_has_no_such_numbers(
         pass
     qualities = dict(evaluate(ColourModel(), TerrainDataset(tmp_path / "plain.h5")))
     assert qualities["test/std"].classes[0].look_alikes is None
-    assert "look_alikes" not in to_markdown(quality_table("", qualities, whole=True))
+    assert "look_alikes" not in to_markdown(
+        quality_table("", qualities, all_columns=True)
+    )
     assert not {*LOOK_ALIKES, "look_alikes"} & set(
         json.loads(quality_json({}, qualities))["splits"]["test/std"]
     )

@@ -101,8 +101,8 @@ def test_the_number_that_means_no_class_in_maps_is_a_class_of_a_log(
     ("text", "why"),
     [
         ("", "cannot be read: No columns"),
-        (HEADER, "got none among 0"),
-        (HEADER + "a,1,\nb,,1\n", "got none among 2"),
+        (HEADER, "got 0 of 0"),
+        (HEADER + "a,1,\nb,,1\n", "got 0 of 2"),
         (
             "class,slope,traversability\na,1,1\n",
             "got no slope_deg.*It has class, slope, traversability",
@@ -218,7 +218,7 @@ def test_slopes_in_radians_are_refused(tmp_path: Path) -> None:
             + "".join(f"sand,{most * k / count},0.5\n" for k in range(1, count + 1)),
         )
         if is_refused:
-            with pytest.raises(DatasetError, match="as of radians"):
+            with pytest.raises(DatasetError, match="as in radians"):
                 read_slip_logs(path)
         else:
             assert len(read_slip_logs(path).cells) == count

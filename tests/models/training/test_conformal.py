@@ -19,7 +19,7 @@ from benchnav.models.checkpoint import load_checkpoint
 from benchnav.models.config import TrainOptions
 from benchnav.models.conformal import ConformalModel, fit_table
 from benchnav.models.nets import calibration
-from benchnav.models.nets.trainable import Ensemble
+from benchnav.models.nets.ensemble import Ensemble
 from benchnav.models.predictor import load_model
 from benchnav.models.training import networks
 from benchnav.models.training.conformal import (
@@ -74,7 +74,7 @@ def test_one_half_is_every_second_map_and_the_other_is_the_rest(
 ) -> None:
     whole = MapDataset(maps.path, "valid", FIELDS)
     half = MapDataset(
-        maps.path, "valid", FIELDS, in_memory, every=stopping_every(conformal=True)
+        maps.path, "valid", FIELDS, in_memory, step=stopping_every(conformal=True)
     )
     assert (len(whole), len(half), list(scored_maps(7))) == (7, 4, [1, 3, 5])
     every = whole.read(range(7))["rgb"]
@@ -211,7 +211,7 @@ def test_the_fused_model_is_recalibrated_as_a_whole(
     arguments += [f"--classifier.{name}={value}" for name, value in small.items()]
 
     assert call("train", *arguments, "--out", tmp_path / "alone") == 2
-    assert "a whole model for `conformal`" in capsys.readouterr().err
+    assert "a complete model for `conformal`" in capsys.readouterr().err
     assert not (tmp_path / "alone").exists()
     before = load_checkpoint(out).conformal
     assert call("train", *arguments, "--out", out, "--overwrite", "--seed", 4) == 0

@@ -199,7 +199,7 @@ def test_processes_share_every_batch(
         [
             index
             for index, *_ in MapSampler(
-                maps, batch_size, 3, shuffle=True, share=(place, processes)
+                maps, batch_size, 3, shuffle=True, process=(place, processes)
             )
         ]
         for place in range(processes)

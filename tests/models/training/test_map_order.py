@@ -139,7 +139,7 @@ def test_processes_share_batches_of_windows() -> None:
         [
             index
             for index, *_ in MapSampler(
-                400, 7, 2, shuffle=True, shards=shards, share=(which, 2)
+                400, 7, 2, shuffle=True, shards=shards, process=(which, 2)
             )
         ]
         for which in (0, 1)

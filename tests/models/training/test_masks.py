@@ -42,9 +42,11 @@ MASKED = ClassifierConfig(
 )
 
 
-def masks(dataset: TerrainDataset, law: Masking) -> RandomMasks:
+def masks(dataset: TerrainDataset, masking: Masking) -> RandomMasks:
     return RandomMasks(
-        law=law, means=layer_means(dataset), resolution_m=dataset.grid.resolution_m
+        masking=masking,
+        means=layer_means(dataset),
+        resolution_m=dataset.grid.resolution_m,
     )
 
 
@@ -316,7 +318,7 @@ def test_networks_and_the_pool_of_them_meet_masked_maps(
     train_networks(
         how, str(dataset.path), str(tmp_path / "c"), classifier_of(MASKED), members=2
     )
-    laws = [maps.masks.law if maps.masks else None for maps in met]
+    laws = [maps.masks.masking if maps.masks else None for maps in met]
     assert {maps.split for maps in met} == {"train", "valid"}
     assert laws == [MASKED.masking] * len(met)
 

@@ -17,7 +17,7 @@ from benchnav.models.cli import fit
 from benchnav.models.nets.trainable import TrainableNetwork
 from benchnav.models.training.check import fields_of, try_network
 from benchnav.models.training.data import MapDataset
-from benchnav.models.training.networks import is_trainable
+from benchnav.models.training.find import is_trainable
 from tests.commands import call
 from tests.models.training.conftest import EXAMPLE
 
@@ -205,7 +205,7 @@ def test_settings_that_no_checkpoint_could_keep_are_refused(
         )
         == 2
     )
-    assert "settings that JSON can keep" in capfd.readouterr().err
+    assert "settings that JSON can store" in capfd.readouterr().err
     assert not Path("c.training").exists()
 
 
@@ -255,13 +255,13 @@ def test_a_class_of_a_name_that_is_ours_is_refused(
         (["own.py:CellModel", "--members", "0"], "`members` in 1–1000"),
         (
             ["own.py:CellConfig"],
-            "Expected a model that can be trained, fused, .*mdn.* got 'own.py:CellConfig'",
+            "Expected a trainable model, fused, .*mdn.* got 'own.py:CellConfig'",
         ),
         (["own.py:CellMode"], "Did you mean 'CellModel'"),
         (["oracle"], "got 'oracle'"),
         (
             ["mdm"],
-            "can be trained, fused, evidential, .* or FILE.py:Class, got 'mdm'. Did you mean 'mdn'",
+            "a trainable model, fused, evidential, .* or FILE.py:Class, got 'mdm'. Did you mean 'mdn'",
         ),
         (["mdn", "--settings.architecture", "unett"], "unett"),
         (["mdn", "--settings.encoder", "resnet19"], "resnet19"),

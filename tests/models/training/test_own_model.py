@@ -19,7 +19,7 @@ from benchnav.core.sources import load_file
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.checkpoint import load_checkpoint, save_checkpoint
 from benchnav.models.cli import main
-from benchnav.models.nets.trainable import Ensemble
+from benchnav.models.nets.ensemble import Ensemble
 from benchnav.models.predictor import load_model
 from benchnav.models.training import networks
 from benchnav.models.training.best import KeepBest

@@ -11,12 +11,12 @@ from benchnav.models.checkpoint import (
     Checkpoint,
     Part,
     load_checkpoint,
-    member_name,
     member_names,
     save_checkpoint,
 )
+from benchnav.models.checkpoint_folders import find_checkpoint
 from benchnav.models.config import ClassifierConfig, NetworkConfig
-from benchnav.models.predictor import find_checkpoint
+from benchnav.models.parts import member_name
 from benchnav.models.training import target as module
 from benchnav.models.training.fit import STATE, FitOptions
 from benchnav.models.training.target import Target, open_target
@@ -117,15 +117,15 @@ def test_resuming_keeps_parts_of_the_same_settings_seed_and_maps(
     state = tmp_path / "m.training" / "gp" / STATE  # of a kill after the part was saved
     state.parent.mkdir(parents=True)
     state.touch()
-    assert target.holds("gp", Config(), 0)
+    assert target.has_part("gp", Config(), 0)
     assert not state.exists()
-    assert not target.holds("classifier", NetConfig(), 0)
+    assert not target.has_part("classifier", NetConfig(), 0)
     for config, seed in ((Config(width=4), 0), (Config(), 1)):
         with pytest.raises(CheckpointError, match="Repeat its settings"):
-            target.holds("gp", config, seed)
+            target.has_part("gp", config, seed)
     target.digest = "other"
     with pytest.raises(CheckpointError, match="Repeat its settings"):
-        target.holds("gp", Config(), 0)
+        target.has_part("gp", Config(), 0)
 
 
 def test_a_network_is_kept_if_the_trainer_and_the_precision_are_the_same(
@@ -145,7 +145,7 @@ def test_a_network_is_kept_if_the_trainer_and_the_precision_are_the_same(
         options = replace(
             asked, trainer={**trainer, **changed}, half_precision=half_precision
         )
-        return Target(tmp_path / "m", checkpoint, "d", options).holds(
+        return Target(tmp_path / "m", checkpoint, "d", options).has_part(
             "classifier", kind(), 0
         )
 
@@ -176,7 +176,7 @@ def test_a_training_that_was_to_replace_a_part_is_gone_on_with_when_asked(
     with pytest.raises(
         CheckpointError, match=r"pass --overwrite instead of --resume\."
     ):
-        start(folder, ["classifier"], resume=True).holds(
+        start(folder, ["classifier"], resume=True).has_part(
             "classifier", NetConfig(width=4), 0
         )
     state = tmp_path / "m.training" / "classifier" / STATE
@@ -185,11 +185,11 @@ def test_a_training_that_was_to_replace_a_part_is_gone_on_with_when_asked(
     with pytest.raises(
         CheckpointError, match="pass --overwrite with --resume to go on"
     ):
-        start(folder, ["classifier"], resume=True).holds(
+        start(folder, ["classifier"], resume=True).has_part(
             "classifier", NetConfig(width=4), 0
         )
     target = start(folder, ["classifier"], resume=True, overwrite=True)
-    assert not target.holds("classifier", NetConfig(width=4), 0)
+    assert not target.has_part("classifier", NetConfig(width=4), 0)
     assert state.exists()
 
 
@@ -232,7 +232,7 @@ def test_processes_beside_the_first_refuse_and_write_nothing(
     target = start(
         folder, ["gp"]
     )  # as the first process left it, which trains the rest with this one
-    assert not target.holds("gp", Config(), 0)
+    assert not target.has_part("gp", Config(), 0)
     target.add("classifier", PART)
     assert (folder / "config.json").read_bytes() == before
 
@@ -245,9 +245,9 @@ def test_a_part_of_an_earlier_version_has_the_defaults_of_settings_that_came_lat
     classifier = shipped.parts["classifier"]
     target = Target(tmp_path / "mine", shipped, classifier.data_digest, FitOptions())
     assert "encoder_depth" not in classifier.config
-    assert target.holds("classifier", ClassifierConfig(), 0)
+    assert target.has_part("classifier", ClassifierConfig(), 0)
     with pytest.raises(CheckpointError, match="got others"):
-        target.holds("classifier", ClassifierConfig(encoder_depth=3), 0)
+        target.has_part("classifier", ClassifierConfig(encoder_depth=3), 0)
 
 
 def test_statistics_of_the_ground_come_with_the_first_part_and_not_from_logs(

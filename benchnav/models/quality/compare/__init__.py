@@ -1,1 +1,1 @@
-"""Compares several models on the same maps."""
+"""Comparison of several models on the same maps."""

@@ -1,6 +1,4 @@
-"""The models of a comparison: those that were asked for, and the privileged ones; and
-what each costs.
-"""
+"""Models of a comparison: the requested and the privileged ones, and their costs."""
 
 import statistics
 import time
@@ -14,20 +12,19 @@ import torch
 from benchnav.core.errors import BenchnavError, ConfigError, expect
 from benchnav.core.terrain import Terrain
 from benchnav.models.base import PrivilegedModel, TraversabilityModel, predict
+from benchnav.models.checkpoint_folders import find_checkpoint, split_own
 from benchnav.models.predictor import (
     Ideal,
     Oracle,
-    find_checkpoint,
     load_model,
     networks_of,
-    split_own,
     trained_on,
 )
 
-# That are always compared with, where the truth is known; the one that knows most
-# first.
+# Added to every comparison if the truth is available; the better informed model first.
 PRIVILEGED = ("oracle", "ideal")
-_TIMED, _MOST_S = 15, 5.0
+_N_REPETITIONS = 15
+_MAX_TIMING_MS = 5000.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,10 +32,10 @@ class Candidate:
     """A model of a comparison.
 
     Args:
-        label: what tables call it.
-        source: as it was asked for.
+        label: its name in tables.
+        source: its name in the request.
         model: the model.
-        trained_on: names of the splits that it was trained on, by digest.
+        trained_on: names of the splits on which it was trained, by digest.
     """
 
     label: str
@@ -48,23 +45,19 @@ class Candidate:
 
     @property
     def privileged(self) -> bool:
-        """Whether it is given part of the truth: a reference, which does not compete."""
+        """Whether it receives part of the truth: a reference that does not compete."""
         return isinstance(self.model, PrivilegedModel)
 
     @property
     def needs_truth(self) -> bool:
-        """Whether it says what the class table says, which is not the truth of imported
-        ground.
-        """
+        """Whether it predicts by the class table, which is not the truth of imported terrain."""
         return isinstance(self.model, Oracle | Ideal)
 
 
-def candidate(
+def load_candidate(
     source: str, label: str, model: TraversabilityModel | None = None
 ) -> Candidate:
-    """Return a model as a candidate; it is loaded from its source where it is not
-    given.
-    """
+    """Return a model as a candidate; if not given, it is loaded from its source."""
     return Candidate(
         label=label,
         source=source,
@@ -74,42 +67,44 @@ def candidate(
 
 
 def find_candidates(sources: Sequence[str]) -> list[Candidate]:
-    """Loads the models that are compared: those asked for in their order, then the
-    privileged ones.
+    """Load the models to compare: those requested in order, then the privileged ones.
 
     Args:
-        sources: each as `load_model` takes it; one or more.
+        sources: each as an argument of `load_model`; at least one.
 
     Raises:
-        ConfigError: there are none, one is there twice, or there is no such model.
-        CheckpointError: a checkpoint cannot be used.
+        ConfigError: If `sources` is empty or names a model twice, or if a model does
+            not exist.
+        CheckpointError: If a checkpoint cannot be used.
     """
     expect(
         len(sources) > 0,
         "one model or more to compare, got none. Name checkpoints or models.",
     )
-    places = [str(_folder(source) or source) for source in sources]
-    for place, times in Counter(places).items():
-        if times > 1:
-            named = " and ".join(
-                source
-                for source, own in zip(sources, places, strict=True)
-                if own == place
-            )
+    by_location: dict[str, list[str]] = {}
+    for source in sources:
+        location = str(_folder(source) or source)
+        by_location.setdefault(location, []).append(source)
+    for same in by_location.values():
+        if len(same) > 1:
             raise ConfigError(
-                f"Expected models that differ, got {named}. Name each model once."
+                f"Expected models that differ, got {' and '.join(same)}. Name each "
+                "model once."
             )
     models = {source: load_model(source) for source in sources}
-    models |= {name: load_model(name) for name in PRIVILEGED if name not in models}
+    for name in PRIVILEGED:
+        if name not in models:
+            models[name] = load_model(name)
     labels = _labels(list(models))
-    found = [
-        candidate(source, labels[source], model) for source, model in models.items()
+    candidates = [
+        load_candidate(source, labels[source], model)
+        for source, model in models.items()
     ]
-    return sorted(found, key=lambda one: one.privileged)
+    return sorted(candidates, key=lambda candidate: candidate.privileged)
 
 
 def _folder(source: str) -> Path | None:
-    """The folder of a checkpoint; None of a model by name, module or file."""
+    """Return the folder of a checkpoint; None for a model by name, module or file."""
     try:
         return find_checkpoint(source).resolve()
     except BenchnavError:
@@ -117,56 +112,55 @@ def _folder(source: str) -> Path | None:
 
 
 def _labels(sources: Sequence[str]) -> dict[str, str]:
-    """Short names: of a folder its own, of a file the class in it; the whole source
-    where these are alike.
-    """
-    short = {}
-    for source in sources:
-        own = split_own(source)
-        place, _, name = source.rpartition(":")
-        is_part = place.endswith(".py") or (bool(place) and not Path(source).exists())
-        short[source] = (
-            Path(own[1]).name
-            if own
-            else name
-            if is_part
-            else Path(source).name or source
-        )
-    times = Counter(short.values())
+    """Return short names of models, or the whole source if short names coincide."""
+    short = {source: _short_name(source) for source in sources}
+    counts = Counter(short.values())
     return {
-        source: name if times[name] == 1 else source for source, name in short.items()
+        source: name if counts[name] == 1 else source for source, name in short.items()
     }
+
+
+def _short_name(source: str) -> str:
+    """Return the name of a checkpoint's folder, or of the class in a module or file."""
+    part_and_checkpoint = split_own(source)
+    if part_and_checkpoint:
+        return Path(part_and_checkpoint[1]).name
+    module, _, name = source.rpartition(":")
+    is_module = bool(module) and not Path(source).exists()
+    if module.endswith(".py") or is_module:
+        return name
+    return Path(source).name or source
 
 
 def count_parameters(model: TraversabilityModel) -> int | None:
-    """Number of weights in the networks of a model and of its members; None where it
-    has no network.
-    """
+    """Return the number of weights in a model's networks; None without networks."""
     networks = list(networks_of(model))
-    weights = {
-        id(weight): weight.numel()
-        for network in networks
-        for weight in network.parameters()
-    }
-    return sum(weights.values()) if networks else None
+    sizes: dict[int, int] = {}
+    for network in networks:
+        for weight in network.parameters():
+            sizes[id(weight)] = weight.numel()
+    return sum(sizes.values()) if networks else None
 
 
 def prediction_ms(model: TraversabilityModel, terrain: Terrain) -> float:
-    """Median time of a prediction in milliseconds, over 15 repetitions after a first,
-    or as many as 5 s hold.
+    """Return the median time of a prediction in milliseconds.
+
+    The median is over 15 repetitions after a warm-up, or fewer if they exceed 5 s.
 
     Args:
         model: any model.
-        terrain: what is predicted, on the device where it is to be.
+        terrain: maps to predict, on the device to use.
     """
-    taken: list[float] = []
-    while len(taken) <= _TIMED and (len(taken) < 2 or sum(taken) < 1000 * _MOST_S):
+    times_ms: list[float] = []
+    while len(times_ms) <= _N_REPETITIONS:
+        if len(times_ms) >= 2 and sum(times_ms) >= _MAX_TIMING_MS:
+            break
         _wait(terrain)
         start = time.perf_counter()
         predict(model, terrain)
         _wait(terrain)
-        taken.append(1000 * (time.perf_counter() - start))
-    return statistics.median(taken[1:])
+        times_ms.append(1000 * (time.perf_counter() - start))
+    return statistics.median(times_ms[1:])
 
 
 def _wait(terrain: Terrain) -> None:

@@ -1,8 +1,8 @@
 """Figures of a comparison: measures with intervals, calibration, sparsification, and
-quality over severity.
+quality by severity.
 
-A model has one colour, marker and dash in every figure; privileged ones are grey. A
-panel is a measure or a split.
+A model has the same colour, marker and dash in all figures; privileged models are grey.
+Each panel shows a measure or a split.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 
 from benchnav.datagen.recipe.scenario import find_series
 from benchnav.models.quality.compare.report import Comparison
-from benchnav.models.quality.figures import series_table
+from benchnav.models.quality.figure_data import series_table
 from benchnav.models.quality.map_sums import MapTally
 from benchnav.models.quality.scores import LEVEL
 from benchnav.models.quality.scores_of_maps import COMPARED
@@ -38,111 +38,99 @@ from benchnav.viz.style import (
 )
 
 _GREYS = ("0.35", "0.6")
-_LINE_IN, _ROW_IN = 0.075, 0.16  # of a mark, and at least of a model
-_AT_SEVERITY = ("crps", "pinball")
+_MARK_HEIGHT_IN = 0.075
+_MIN_ROW_HEIGHT_IN = 0.16
+_BY_SEVERITY = ("crps", "pinball")
 _MARKED_EVERY = 4
 _ARROWS = {"higher": " ↑", "lower": " ↓", "": ""}
 
 
 def model_looks(models: Sequence[str], privileged: Sequence[str]) -> Looks:
-    """Return how the lines of each model are drawn, as keywords of `Axes.plot`;
-    privileged ones are grey.
+    """Return the line style of each model, as keywords of `Axes.plot`.
+
+    Privileged models are grey.
     """
     looks = line_looks([model for model in models if model not in privileged])
-    for place, model in enumerate(privileged):
-        grey, marker, dash = (
-            _GREYS[place % len(_GREYS)],
-            "+x|_"[place % 4],
-            ("--", "-.")[place % 2],
-        )
-        looks[model] = {"color": grey, "marker": marker, "ls": dash}
+    for index, model in enumerate(privileged):
+        looks[model] = {
+            "color": _GREYS[index % len(_GREYS)],
+            "marker": "+x|_"[index % 4],
+            "ls": ("--", "-.")[index % 2],
+        }
     return {model: {**looks[model], "ms": 3, "lw": 1} for model in models}
 
 
 def _draw_tallies(
     data: Comparison,
 ) -> tuple[Drawing, list[tuple[Axes, str, MapTally, Mapping[str, Any]]]]:
-    """Make a panel a split; return the figure, and the panel, name, tally and look of
-    each line.
+    """Create a panel per split.
+
+    Returns:
+        The figure; and panel, model, tally and style of each line.
     """
     splits = list(dict.fromkeys(split for split, _ in data.tallies))
     width = page_width(len(splits), 3)
-    figure, places = panel_grid(splits, 3, 1.8, 0.6, width, sharex=True, sharey=True)
-    panels = {split: panel for split, (panel,) in zip(splits, places, strict=True)}
-    for panel in panels.values():
+    figure, axes = panel_grid(splits, 3, 1.8, 0.6, width, sharex=True, sharey=True)
+    looks = _looks(data)
+    panels = {}
+    for split, (panel,) in zip(splits, axes, strict=True):
         panel.set_xlim(0, 1)
         panel.set_xticks([0, 0.5, 1], ["0", "0.5", "1"])
         panel.grid(alpha=0.3)
-    known = [
-        (split, model)
-        for model in data.models
-        for split in splits
-        if (split, model) in data.tallies
-    ]
-    looks = _looks(data)
-    return figure, [
-        (panels[split], model, data.tallies[split, model], looks[model])
-        for split, model in known
-    ]
+        panels[split] = panel
+    lines = []
+    for model in data.models:
+        for split in splits:
+            tally = data.tallies.get((split, model))
+            if tally is not None:
+                lines.append((panels[split], model, tally, looks[model]))
+    return figure, lines
 
 
 class _Measures(Figure):
     name, title = "measures", "Measures with their intervals"
     text = (
         "Each row is a model, each mark a split; lines are 95 % intervals over maps. "
-        "↑: higher is better, ↓: lower "
-        "is better. Grey: privileged models, which are given part of the truth."
+        "↑: higher is better, ↓: lower is better. Grey: privileged models, which "
+        "receive part of the truth."
     )
 
     def draw(self, data: Comparison) -> Drawing:
-        looks = _looks(data)
-        shown = [
-            score
-            for score in COMPARED
-            if score.name in data.summary and data.summary[score.name].notna().any()
-        ]
-        models, splits = list(looks), list(dict.fromkeys(data.summary["split"]))
-        across = 4 if len(shown) > 6 else 3
-        high = len(models) * max(_ROW_IN, _LINE_IN * (len(splits) + 1.5)) + 0.45
-        titles = [score.title + _ARROWS[score.better] for score in shown]
-        figure, places = panel_grid(
-            titles, across, high, 0.35, TWO_COLUMNS_IN, sharey=True
+        models = list(_looks(data))
+        splits = list(dict.fromkeys(data.summary["split"]))
+        has_values = data.summary.notna().any()
+        scores = [score for score in COMPARED if has_values.get(score.name, False)]
+        n_columns = 4 if len(scores) > 6 else 3
+        row_height = max(_MIN_ROW_HEIGHT_IN, _MARK_HEIGHT_IN * (len(splits) + 1.5))
+        height = len(models) * row_height + 0.45
+        titles = [score.title + _ARROWS[score.better] for score in scores]
+        figure, axes = panel_grid(
+            titles, n_columns, height, 0.35, TWO_COLUMNS_IN, sharey=True
         )
-        panels = [panel for (panel,) in places]
-        for panel, score in zip(panels, shown, strict=True):
-            name = score.name
-            for place, split in enumerate(splits):
-                rows = (
-                    data.summary[data.summary["split"] == split]
-                    .set_index("model")
-                    .reindex(models)
-                )
-                y = np.arange(len(models)) + 0.7 * ((place + 0.5) / len(splits) - 0.5)
-                value, low, high_end = (
-                    rows[own].to_numpy(float)
-                    for own in (name, f"{name}_low", f"{name}_high")
-                )
-                colour = LINE_COLOURS[place % len(LINE_COLOURS)]
-                panel.hlines(y, low, high_end, color=colour, lw=1)
-                panel.plot(
-                    value,
-                    y,
-                    MARKERS[place % len(MARKERS)],
-                    color=colour,
-                    ms=2.8,
-                    label=split,
-                )
-            if name == "coverage":
+        panels = [panel for (panel,) in axes]
+        for panel, score in zip(panels, scores, strict=True):
+            for index, split in enumerate(splits):
+                rows = data.summary[data.summary["split"] == split]
+                rows = rows.set_index("model").reindex(models)
+                offset = 0.7 * ((index + 0.5) / len(splits) - 0.5)
+                y = np.arange(len(models)) + offset
+                value = rows[score.name].to_numpy(float)
+                low = rows[f"{score.name}_low"].to_numpy(float)
+                high = rows[f"{score.name}_high"].to_numpy(float)
+                colour = LINE_COLOURS[index % len(LINE_COLOURS)]
+                marker = MARKERS[index % len(MARKERS)]
+                panel.hlines(y, low, high, color=colour, lw=1)
+                panel.plot(value, y, marker, color=colour, ms=2.8, label=split)
+            if score.name == "coverage":
                 draw_baseline(panel, LEVEL, "calibrated", horizontal=False)
             panel.grid(axis="x", alpha=0.3)
             panel.margins(x=0.08)
             ticks_of(panel, "x")
-        for panel in panels[::across]:
+        for panel in panels[::n_columns]:
             panel.set_yticks(range(len(models)), models, parse_math=False)
             for label in panel.get_yticklabels():
-                label.set_color(
-                    "0.5" if label.get_text() in data.privileged else "black"
-                )
+                is_privileged = label.get_text() in data.privileged
+                label.set_color("0.5" if is_privileged else "black")
         panels[0].set_ylim(len(models) - 0.5, -0.5)
         legend_outside(figure, side="upper center", columns=5)
         return figure
@@ -151,9 +139,9 @@ class _Measures(Figure):
 class _Calibration(Figure):
     name, title = "calibration", "Calibration of the predicted distributions of λ"
     text = (
-        "Fraction of observed λ below a predicted quantile, less the level of the "
-        "quantile, over that level. 0 is "
-        "calibrated. Above 0 at the left: low λ is more frequent than predicted."
+        "Fraction of observed λ below a predicted quantile, minus the level of the "
+        "quantile, over that level. 0 is calibrated. Above 0 at the left: low λ is "
+        "more frequent than predicted."
     )
 
     def draw(self, data: Comparison) -> Drawing:
@@ -162,9 +150,8 @@ class _Calibration(Figure):
             panel.axhline(0, color="0.4", lw=0.8, label="calibrated")
         for panel, model, tally, look in lines:
             levels = np.linspace(0, 1, len(tally.pit) + 1)
-            excess = (
-                np.concatenate([[0], np.cumsum(tally.pit) / tally.pit.sum()]) - levels
-            )
+            fractions = np.concatenate([[0], np.cumsum(tally.pit) / tally.pit.sum()])
+            excess = fractions - levels
             panel.plot(levels, excess, label=model, markevery=_MARKED_EVERY, **look)
         figure.supxlabel("level of the quantile")
         figure.supylabel("fraction of λ below\nthe quantile − level", fontsize=TITLE)
@@ -176,9 +163,8 @@ class _Sparsification(Figure):
     name, title = "sparsification", "Sparsification: uncertainty against error"
     text = (
         "Mean error |λ − E[λ]| of the remaining cells over the fraction of cells "
-        "removed: the most uncertain first "
-        "(lines), or those of largest error first (dotted). The area between the two "
-        "is AUSE."
+        "removed: the most uncertain first (lines), or those with the largest error "
+        "first (dotted). The area between the two is AUSE."
     )
 
     def draw(self, data: Comparison) -> Drawing:
@@ -189,19 +175,13 @@ class _Sparsification(Figure):
                 left_out, by_width, label=model, markevery=2 * _MARKED_EVERY, **look
             )
             panel.plot(left_out, by_error, color=look["color"], lw=0.8, ls=":")
-        panel.set_ylim(bottom=0)  # of all, which share it
+        panel.set_ylim(bottom=0)  # all panels share it
         figure.supxlabel(
-            "fraction of cells left out, those of the widest intervals first"
+            "fraction of cells removed, those with the widest intervals first"
         )
-        figure.supylabel("mean |E[λ] − λ| of the rest", fontsize=TITLE)
-        best = Line2D(
-            [],
-            [],
-            color="0.4",
-            lw=0.8,
-            ls=":",
-            label="largest errors first, the best order",
-        )
+        figure.supylabel("mean |E[λ] − λ| of remaining cells", fontsize=TITLE)
+        label = "largest errors first, the best order"
+        best = Line2D([], [], color="0.4", lw=0.8, ls=":", label=label)
         legend_outside(figure, [best], 5, side="upper center")
         return figure
 
@@ -210,8 +190,8 @@ class _Severity(Figure):
     name, title = "severity", "Quality over the severity of a shift"
     text = (
         "CRPS and pinball loss of the lower fifth over the severity of each scenario: "
-        "0 is the training maps, 1 "
-        "the scenario itself. Lines are 95 % intervals over maps."
+        "0 is the training maps, 1 the scenario itself. Lines are 95 % intervals over "
+        "maps."
     )
 
     def needs(self, data: Comparison) -> bool:
@@ -219,22 +199,19 @@ class _Severity(Figure):
 
     def draw(self, data: Comparison) -> Drawing:
         series = series_table(data.splits)
-        count = series["scenario"].nunique()
-        measured = data.summary.rename(columns={"model": "line"})
+        n_scenarios = series["scenario"].nunique()
+        summary = data.summary.rename(columns={"model": "line"})
+        table = series.merge(summary, on="split")
+        table = table.rename(columns={"scenario": "panel", "severity": "x"})
+        scores = [score for score in COMPARED if score.name in _BY_SEVERITY]
         curves = Curves(
-            table=series.merge(measured, on="split").rename(
-                columns={"scenario": "panel", "severity": "x"}
-            ),
-            measures={
-                score.name: score.title
-                for score in COMPARED
-                if score.name in _AT_SEVERITY
-            },
+            table=table,
+            measures={score.name: score.title for score in scores},
             looks=_looks(data),
             x_label="severity of the shift",
-            across=min(count, 3),
+            across=min(n_scenarios, 3),
             high_in=1.7,
-            width_in=page_width(count, 3),
+            width_in=page_width(n_scenarios, 3),
             bars=True,
         )
         figure, panels = curves.draw()

@@ -1,6 +1,4 @@
-"""A comparison of models in numbers and words: a table for each kind of file, and what
-columns and figures mean.
-"""
+"""Tables of a comparison of models for the terminal, Markdown, JSON and CSV."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -28,7 +26,7 @@ from benchnav.stats.tables import (
     table_of,
 )
 
-# What a model costs, which stands in the table next to its scores: heading and meaning.
+# Costs of a model, shown in the table next to its scores: heading and meaning.
 COSTS = {
     "prediction_ms": (
         "ms a\nmap",
@@ -37,24 +35,21 @@ COSTS = {
     "parameters": ("parameters\n", "number of weights of all networks of the model."),
 }
 PRIVILEGED_MARK = " †"
-_UNITS = (
-    (1e6, 2, "M"),
-    (1e3, 1, "k"),
-    (1, 0, ""),
-)  # size, decimal places and letter of a number of weights
+# Size, decimal places and letter for numbers of weights.
+_UNITS = ((1e6, 2, "M"), (1e3, 1, "k"), (1, 0, ""))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """What was measured of several models.
+    """Measurements of several models.
 
     Args:
-        models: by label what is said of it, such as `source`, `privileged`,
-            `parameters`, `prediction_ms`; those that compete first.
-        summary: a row a split and model, `split`, `model` and the columns of
+        models: information by label, such as `source`, `privileged`, `parameters`,
+            `prediction_ms`; competing models first.
+        summary: a row per split and model, with `split`, `model` and the columns of
             `scores.summarise`.
-        pairs: of each split, `split` and the columns of `scores.compare_pairs`.
-        best: of each split, `split`, `model` and the columns of `scores.against_best`.
+        pairs: for each split, `split` and the columns of `scores.compare_pairs`.
+        best: for each split, `split`, `model` and the columns of `scores.against_best`.
         tallies: by split and model.
     """
 
@@ -66,88 +61,93 @@ class Comparison:
 
     @property
     def splits(self) -> list[str]:
-        """Those that were measured."""
+        """Names of the measured splits."""
         return list(dict.fromkeys(self.summary["split"]))
 
     @property
     def privileged(self) -> list[str]:
-        """Models that are given part of the truth."""
-        return [label for label, about in self.models.items() if about["privileged"]]
+        """Labels of models that receive part of the truth."""
+        return [label for label, info in self.models.items() if info["privileged"]]
 
     @property
     def numbers(self) -> pd.DataFrame:
-        """The summary with what each model costs, and whether it is privileged."""
-        about = pd.DataFrame.from_dict(self.models, orient="index")
-        return self.summary.join(about[["privileged", *COSTS]], on="model")
+        """The summary with the costs of each model, and whether it is privileged."""
+        models = pd.DataFrame.from_dict(self.models, orient="index")
+        return self.summary.join(models[["privileged", *COSTS]], on="model")
 
 
 def compare_sums(
     sums: Mapping[str, Mapping[str, Any]], competing: Sequence[str]
 ) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]:
-    """Compare models by their sums over maps, each split for itself.
+    """Compare models by their sums over maps, separately for each split.
 
     Args:
         sums: by split and model, from `map_sums.by_group`.
-        competing: the models that compete.
+        competing: labels of the competing models.
 
     Returns:
         `summary`, `pairs` and `best` of `Comparison`.
     """
-    summaries, pairs, best = {}, {}, {}
-    for split, own in sums.items():
-        summaries[split] = summarise((*COMPARED, *TAIL_RATES), own)
-        pairs[split] = compare_pairs(COMPARED, own, competing, "cells")
-        rivals = summaries[split][summaries[split].index.isin(competing)]
+    summaries = {}
+    pairs = {}
+    best = {}
+    for split, by_model in sums.items():
+        summary = summarise((*COMPARED, *TAIL_RATES), by_model)
+        summaries[split] = summary
+        pairs[split] = compare_pairs(COMPARED, by_model, competing, "cells")
+        rivals = summary[summary.index.isin(competing)]
         best[split] = against_best(COMPARED, rivals, pairs[split])
+    all_pairs = pd.concat(pairs, names=["split"]).reset_index("split")
     return (
         pd.concat(summaries, names=["split", "model"]).reset_index(),
-        pd.concat(pairs, names=["split"]).reset_index("split").reset_index(drop=True),
+        all_pairs.reset_index(drop=True),
         pd.concat(best, names=["split", "model"]).reset_index(),
     )
 
 
-def comparison_table(title: str, comparison: Comparison, whole: bool = False) -> Table:
-    """Write the numbers, a row a split and model; a missing number has a dash.
+def comparison_table(
+    title: str, comparison: Comparison, all_columns: bool = False
+) -> Table:
+    """Return the numbers as a table with a row per split and model; NaN is a dash.
 
     Args:
-        title: over the table.
-        comparison: what was measured.
-        whole: with both errors of E[λ]; else that to observed λ only if the other is
-            unknown.
+        title: title of the table.
+        comparison: measurements of the models.
+        all_columns: whether to include both errors of E[λ]; otherwise the error
+            relative to observed λ is shown only if the other is missing.
     """
     numbers = comparison.numbers
-    known = [
+    hidden = {score.name for score in TAIL_RATES}
+    expected_rmse = numbers.get("rmse_expected", pd.Series([math.nan]))
+    if not all_columns and expected_rmse.notna().all():
+        hidden.add("rmse_observed")
+    shown = [
         name
         for name in (*SCORES, *COSTS)
-        if name in numbers and numbers[name].notna().any()
+        if name in numbers and name not in hidden and numbers[name].notna().any()
     ]
-    hidden = {score.name for score in TAIL_RATES}
-    if not whole and numbers.get("rmse_expected", pd.Series([math.nan])).notna().all():
-        hidden.add("rmse_observed")
     best = comparison.best[comparison.best["marked"]]
-    marked = {
-        (row["split"], row["model"], row["measure"]) for row in best.to_dict("records")
-    }
+    marked = set(zip(best["split"], best["model"], best["measure"], strict=True))
     columns = [
         Column("split\n", cell_of("split"), "split of the dataset."),
         Column(
             "model\n",
             lambda row: row["model"] + PRIVILEGED_MARK * row["privileged"],
-            "† marks privileged models: references that are given part of the truth "
-            "and do not compete.",
+            "† marks privileged models: references that receive part of the truth and "
+            "do not compete.",
         ),
     ]
-    for name in known:
-        if name not in hidden:
-            heading, meaning = COSTS.get(name) or (
-                SCORES[name].heading,
-                SCORES[name].meaning,
-            )
-            columns.append(Column(heading, partial(_cell, name, marked), meaning))
+    for name in shown:
+        if name in COSTS:
+            heading, meaning = COSTS[name]
+        else:
+            heading = SCORES[name].heading
+            meaning = SCORES[name].meaning
+        columns.append(Column(heading, partial(_cell, name, marked), meaning))
     note = (
         "best of its split by this measure, and all without a significant difference "
-        "from it (permutation test by map, "
-        f"Holm, p ≥ {ALPHA}). Privileged models (†) do not compete."
+        f"from it (permutation test by map, Holm, p ≥ {ALPHA}). Privileged models (†) "
+        "do not compete."
     )
     return table_of(
         numbers.to_dict("records"),
@@ -166,19 +166,21 @@ def _cell(name: str, marked: set[tuple[str, str, str]], row: Row) -> str:
     if name == "prediction_ms":
         return f"{value:.3g}"
     if name == "parameters":
-        size, digits, unit = next(
-            (known for known in _UNITS if value >= known[0]), _UNITS[-1]
-        )
-        return f"{value / size:.{digits}f}{unit}"
+        fitting = (unit for unit in _UNITS if value >= unit[0])
+        size, digits, letter = next(fitting, _UNITS[-1])
+        return f"{value / size:.{digits}f}{letter}"
     text = f"{value:.4f}"
     return Bold(text) if (row["split"], row["model"], name) in marked else text
 
 
 def difference_table(comparison: Comparison) -> Table:
-    """Write the differences to the best, a row a split, measure and other model that
-    competes.
-    """
+    """Return differences to the best, a row per split, measure and competing model."""
     rows = comparison.best[comparison.best["difference"].notna()]
+
+    def p_cell(row: Row) -> str:
+        text = p_value(row["p_holm"])
+        return text if row["alike"] else Bold(text)
+
     columns = [
         *labels_of("split"),
         Column("measure", cell_of("measure", lambda name: SCORES[name].title)),
@@ -186,8 +188,8 @@ def difference_table(comparison: Comparison) -> Table:
         Column(
             "difference",
             lambda row: signed(row["difference"], 4),
-            "the model less the best, by this measure; of “in 90 %” the difference of "
-            "the distance to 0.9.",
+            "the model minus the best, by this measure; for “in 90 %” the difference "
+            "of the distances from 0.9.",
         ),
         Column(
             "95 % interval",
@@ -196,12 +198,9 @@ def difference_table(comparison: Comparison) -> Table:
         ),
         Column(
             "p (Holm)",
-            lambda row: (
-                p_value(row["p_holm"]) if row["alike"] else Bold(p_value(row["p_holm"]))
-            ),
+            p_cell,
             "permutation test by map, which exchanges the two models; corrected over "
-            "all pairs of models that compete, "
-            "within measure and split (Holm).",
+            "all pairs of competing models, within measure and split (Holm).",
         ),
     ]
     note = "" if rows["alike"].all() else f"p under {ALPHA}."
@@ -214,47 +213,31 @@ def difference_table(comparison: Comparison) -> Table:
     )
 
 
-def comparison_json(about: Mapping[str, Any], comparison: Comparison) -> str:
-    """Write everything that was measured as JSON; NaN is null."""
+def comparison_json(header: Mapping[str, Any], comparison: Comparison) -> str:
+    """Return all results as JSON; NaN becomes null."""
     splits: dict[str, Any] = {}
     for row in comparison.summary.to_dict("records"):
-        split, model, units = row.pop("split"), row.pop("model"), row.pop("units")
+        split = row.pop("split")
+        model = row.pop("model")
+        units = row.pop("units")
+        if split not in splits:
+            splits[split] = {"units": units, "models": {}, "pairs": []}
         tally = comparison.tallies[split, model]
-        own = splits.setdefault(split, {"units": units, "models": {}, "pairs": []})
-        own["models"][model] = {
-            **row,
-            "pit": list(tally.pit),
-            "sparsification": dict(
-                zip(
-                    ("left_out", "by_width", "by_error"),
-                    tally.curves().tolist(),
-                    strict=True,
-                )
-            ),
-        }
+        left_out, by_width, by_error = tally.curves().tolist()
+        curves = {"left_out": left_out, "by_width": by_width, "by_error": by_error}
+        result = {**row, "pit": list(tally.pit), "sparsification": curves}
+        splits[split]["models"][model] = result
     for row in comparison.pairs.to_dict("records"):
         splits[row.pop("split")]["pairs"].append(row)
-    return json_text({**about, "models": comparison.models}, splits)
+    return json_text({**header, "models": comparison.models}, splits)
 
 
 def comparison_csv(comparison: Comparison) -> str:
-    """Write the numbers as CSV, a row a split and model, with the ends of their
-    intervals.
-    """
+    """Return the numbers as CSV, a row per split and model, with their intervals."""
     numbers = comparison.numbers
-    names = [
-        own
-        for score in COMPARED
-        for own in (score.name, f"{score.name}_low", f"{score.name}_high")
-    ]
-    columns = [
-        "split",
-        "model",
-        "privileged",
-        "units",
-        *names,
-        *COSTS,
-        *(score.name for score in TAIL_RATES),
-    ]
-    known = [name for name in columns if name in numbers]
-    return numbers.to_csv(columns=known, index=False, float_format="%.6g")
+    columns = ["split", "model", "privileged", "units"]
+    for score in COMPARED:
+        columns += [score.name, f"{score.name}_low", f"{score.name}_high"]
+    columns += [*COSTS, *(score.name for score in TAIL_RATES)]
+    available = [name for name in columns if name in numbers]
+    return numbers.to_csv(columns=available, index=False, float_format="%.6g")

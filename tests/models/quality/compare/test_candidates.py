@@ -8,7 +8,7 @@ import torch
 from benchnav.core import registry
 from benchnav.core.errors import ConfigError
 from benchnav.models.fused import FusedModel
-from benchnav.models.nets.trainable import Ensemble
+from benchnav.models.nets.ensemble import Ensemble
 from benchnav.models.predictor import Clairvoyant
 from benchnav.models.quality.compare.candidates import (
     count_parameters,
@@ -75,7 +75,7 @@ def test_weights_of_all_networks_are_counted_once() -> None:
     other = torch.nn.Conv2d(3, 4, 1)
     both = FusedModel([network, other], linear_table(), ("a",))
     assert count_parameters(both) == 16 + 8 + 16
-    assert count_parameters(Ensemble([both, both])) == 16 + 8 + 16  # type: ignore[list-item]
+    assert count_parameters(Ensemble([both, both])) == 16 + 8 + 16
     assert count_parameters(ColourModel()) is None
 
 

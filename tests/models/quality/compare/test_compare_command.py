@@ -299,7 +299,7 @@ def test_a_model_of_other_classes_is_compared_by_traversability_and_said_to_be(
     )
     out = capfd.readouterr().out
     assert (
-        "foreign is compared by λ alone: its classes are not those of these maps" in out
+        "foreign is compared by λ only: its classes are not those of these maps" in out
     )
     first, second = (
         line.split()

@@ -1,0 +1,88 @@
+"""Locations of checkpoints: by path, by name, or on a hub."""
+
+import re
+from pathlib import Path
+
+from benchnav.core import hub, registry
+from benchnav.core.errors import CheckpointError, ConfigError
+from benchnav.core.shipped_files import shipped_folder
+from benchnav.models.checkpoint import CONFIG
+from benchnav.models.parts import check_finished
+
+_ONLY_IN_REPOSITORY = "paper-v1"  # a checkpoint that `setup.py` leaves out of wheels
+
+
+def find_checkpoint(source: str | Path) -> Path:
+    """Find the folder of a checkpoint by path, by name, or on a hub.
+
+    Names are those in `checkpoints/` here and of the shipped checkpoints.
+
+    Args:
+        source: path, name or `owner/name@revision`; for `path/to/file.py:Name@CHECKPOINT`
+            the result is the folder of CHECKPOINT.
+
+    Raises:
+        CheckpointError: If the training of the checkpoint was interrupted.
+        ConfigError: If there is no such folder, nor a model of that name.
+    """
+    class_and_checkpoint = split_own(source)
+    if class_and_checkpoint:
+        source = class_and_checkpoint[1]
+    path = Path(source)
+    candidates = (path, *(folder / source for folder in _checkpoint_folders()))
+    for candidate in candidates:
+        if (candidate / CONFIG).is_file():
+            return candidate
+    if path.is_dir():
+        return path  # the reader reports what is missing
+    for candidate in candidates:
+        check_finished(candidate)
+    if hub.is_address(source):
+        return hub.download(str(source), "model", CheckpointError)
+    if str(source) == _ONLY_IN_REPOSITORY:
+        raise ConfigError(
+            f"Expected the checkpoint {source} in checkpoints/, got none: the wheel "
+            f"leaves it out for its size. Copy the folder checkpoints/{source} of the "
+            "repository there, or name another model, such as stakes-v1."
+        )
+    names = [folder.name for folder in list_checkpoints()]
+    options = sorted({*registry.names("model"), *names})
+    siblings = [config.parent.name for config in path.parent.glob(f"*/{CONFIG}")]
+    suggestion = (
+        registry.hint(str(source), options)
+        or registry.hint(path.name, siblings, f"{path.parent}/")
+        or registry.hint(path.name, names)
+    )
+    raise ConfigError(
+        f"Expected a model among {', '.join(options)}, the folder of a checkpoint, "
+        "package.module:Name, path/to/file.py:Name or owner/name@revision of a hub, "
+        f"got {str(source)!r}.{suggestion}"
+    )
+
+
+def list_checkpoints() -> list[Path]:
+    """Return the folders of the checkpoints in `checkpoints/` here and of those shipped.
+
+    Of several checkpoints with the same name only the first is returned.
+    """
+    by_name: dict[str, Path] = {}
+    for folder in _checkpoint_folders():
+        for path in sorted(config.parent for config in folder.glob(f"*/{CONFIG}")):
+            by_name.setdefault(path.name, path)
+    return list(by_name.values())
+
+
+def split_own(source: str | Path) -> tuple[str, str] | None:
+    """Split `path/to/file.py:Name@CHECKPOINT` into class and checkpoint.
+
+    Returns:
+        None if the source does not have this form.
+    """
+    match = re.fullmatch(r"(.+?:[A-Za-z_][\w.]*)@(.+)", str(source))
+    if match is None or (Path(source) / CONFIG).is_file():
+        return None
+    return match[1], match[2]
+
+
+def _checkpoint_folders() -> tuple[Path, Path]:
+    return Path("checkpoints"), shipped_folder("checkpoints")

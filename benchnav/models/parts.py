@@ -1,0 +1,63 @@
+"""Names of the parts of a model, and interrupted trainings of parts."""
+
+import os
+from collections.abc import Collection
+from pathlib import Path
+
+from benchnav.core import registry
+from benchnav.core.errors import CheckpointError
+
+CLASSIFIER = "classifier"
+GP = "gp"
+
+
+def member_name(index: int, stem: str) -> str:
+    """Return the part of an ensemble's member, counted from 0; the first is the stem."""
+    return f"{stem}-{index + 1}" if index else stem
+
+
+def is_member(name: str, stem: str) -> bool:
+    """Return whether a part is a member of the name `stem`."""
+    number = name.removeprefix(f"{stem}-")
+    return name == stem or (number != name and number.isdigit())
+
+
+def training_command(part: str) -> str:
+    """Return the command that trains a part."""
+    stem = part.partition("-")[0]
+    if stem in (CLASSIFIER, GP):
+        return stem
+    if stem in registry.names("model"):
+        return f"fit {stem}"
+    return f"fit path/to/file.py:{stem}"
+
+
+def training_folder(folder: str | Path) -> Path:
+    """Return the folder for logs and state of a training, next to its checkpoint."""
+    return Path(f"{os.path.normpath(folder)}.training")
+
+
+def check_finished(folder: str | Path, trained: Collection[str] = ()) -> None:
+    """Check that the training of a model was not interrupted.
+
+    Args:
+        folder: folder of its checkpoint, which need not exist.
+        trained: names of the parts in the checkpoint.
+
+    Raises:
+        CheckpointError: If the folder of logs has a part that the checkpoint lacks.
+    """
+    logs = training_folder(folder)
+    unfinished = sorted(
+        path.name
+        for path in logs.glob("*")
+        if path.is_dir() and path.name not in trained
+    )
+    if unfinished:
+        command = "all" if GP in trained else training_command(unfinished[0])
+        raise CheckpointError(
+            f"Expected a trained model in {folder}, got one whose training was "
+            f"interrupted: {logs / unfinished[0]} is not finished. Give its command "
+            f"again with --resume, such as `benchnav-train {command} --data DATA --out "
+            f"{folder} --resume`."
+        )
