@@ -226,7 +226,7 @@ def compare(
     runs = [Path(folder) for folder in folders]
     different = allow_different == "code"
     table, shown = compare_runs(
-        runs, by, against, labels.asked, points / 100, different, metric
+        runs, by, against, labels.selected, points / 100, different, metric
     )
     print_table(shown)
     if out:
