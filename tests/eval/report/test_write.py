@@ -84,7 +84,7 @@ def test_report_has_its_files_and_gives_the_summary(tmp_path: Path) -> None:
     np.testing.assert_allclose(again["success_low"], summary["success_low"], rtol=1e-5)
     text = (folder / "summary.md").read_text()
     for line in (
-        "- World paper: λ resampled; time budget T = 100 s; free ground has λ̂ above 0.3.",
+        "- World paper: λ resampled; time budget T = 100 s; free terrain has λ̂ above 0.3.",
         "- Data: paper-v1. Models: paper-v1. Seeds: 0, 7.",
         "- Each condition: 4 episodes on 2 maps.",
         "¹ Cost minimised in place of J: its own time.",
