@@ -22,7 +22,7 @@ class Failures(Figure):
     """Failures of the best setting of a block and of the worst, a line a condition.
 
     Attributes:
-        place: of the sheet among those of the run.
+        place: index of the sheet among those of the run.
     """
 
     name = "failures"
@@ -37,9 +37,8 @@ class Failures(Figure):
         title, _ = data.sheets.shown[self.place]
         return (
             "Failures of the settings with the highest and the lowest success rate, "
-            f"{title}: predicted λ̂ (colour), "
-            "driven path and its end. λ̂ is that of the cell of the end, observed λ "
-            "the mean of the last 2 s."
+            f"{title}: predicted λ̂ (colour), driven path and its end. λ̂ in the titles "
+            "is that of the last cell, observed λ the mean of the last 2 s."
         )
 
     def draw(self, data: RunData) -> Drawing:
