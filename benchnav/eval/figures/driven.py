@@ -94,11 +94,9 @@ class DrivenPaths(Figure):
         maps.mark(panel, "start", tracks[0][0])
         maps.mark(panel, "goal", ground.goal_m)
         maps.name_immobilising(panel, ground.immobilising)
-        title = (
-            "terrain, faded"
-            if ground.field is None
-            else "λ field of the episode; lighter is higher"
-        )
+        title = "λ field of the episode; lighter is higher"
+        if ground.field is None:
+            title = "terrain, faded"
         panel.set(xlabel="x [m]", ylabel="y [m]", title=title)
         maps.frame_map(panel)
         failed = np.flatnonzero(~rows["success"].to_numpy(bool))

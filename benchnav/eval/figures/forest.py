@@ -17,7 +17,8 @@ from benchnav.viz.figure import Figure
 from benchnav.viz.panels import GRID, draw_interval
 from benchnav.viz.style import BLUE, TWO_COLUMNS_IN, legend_outside
 
-_TEST_IN, _METRIC_IN = 0.3, 0.55
+_TEST_IN = 0.3
+_METRIC_IN = 0.55
 _MARGIN = "0.88"
 
 

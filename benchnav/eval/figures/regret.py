@@ -50,11 +50,9 @@ class Regret(Figure):
     def caption(self, data: RunData) -> str:
         """Return the meaning of a step, and how many chains are shown."""
         chains = data.regret["chain"].nunique()
-        shown = (
-            f" The first {MAX_CHAINS} of {chains} chains are shown."
-            if chains > MAX_CHAINS
-            else ""
-        )
+        shown = ""
+        if chains > MAX_CHAINS:
+            shown = f" The first {MAX_CHAINS} of {chains} chains are shown."
         return (
             "Regret against the near-optimal reference, which plans on λ itself and is "
             "no bound: paired differences in each step from a planner to the "
@@ -148,7 +146,8 @@ def _draw_chain(panel: Axes, rows: pd.DataFrame, measure: str) -> None:
         difference, low, high = (
             factor * row[f"{measure}_{end}"] for end in ("difference", "low", "high")
         )
-        start, end = means[height - 1], means[height]
+        start = means[height - 1]
+        end = means[height]
         better = difference > 0 if more_is_worse else difference < 0
         panel.barh(
             height, end - start, left=start, color=ORANGE if better else BLUE, **looks

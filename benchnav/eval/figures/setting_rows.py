@@ -15,7 +15,8 @@ from benchnav.eval.experiment.condition import KNOWLEDGE
 from benchnav.eval.words import blocks, with_names
 from benchnav.viz.panels import GRID, panel_grid
 
-_ROW_IN, _GAP_ROWS = 0.145, 0.6
+_ROW_IN = 0.145
+_GAP_ROWS = 0.6
 _PANELS_A_LINE = 4
 _SETTING = ["planner", "model", *KNOWLEDGE, "risk"]
 
@@ -41,7 +42,8 @@ def lay_out(
         "gap", kind="stable"
     )
     settings["height"] = np.arange(len(settings)) + settings.pop("gap")
-    lowest, columns = settings["height"].max(), len(measures)
+    lowest = settings["height"].max()
+    columns = len(measures)
     blocks_of_run = blocks(summary.merge(settings, on=_SETTING, how="left"))
     block_panels = [block for block in blocks_of_run for _ in measures]
     across = columns if columns > 1 else min(len(block_panels), _PANELS_A_LINE)

@@ -122,7 +122,8 @@ def describe_parts(condition: Condition) -> Code:
     modules = [_UNIT]
     parts: dict[str, Any] = {}
     for kind, part in condition.parts.items():
-        name, target = f"{kind} {part.part}", part.found
+        name = f"{kind} {part.part}"
+        target = part.found
         folder = part.folder if isinstance(part, ModelPart) else None
         if folder is not None:
             parts[name] = text_digest(digests_of(folder))

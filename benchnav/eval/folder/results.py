@@ -75,11 +75,9 @@ class Results:
             "for one that is read repeatedly as it grows"
         ]
         if self.without:
-            more = (
-                f" and {len(self.without) - _NAMED} more"
-                if len(self.without) > _NAMED
-                else ""
-            )
+            more = ""
+            if len(self.without) > _NAMED:
+                more = f" and {len(self.without) - _NAMED} more"
             lines.append(
                 f"{self.mark}, no episode yet: {'; '.join(self.without[:_NAMED])}{more}"
             )

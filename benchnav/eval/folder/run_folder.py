@@ -43,8 +43,11 @@ from benchnav.eval.folder.sealed import (
     with_metadata,
 )
 
-FORMAT, FORMAT_VERSION = "benchnav-run", 6
-RUN, EPISODES, ERRORS = "run.json", "episodes.parquet", "errors.txt"
+FORMAT = "benchnav-run"
+FORMAT_VERSION = 6
+RUN = "run.json"
+EPISODES = "episodes.parquet"
+ERRORS = "errors.txt"
 KEYS = ["condition", *DRAW]  # of a row
 
 

@@ -30,7 +30,8 @@ def verify_run(folder: Path) -> tuple[list[str], list[str]]:
     Raises:
         ConfigError: If the folder has no `run.json`.
     """
-    damage, notes = [], []
+    damage = []
+    notes = []
     try:
         run = open_run(folder)
     except BenchnavError as error:

@@ -47,17 +47,13 @@ def _pairing_by_label(rows: pd.DataFrame, summary: pd.DataFrame) -> dict[str, bo
 
     The value is whether `compare` pairs the settings by that label.
     """
-    first, setting_columns = (
-        rows.iloc[0],
-        [name for name in LABELS if name not in BLOCK],
-    )
+    first = rows.iloc[0]
+    setting_columns = [name for name in LABELS if name not in BLOCK]
     same_maps = summary[
         (summary["data"] == first["data"]) & (summary["scenario"] == first["scenario"])
     ]
-    settings, is_paired_by = (
-        set(rows[setting_columns].itertuples(index=False, name=None)),
-        {},
-    )
+    settings = set(rows[setting_columns].itertuples(index=False, name=None))
+    is_paired_by = {}
     for name in ("robot", "objective", "world"):
         fixed = [label for label in BLOCK if label != name]
         others = same_maps[
@@ -127,7 +123,8 @@ def _rank(
         for name in (name for name, paired in apart.items() if paired):
             yield f"benchnav-eval compare --by {name} compares the {name}s of the run."
         return
-    alike, worse = others[others["best_alike"]], others[~others["best_alike"]]
+    alike = others[others["best_alike"]]
+    worse = others[~others["best_alike"]]
     unit = "group" if best["n_groups"] < best["n_maps"] else "map"
     test = f"max-T bootstrap test by {unit} over {len(others) + 1} settings"
     if best["best_maps"] < FEWEST_MAPS:
@@ -137,7 +134,8 @@ def _rank(
         )
         return
     if worse.empty:
-        shown, p = others["best_shown"].max(), others["best_p"].min()
+        shown = others["best_shown"].max()
+        p = others["best_p"].min()
         maps = f"{int(best['best_maps'])} {unit}s"
         power = (
             f"; {maps} detect differences of {100 * shown:.0f} points or more "
@@ -150,33 +148,28 @@ def _rank(
         )
         return
     if alike.empty:
-        subject = (
-            "The other setting is"
-            if len(worse) == 1
-            else f"All {len(worse)} other settings are"
-        )
+        subject = "The other setting is"
+        if len(worse) != 1:
+            subject = f"All {len(worse)} other settings are"
         yield f"{subject} significantly worse."
     else:
         listed = list(alike["name"])
-        remainder = (
-            f" and {len(listed) - _MAX_NAMED} more" if len(listed) > _MAX_NAMED else ""
-        )
-        verb = (
-            "1 other setting is"
-            if len(listed) == 1
-            else f"{len(listed)} other settings are"
-        )
+        remainder = ""
+        if len(listed) > _MAX_NAMED:
+            remainder = f" and {len(listed) - _MAX_NAMED} more"
+        verb = "1 other setting is"
+        if len(listed) != 1:
+            verb = f"{len(listed)} other settings are"
         yield (
             f"{verb} not significantly worse (p ≥ {ALPHA}): "
             f"{'; '.join(listed[:_MAX_NAMED])}{remainder}."
         )
     following = worse.iloc[0]
-    low, high = 100 * following["best_low"], 100 * following["best_high"]
-    verb = (
-        "is significantly worse"
-        if len(worse) == 1
-        else "is the best of those that are significantly worse"
-    )
+    low = 100 * following["best_low"]
+    high = 100 * following["best_high"]
+    verb = "is the best of those that are significantly worse"
+    if len(worse) == 1:
+        verb = "is significantly worse"
     yield (
         f"{following['name']} {verb}: {rate_in_words(following)} %, "
         f"{100 * following['best_difference']:.1f} points "

@@ -141,14 +141,15 @@ def _claim(row: Mapping[Any, Any], quantities_by_name: Mapping[str, Quantity]) -
 def _verdict(row: Mapping[Any, Any]) -> str:
     if np.isnan(row["p_holm"]):
         return f"partial: {NOT_YET}"
-    kind, direction = row["kind"], row["direction"]
+    kind = row["kind"]
+    direction = row["direction"]
     if kind in _OF_MARGINS:
         return _OF_MARGINS[kind] if row["supported"] else f"{kind} not shown"
     if row["supported"]:
         return f"significantly {direction or 'different'}"
-    return (
-        f"not significantly {direction}" if direction else "no significant difference"
-    )
+    if direction:
+        return f"not significantly {direction}"
+    return "no significant difference"
 
 
 def _numbers(row: Mapping[Any, Any], unit: str) -> str:
@@ -181,10 +182,11 @@ def _extended(manifest: Mapping[str, Any]) -> list[str]:
 def _interval(row: Mapping[Any, Any]) -> str:
     # The interval whose end decides a test at 5 %, before a correction.
     suffix, words = ("_90", "90 %") if row["kind"] in _OF_MARGINS else ("", "95 %")
-    low, high = row[f"low{suffix}"], row[f"high{suffix}"]
-    return (
-        NOT_USED if np.isnan(low) else (f"{_signed(low)} to {_signed(high)} ({words})")
-    )
+    low = row[f"low{suffix}"]
+    high = row[f"high{suffix}"]
+    if np.isnan(low):
+        return NOT_USED
+    return f"{_signed(low)} to {_signed(high)} ({words})"
 
 
 def _with_unit(row: Mapping[Any, Any]) -> str:

@@ -40,7 +40,8 @@ _ALWAYS = ("scenario", "planner", "risk")
 _SUCCESS = shipped.SUCCESS.quantity
 _TOTAL_TIME = shipped.TOTAL_TIME.quantity
 _TRAVERSABILITY = shipped.TRAVERSABILITY.quantity
-ALONE, IN_BATCH = "one robot [ms]", "per episode of a batch [ms]"
+ALONE = "one robot [ms]"
+IN_BATCH = "per episode of a batch [ms]"
 LATENCIES = ("median_ms", "p95_ms", "max_ms")
 _MEANINGS = {
     "data": "dataset.",

@@ -96,7 +96,8 @@ def begin(
             f"{'metric' if len(new_names) == 1 else 'metrics'} {', '.join(new_names)}"
         )
         (folder / EPISODES).unlink(missing_ok=True)
-    conditions, requested = dict(earlier.conditions), {}
+    conditions = dict(earlier.conditions)
+    requested = {}
     # What differs from an earlier condition only in what is not used is run as that
     # one.
     rows_ids = {

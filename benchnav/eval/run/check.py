@@ -257,7 +257,8 @@ def _distinct(conditions: Sequence[Condition], *names: str) -> list[Condition]:
 
 def _check_model(condition: Condition) -> list[str]:
     """Load the model, which may reject its options, and warn of another class table."""
-    model, name = condition.model.object, f"model {condition.model.label}"
+    model = condition.model.object
+    name = f"model {condition.model.label}"
     folder = condition.model.folder
     # A checkpoint has a class table, whether or not its model predicts classes.
     owner = load_checkpoint(folder) if folder else model

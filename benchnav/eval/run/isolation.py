@@ -73,7 +73,8 @@ class IsolatedPlanner(Planner[int]):
 
     def init(self, problem: Problem, generator: torch.Generator) -> int:
         """See `Planner`. The plan state stays in the child; here it counts calls."""
-        seed, state = generator.initial_seed(), generator.get_state()
+        seed = generator.initial_seed()
+        state = generator.get_state()
         self._ask(self.limit_s + _START_S, "init", problem, seed, state)
         return 0
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from benchnav.core.batch import put_if_alike
 from benchnav.eval.folder.steps import AHEAD_DEG, AHEAD_M
-from benchnav.eval.recording import KnownMap, reach_outline
+from benchnav.eval.recorded_plans import KnownMap, reach_outline
 from benchnav.planning.free_space import cells_at_goal
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import steps_in
@@ -129,9 +129,9 @@ class Knowing:
         )
         knowledge, changed = learning.learner.update(self.known, self._truth)
         self.known = knowledge
-        return (
-            self._updated_problem(robot_state, running) if bool(changed.any()) else None
-        )
+        if bool(changed.any()):
+            return self._updated_problem(robot_state, running)
+        return None
 
     def _updated_problem(self, robot_state: Tensor, running: Tensor) -> Problem | None:
         """Return the problem with new maps where running episodes changed enough."""
@@ -220,7 +220,8 @@ class Knowing:
         indices = {
             int(member): index for index, member in enumerate(self.members.tolist())
         }
-        learner, knowledge = self._learning.learner, self.known
+        learner = self._learning.learner
+        knowledge = self.known
         maps = {}
         for member in members:
             if member not in indices:

@@ -64,14 +64,14 @@ def merge_shards(parts: Sequence[Path], folder: Path) -> Iterator[tuple[int, int
         all_units = in_table_order(units(conditions), conditions)
         makings = [(unit, _find(unit, runs)) for unit in all_units]
         _check_whole([unit for unit, making in makings if making is None], runs)
-        found = [(unit, making) for unit, making in makings if making is not None]
-        _check_one_environment([making for _, making in found])
+        complete = [(unit, making) for unit, making in makings if making is not None]
+        _check_one_environment([making for _, making in complete])
         target = folder.resolve()
         partial = new_folder(target)
         write_run(partial, _about(runs))
         yield 0, len(all_units)
         copied = []
-        for unit, finished in found:
+        for unit, finished in complete:
             path = partial / "units" / unit.condition.id / finished.path.name
             _copy(finished.path, path)
             copied.append((unit, replace(finished, path=path)))

@@ -9,16 +9,14 @@ import torch
 
 from benchnav.core.terrain import Terrain
 from benchnav.eval.experiment.unit import Unit
-from benchnav.eval.recording import (
-    MOMENT_S,
+from benchnav.eval.recorded_plans import (
     NUMBERS,
     DrawnPlan,
     KnownMap,
-    Recording,
-    drawing_interval,
     drawn_plan,
     thinned,
 )
+from benchnav.eval.recording import MOMENT_S, Recording, drawing_interval
 from benchnav.eval.run.knowledge import Knowing
 from benchnav.eval.run.rollout import Episodes, Observer
 from benchnav.planning.planners.planner import Plan

@@ -119,7 +119,7 @@ def compare(run_folder: Path, folder: Path) -> tuple[bool, list[str]]:
     same = not (len(cells) or len(missing) or columns)
     lines = [f"all {len(first)} rows came out the same"] if same else []
     if len(cells) or len(missing):
-        conditions = {}
+        conditions: dict[str, Condition] = {}
         for entries in (again.conditions, run.conditions):
             conditions |= {i: condition for i, (condition, _) in entries.items()}
         lines += _verdict(conditions, len(first), cells, missing)

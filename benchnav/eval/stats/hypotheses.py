@@ -59,7 +59,7 @@ def test_hypotheses(
             budgets = time_budgets(of_condition, worlds[condition])
             sides.append(of_condition.assign(time_budget_s=budgets))
         quantity = quantities[test.metric]
-        paired = comparable(*sides, quantity)
+        paired = comparable(sides[0], sides[1], quantity)
         _, low_90, high_90 = _interval(paired, quantity, 0.9)
         table_rows.append(
             {
