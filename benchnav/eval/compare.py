@@ -105,7 +105,7 @@ def compare_runs(
     lines = _unlike_code(members, parts_alone=not any(unlike))
     if lines and by != "run" and not allow_different_code:
         raise ConfigError(
-            f"Expected conditions that differ in their {by} alone, got conditions "
+            f"Expected conditions that differ only in their {by}, got conditions "
             "made by different code: "
             f"{'; '.join(lines)}. Run them with one code, or pass --allow-different "
             "code, which names it in the table."
@@ -415,7 +415,7 @@ def _no_partner(
     if not names:
         return []
     return [
-        f"Not in the table, since no condition differs from them in {by} alone: "
+        f"Not in the table, since no condition differs from them only in {by}: "
         f"{'; '.join(_first_of(names, 'conditions'))}."
     ]
 

@@ -190,12 +190,12 @@ class Recording(Ground):
 
     @property
     def now(self) -> int:
-        """The step that figures show: that of the plan, or the last if there is none."""
+        """The step that figures show: that of the plan, or the last without a plan."""
         last = len(self.traversability)
         return min(self.plan.step, last) if self.own_plans else last
 
     def plan_at(self, time_s: float) -> DrawnPlan:
-        """Return the last plan drawn by a time; an empty one if there is none."""
+        """Return the last plan drawn by a time; an empty one if no plan was."""
         due = time_s / self.dt_s + 1e-6
         plans = [plan for plan in self.own_plans if plan.step <= due]
         return plans[-1] if plans else DrawnPlan(step=0, lines={})

@@ -4,6 +4,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from benchnav.core.registry import Part
 from benchnav.core.store import Shard
@@ -168,19 +169,15 @@ def units(
         for unit in _blocks(condition, extent, record)
     ]
     order = {condition_id: index for index, condition_id in enumerate(conditions)}
-    return sorted(
-        units_,
-        key=lambda u: (
-            u.condition.data,
-            u.condition.scenario,
-            u.block,
-            u.condition.blind,
-            u.condition.model.part,
-            u.seed,
-            u.realisation,
-            order[u.condition.id],
-        ),
-    )
+
+    def run_order(unit: Unit) -> tuple[Any, ...]:
+        condition = unit.condition
+        block = (condition.data, condition.scenario, unit.block)
+        prediction = (condition.blind, condition.model.part)
+        draw = (unit.seed, unit.realisation)
+        return (*block, *prediction, *draw, order[condition.id])
+
+    return sorted(units_, key=run_order)
 
 
 def in_table_order(units_: Iterable[Unit], conditions: Conditions) -> list[Unit]:

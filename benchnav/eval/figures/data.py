@@ -142,7 +142,7 @@ def choose_recordings(
     """Choose one recording a condition, up to `MAX_PANELS`, on one map if possible.
 
     The map is the first on which outcomes differ, among those that the first condition
-    was recorded on; if there is none, the first on which an episode failed.
+    was recorded on, else the first on which an episode failed.
 
     Args:
         recordings: all recordings.

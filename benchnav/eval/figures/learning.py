@@ -80,13 +80,14 @@ class Learning(Figure):
         letters = int(
             (TWO_COLUMNS_IN / min(len(groups), MAX_ACROSS) - 0.4) / _LETTER_IN
         )
-        points = [
-            self.curves[self.curves["condition"] == rows["condition"][index]].assign(
-                panel=textwrap.fill(title, letters), line=names[index]
-            )
-            for title, shown in groups
-            for index in shown
-        ]
+        points = []
+        for title, shown in groups:
+            panel = textwrap.fill(title, letters)
+            for index in shown:
+                is_line = self.curves["condition"] == rows["condition"][index]
+                points.append(
+                    self.curves[is_line].assign(panel=panel, line=names[index])
+                )
         table = pd.concat(points).rename(columns={"time_s": "x"})
         looks = line_looks(names, dashed=True)
         figure, panels = Curves(

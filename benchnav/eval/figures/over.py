@@ -198,22 +198,19 @@ class Over(Figure):
         groups = [
             (title or labels["scenario"][shown[0]], shown) for title, shown in groups
         ]
-        measured = pd.DataFrame(
-            {
-                name + end: scale * rows[column]
-                for name, (*columns, scale) in _MEASURES.items()
-                for end, column in zip(("", "_low", "_high"), columns, strict=True)
-            }
-        )
-        points = [
-            measured.loc[list(self.lines[index].conditions)].assign(
-                panel=title,
-                line=labels["name"][index],
-                x=_positions(self.number, self.lines[index].values),
-            )
-            for title, shown in groups
-            for index in shown
-        ]
+        columns_of_measures: dict[str, pd.Series] = {}
+        for name, (*columns, scale) in _MEASURES.items():
+            for end, column in zip(("", "_low", "_high"), columns, strict=True):
+                columns_of_measures[name + end] = scale * rows[column]
+        measured = pd.DataFrame(columns_of_measures)
+        points = []
+        for title, shown in groups:
+            for index in shown:
+                line = self.lines[index]
+                x = _positions(self.number, line.values)
+                of_line = measured.loc[list(line.conditions)]
+                name = labels["name"][index]
+                points.append(of_line.assign(panel=title, line=name, x=x))
         across = min(len(groups), MAX_ACROSS)
         measures = {name: name for name in _MEASURES}
         label = _NAMES.get(self.number, sweep_name(self.number))

@@ -209,28 +209,28 @@ def code_differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list
         earlier: as `Origin.code`, perhaps with `TOUCHED`.
         now: likewise.
     """
-    differing = {
-        group: [
+    differing: dict[str, list[str]] = {}
+    for group in ("modules", "environment", "parts", METRICS):
+        values = now.get(group, {})
+        differing[group] = [
             name
             for name, value in earlier.get(group, {}).items()
-            if now.get(group, {}).get(name, value) != value
+            if values.get(name, value) != value
         ]
-        for group in ("modules", "environment", "parts", METRICS)
-    }
     modules = differing["modules"]
     more = ""
     if len(modules) > _MAX_NAMED:
         more = f" and {len(modules) - _MAX_NAMED} more of its modules"
-    return [
-        *([f"{', '.join(modules[:_MAX_NAMED])}{more}"] if modules else []),
-        *(
-            f"{n} ({earlier['environment'][n]} to {now['environment'][n]})"
-            for n in differing["environment"]
-        ),
-        *differing["parts"],
-        *(f"metric {column}" for column in differing[METRICS]),
-        *unlike(earlier.get(TOUCHED, {}), now.get(TOUCHED, {})),
-    ]
+    lines = []
+    if modules:
+        lines.append(f"{', '.join(modules[:_MAX_NAMED])}{more}")
+    for name in differing["environment"]:
+        before = earlier["environment"][name]
+        lines.append(f"{name} ({before} to {now['environment'][name]})")
+    lines += differing["parts"]
+    lines += [f"metric {column}" for column in differing[METRICS]]
+    lines += unlike(earlier.get(TOUCHED, {}), now.get(TOUCHED, {}))
+    return lines
 
 
 def dataset_differences(

@@ -330,7 +330,7 @@ def finish_run(
     Args:
         folder: the run folder.
         finished: all units of the run, in the order of the table.
-        reused: a line on units of other code; empty if there are none.
+        reused: a line on units of other code; empty without such units.
     """
     manifest = open_run(folder).about
     write_errors(folder, finished)

@@ -173,7 +173,7 @@ def _rank(
     yield (
         f"{following['name']} {verb}: {rate_in_words(following)} %, "
         f"{100 * following['best_difference']:.1f} points "
-        f"less (95 % interval of this pair alone {low:.1f} to {high:.1f}), "
+        f"less (95 % interval of this pair only {low:.1f} to {high:.1f}), "
         f"{p_in_words(following['best_p'])} ({test})."
     )
 

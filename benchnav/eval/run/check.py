@@ -276,7 +276,7 @@ def _check_world(condition: Condition, dataset: TerrainDataset, maps: int) -> li
     top_speed = task.robot.top_speed_mps
     budget = world.budget_s(torch.from_numpy(read["reference_time_s"]), top_speed)
     world.steps(budget, task.robot.dt_s)
-    # Only imported maps have cells of which λ is missing.
+    # Only imported maps have cells without λ.
     is_imported = any("source" in part for part in dataset.splits[split]["parts"])
     for start in chosen[::BLOCK_MAPS] if is_imported else chosen[:1]:
         block_maps = chosen[start : start + BLOCK_MAPS] if is_imported else [0]
@@ -313,5 +313,5 @@ def _doubts(condition: Condition, dataset: TerrainDataset) -> Iterator[str]:
         yield (
             f"maps of {dataset.id} {condition.split} may have no feasible path to the "
             "goal (no `solvable: true`), "
-            "so that a planner may fail on them for that alone"
+            "so that a planner may fail on them for this reason"
         )

@@ -58,8 +58,8 @@ class Knowing:
         sensed_cells: number of cells whose λ each robot measured by then, int64,
             shape [B].
         ahead: by step, RMSE of E[λ] and mean log score of the belief over the cells
-            ahead of each robot whose λ was not measured, shape [B, 2]; NaN if there are
-            none.
+            ahead of each robot whose λ was not measured, shape [B, 2]; NaN without
+            such cells.
         known: knowledge of the remaining episodes.
         members: indices of the remaining episodes, int64.
     """

@@ -37,7 +37,7 @@ from benchnav.planning.world.outcome import Outcome, tell_standstill
 from benchnav.planning.world.simulation import Simulation, SimulationState, end
 
 _FULL = 0.75  # fraction of running episodes above which the batch is not reduced
-_CHECK_INTERVAL = 8  # steps between two reads of which episodes run, on a GPU
+_CHECK_INTERVAL = 8  # steps between two reads of the running episodes, on a GPU
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,13 +149,13 @@ class _Log:
         self.dt_s = problem.dt_s
         self.states = [start.state]
         # Of each step: actions, observed λ, and distance and turn rate for λ = 1.
-        none = start.state.new_zeros(len(start.state), 0)
+        empty = start.state.new_zeros(len(start.state), 0)
         self._steps = [
             [
-                none[..., None].expand(-1, 0, len(problem.robot.action_low)),
-                none,
-                none,
-                none,
+                empty[..., None].expand(-1, 0, len(problem.robot.action_low)),
+                empty,
+                empty,
+                empty,
             ]
         ]
         self.clock = Clock(start.state.device)  # what is prepared, then each plan
@@ -225,7 +225,7 @@ class _Log:
 
 
 def _by_step(measured: Mapping[int, Tensor], batch: int, steps: int) -> Tensor:
-    """Return scores of all steps, NaN where there are none, shape [B, N, 2]."""
+    """Return scores of all steps, NaN without an update, shape [B, N, 2]."""
     scores = torch.full((batch, steps, 2), torch.nan)
     for step, values in measured.items():
         if step < steps:

@@ -144,7 +144,7 @@ def run_work(
             store_files(folder, unit, files)
         yield steps.progress(unit)
     if missing:
-        say("measuring the planning time of one robot alone")
+        say("measuring the planning time of a single robot")
     measure_latencies(folder, {unit.condition.id for unit in named}, work.settings)
     finished, reused = _finished(
         in_table_order(named, conditions), origins, folder, work.reuse_code
@@ -401,7 +401,7 @@ def _finished(
 ) -> tuple[list[tuple[Unit, Finished]], str]:
     """Return the valid makings of all units, and a line on those of other code.
 
-    The line is empty if there are none.
+    The line is empty without such units.
 
     Raises:
         ConfigError: If a unit was removed.

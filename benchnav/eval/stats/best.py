@@ -93,7 +93,7 @@ def against_best(
         the number of other competitors; `best_episodes`, the number of common episodes,
         on `best_maps` maps, where a group counts as one;
         `best_difference`, by how much the best's success rate is higher, with its 95 %
-        interval `_low`, `_high`, of the pair alone; `best_p`, from `best_set_p`;
+        interval `_low`, `_high`, of that pair, uncorrected; `best_p`, from `best_set_p`;
         `best_shown`, the minimum detectable difference with 80 % power; `best_alike`,
         true if it competes and is not significantly worse than the best; and
         `best_marked`, true if it is alike and some condition of its block is worse. NaN

@@ -111,18 +111,19 @@ def _compare(
     std = float(standard_deviation(gain, draws))
     arrived = mean_differences(rows[rows["success"] & rows["success_other"]])
     mean, low, high = map(float, mean_interval(arrived))
-    return {
+    row: dict[str, Any] = {
         "success_one": rows["success"].mean(),
         "success_other": rows["success_other"].mean(),
-        **named("success", interval_of(rows, "success")),
-        "success_p": difference_p(rows, "success"),
-        "success_detectable": smallest_difference(std, len(gain), alpha),
-        "maps_needed": maps_needed(std, difference, alpha),
-        **named("time", time_interval, time_unit),
-        "time_p": signed_rank_p(summed_differences(timed)),
-        **named("arrival_time", (mean, low, high), "_s"),
-        "arrival_time_n_maps": len(arrived),
     }
+    row |= named("success", interval_of(rows, "success"))
+    row["success_p"] = difference_p(rows, "success")
+    row["success_detectable"] = smallest_difference(std, len(gain), alpha)
+    row["maps_needed"] = maps_needed(std, difference, alpha)
+    row |= named("time", time_interval, time_unit)
+    row["time_p"] = signed_rank_p(summed_differences(timed))
+    row |= named("arrival_time", (mean, low, high), "_s")
+    row["arrival_time_n_maps"] = len(arrived)
+    return row
 
 
 def named(name: str, interval: Interval, unit: str = "") -> dict[str, float]:

@@ -61,18 +61,14 @@ def test_hypotheses(
         quantity = quantities[test.metric]
         paired = comparable(sides[0], sides[1], quantity)
         _, low_90, high_90 = _interval(paired, quantity, 0.9)
-        table_rows.append(
-            {
-                **plain,
-                "unit": quantity.unit,
-                "n_maps": paired["group"].nunique(),
-                "n_episodes": len(paired),
-                **means_and_difference(quantity, paired),
-                "low_90": low_90,
-                "high_90": high_90,
-                "p": p_of(test, paired, quantities) if is_whole else np.nan,
-            }
-        )
+        row = {**plain, "unit": quantity.unit}
+        row["n_maps"] = paired["group"].nunique()
+        row["n_episodes"] = len(paired)
+        row |= means_and_difference(quantity, paired)
+        row["low_90"] = low_90
+        row["high_90"] = high_90
+        row["p"] = p_of(test, paired, quantities) if is_whole else np.nan
+        table_rows.append(row)
     table = pd.DataFrame(table_rows)
     table["p_holm"] = holm(table["p"].to_numpy()) if is_whole else np.nan
     return table.assign(supported=table["p_holm"] < ALPHA)

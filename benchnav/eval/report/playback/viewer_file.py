@@ -207,21 +207,19 @@ def describe(drivers: Sequence[Driver]) -> str:
         ]
         for name in NAMING
     }
-    rows: dict[str, Sequence[str]] = {
-        **{name: cells for name, cells in labels.items() if set(cells) != {NOT_USED}},
-        "outcome": [Bold(recording.outcome) for recording in recordings],
-        "time": [
-            f"{recording.end_s:.1f} s of {recording.time_budget_s:g} s"
-            for recording in recordings
-        ],
-        "observed λ": [
-            f"{recording.traversability.mean():.2f}"
-            if len(recording.traversability)
-            else NOT_USED
-            for recording in recordings
-        ],
-        "free": [free_rule(recording) for recording in recordings],
-    }
+    rows: dict[str, Sequence[str]] = {}
+    for name, cells in labels.items():
+        if set(cells) != {NOT_USED}:
+            rows[name] = cells
+    rows["outcome"] = [Bold(recording.outcome) for recording in recordings]
+    rows["time"] = [
+        f"{recording.end_s:.1f} s of {recording.time_budget_s:g} s"
+        for recording in recordings
+    ]
+    rows["observed λ"] = [
+        _mean_in_words(recording.traversability) for recording in recordings
+    ]
+    rows["free"] = [free_rule(recording) for recording in recordings]
     table = Table(
         headings=("", *(driver.name for driver in drivers)),
         rows=tuple((name, *cells) for name, cells in rows.items()),
@@ -232,6 +230,10 @@ def describe(drivers: Sequence[Driver]) -> str:
         to_markdown(table),
     ]
     return "\n\n".join(lines)
+
+
+def _mean_in_words(traversability: np.ndarray) -> str:
+    return f"{traversability.mean():.2f}" if len(traversability) else NOT_USED
 
 
 def free_rule(recording: Recording) -> str:
