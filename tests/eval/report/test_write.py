@@ -8,7 +8,7 @@ import pytest
 
 from benchnav.core.errors import ConfigError
 from benchnav.eval.folder.run_folder import write_run
-from benchnav.eval.report import write
+from benchnav.eval.report import header
 from benchnav.eval.report.write import (
     print_report,
     provenance_lines,
@@ -217,9 +217,9 @@ def test_the_share_of_lambda_drawn_again_is_that_of_frozen_worlds_whatever_faile
             "rejected_draws": [0, 0, 2, 0, 0, 0],
         }
     )  # fmt: skip
-    (line,) = write._rejected_draws(rows, conditions)
+    (line,) = header._rejected_draws(rows, conditions)
     assert line.startswith("50.0 % of the draws of λ had no feasible path")
-    assert write._rejected_draws(rows[rows["condition"] == "c"], conditions) == []
+    assert header._rejected_draws(rows[rows["condition"] == "c"], conditions) == []
 
 
 def test_a_sweep_has_its_figure(tmp_path: Path) -> None:
