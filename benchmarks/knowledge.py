@@ -52,7 +52,7 @@ def drive(unit: Unit, built: Built, steps: int = STEPS) -> dict[str, float]:
     learning and planning.
     """
     start, began = time.process_time(), time.perf_counter()
-    found, _ = simulate(unit, built, Settings(), enough=lambda step: step == steps)
+    found, _ = simulate(unit, built, Settings(), stop=lambda step: step == steps)
     took, waited = time.process_time() - start, time.perf_counter() - began
     return {
         "ms a second driven": 1e3

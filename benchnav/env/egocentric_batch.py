@@ -102,8 +102,9 @@ class EgocentricBatch(EnvBatch):
         if isinstance(model, str) and not model:
             guard.warn_of_default_model()
             model = "oracle"
-        is_loaded = isinstance(model, TraversabilityModel)
-        predictor: Any = model if is_loaded else load_model(model)
+        predictor: Any = model
+        if not isinstance(model, TraversabilityModel):
+            predictor = load_model(model)
         if mismatch := class_mismatch(predictor, self._dataset.recipe):
             guard.warn(f"{mismatch}.")
         sensor: Any = registry.take("sensor", perception.sensor)
@@ -117,7 +118,7 @@ class EgocentricBatch(EnvBatch):
         )
         statistics = None
         if not sensor.sees_all or belief.needs_statistics:
-            source: Any = "oracle" if is_loaded else model
+            source: Any = "oracle" if predictor is model else model
             statistics = find_ground_statistics(source, self._dataset)
         risk = perception.risk
         learner = Learner(

@@ -1,6 +1,4 @@
-"""What can be named in a suite: parts of each kind and worlds, with purpose and
-options; and checkpoints.
-"""
+"""Catalogue of parts, worlds and checkpoints that a suite can name."""
 
 import inspect
 import json
@@ -28,28 +26,28 @@ TITLES = {
     "risk": "risk measures",
     "robot": "robots",
     "objective": "objectives",
-    "sensor": "sensors of appearance: what a robot sees of its map",
-    "ground": "sensors of the ground: what a robot senses of λ",
-    "belief": "beliefs: what is made of what is sensed",
+    "sensor": "appearance sensors: the observed part of the map",
+    "ground": "traversability sensors: the measured λ",
+    "belief": "beliefs: updates of the prediction by measurements",
     "metric": "metrics of episodes",
     "layer": "layers of recipes",
-    "figure": "figures: what a report shows",
-    "world": "worlds, each with its rules of the task",
+    "figure": "figures of reports",
+    "world": "worlds, each with rules of the task",
 }
 HELP = (
-    "Parts of your own are named package.module:Name or path/to/file.py:Name. "
+    "Custom parts are named package.module:Name or path/to/file.py:Name. "
     "NAME:VALUE sets the first option, "
     "{part: NAME, label: LABEL, options: {...}} sets any."
 )
 
 
 class Entry(NamedTuple):
-    """One thing that can be named.
+    """An entry of the catalogue.
 
     Args:
-        name: as it is written in a suite.
+        name: name in a suite.
         purpose: one line.
-        options: its options, each `name: type = default`.
+        options: options, each `name: type = default`.
     """
 
     name: str
@@ -58,14 +56,13 @@ class Entry(NamedTuple):
 
 
 def print_catalogue(*kinds: str) -> None:
-    """Prints what can be named in a suite: as tables in a terminal, as plain lines
-    elsewhere.
+    """Print the catalogue, as tables in a terminal and as plain lines elsewhere.
 
     Args:
-        kinds: some of the keys of `TITLES`; all of them when none is named.
+        kinds: keys of `TITLES`; by default all.
 
     Raises:
-        ConfigError: there is no such kind.
+        ConfigError: If there is no such kind.
     """
     chosen = [kind for kind in kinds if kind] or list(TITLES)
     for kind in chosen:
@@ -80,19 +77,15 @@ def print_catalogue(*kinds: str) -> None:
 
 
 def list_entries(kind: str) -> list[Entry]:
-    """Lists the parts of a kind that are known by name, for models also the checkpoints
-    found; or worlds.
-    """
+    """List the named parts of a kind, for models also checkpoints; or worlds."""
     if kind == "world":
         return list(_worlds())
-    found = [_describe(kind, name) for name in registry.names(kind)]
-    return found + list(_checkpoints()) if kind == "model" else found
+    entries = [_describe(kind, name) for name in registry.names(kind)]
+    return entries + list(_checkpoints()) if kind == "model" else entries
 
 
 def plain_lines(kind: str) -> list[str]:
-    """The catalogue of a kind as lines that other programs can read: `KIND NAME:
-    PURPOSE`, then options.
-    """
+    """Return the catalogue of a kind as lines `KIND NAME: PURPOSE`, then options."""
     lines = []
     for entry in list_entries(kind):
         lines.append(f"{kind} {entry.name}: {entry.purpose}")
@@ -101,7 +94,7 @@ def plain_lines(kind: str) -> list[str]:
 
 
 def make_table(kind: str) -> Table:
-    """The catalogue of a kind as a table."""
+    """Return the catalogue of a kind as a table."""
     return Table(
         title=TITLES[kind],
         headings=("name", "purpose", "options"),
@@ -113,25 +106,20 @@ def make_table(kind: str) -> Table:
 
 
 def _describe(kind: str, name: str) -> Entry:
-    """Describes a part; one that cannot be imported is told as such, and hides no
-    other.
-    """
+    """Describe a part; the purpose of one that cannot be imported is the error."""
     from benchnav.models.base import is_family
 
     try:
         target = registry.find(kind, name).target
         if kind == "model" and is_family(target):
-            settings = (
-                tuple(_option_lines(list_options(target)))
-                if config_class(target)
-                else ()
-            )
-            return Entry(
-                name,
+            settings: tuple[str, ...] = ()
+            if config_class(target):
+                settings = tuple(_option_lines(list_options(target)))
+            purpose = (
                 f"{_purpose(target)} Trained by `benchnav-train fit {name}`; name a "
-                "checkpoint.",
-                settings,
+                "checkpoint."
             )
+            return Entry(name, purpose, settings)
         options = tuple(_option_lines(registry.options_of(kind, target)))
         return Entry(name, _purpose(target), options)
     except BenchnavError as error:
@@ -139,7 +127,7 @@ def _describe(kind: str, name: str) -> Entry:
 
 
 def _purpose(target: Any) -> str:
-    """The first line of a docstring; one that Python made of a dataclass says nothing."""
+    """Return the first line of a docstring; empty if Python generated it."""
     line = (inspect.getdoc(target) or "").partition("\n")[0]
     return "" if line.startswith(f"{getattr(target, '__name__', '')}(") else line
 
@@ -147,14 +135,13 @@ def _purpose(target: Any) -> str:
 def _option_lines(
     options: dict[str, Option], prefix: str = "", holder: Any = None
 ) -> Iterator[str]:
-    """Options with types and defaults, those of a dataclass one by one, with the fields
-    of a holder for defaults.
+    """Yield options with types and defaults, those of nested dataclasses dotted.
+
+    Fields of `holder`, if it has them, override defaults.
     """
     for name, option in options.items():
-        config, default = (
-            dataclass_in(option.kind),
-            getattr(holder, name, option.default),
-        )
+        config = dataclass_in(option.kind)
+        default = getattr(holder, name, option.default)
         if config and default is not None:
             yield from _option_lines(list_options(config), f"{prefix}{name}.", default)
         else:
@@ -163,13 +150,11 @@ def _option_lines(
 
 
 def _type_words(kind: Any) -> str:
-    """A type as people write it in code, classes without their modules, words and
-    unions by bars.
-    """
+    """Return a type as in code: classes without modules, literals and unions by bars."""
     words = re.sub(r"(\w+\.)+", "", inspect.formatannotation(kind))
-    words = re.sub(r"Literal\[(.*?)\]", lambda found: found[1].replace("'", ""), words)
+    words = re.sub(r"Literal\[(.*?)\]", lambda match: match[1].replace("'", ""), words)
     return re.sub(
-        r"^Union\[(.*)\]$", lambda found: found[1].replace(", ", " | "), words
+        r"^Union\[(.*)\]$", lambda match: match[1].replace(", ", " | "), words
     )
 
 
@@ -183,7 +168,7 @@ def _default(value: Any) -> str:
 
 
 def _worlds() -> Iterator[Entry]:
-    """Worlds with their settings, each as a flag or a suite names it."""
+    """Yield worlds with their settings, named as in flags and suites."""
     from benchnav.planning.world.world import PRESETS
 
     for name, preset in PRESETS.items():
@@ -209,10 +194,8 @@ def _checkpoints() -> Iterator[Entry]:
         try:
             config = read_config(folder)
             classes = len(config.get("class_names") or ())
-            told = f", {classes} classes" if classes else ""
-            purpose = (
-                f"Checkpoint of the family {config.get('model')} in {folder}{told}."
-            )
+            class_note = f", {classes} classes" if classes else ""
+            purpose = f"Checkpoint of the family {config.get('model')} in {folder}{class_note}."
         except BenchnavError as error:
             purpose = f"cannot be used: {error}"
         yield Entry(folder.name, purpose)

@@ -1,6 +1,4 @@
-"""The command `benchnav-eval`: run suites, merge and repeat runs, list parts, report,
-replay episodes.
-"""
+"""The command `benchnav-eval`: run, merge, repeat, list, report, compare, replay."""
 
 import json
 import os
@@ -35,29 +33,28 @@ def run_command(
     reuse_code: bool = False,
     check_determinism: bool = False,
 ) -> int:
-    """Run a suite into a folder; resume or extend the run that is there.
+    """Run a suite into a folder; resume or extend an existing run.
 
     Args:
-        suite: What is evaluated.
+        suite: Suite to evaluate.
         out: Run folder.
-        jobs: Worker processes. The result is the same for any number.
-        overwrite: Delete the run that is there first.
-        planner_limit_s: Seconds that a planner may take for one answer; planners then
-            run in processes of their own. 0 sets no limit.
-        shard: I/N runs only the I-th of N shards of the run; `merge` joins them.
+        jobs: Number of worker processes; it does not affect results.
+        overwrite: Delete the run in `out` first.
+        planner_limit_s: Time limit per planner call [s]; planners then run in separate
+            processes. 0 sets no limit.
+        shard: I/N runs only the I-th of N shards of the run; `merge` merges them.
         backend: Worker processes on this machine, or those of a Dask cluster.
         scheduler: Address of the Dask cluster's scheduler, tcp://HOST:PORT.
-        device: Where maps are predicted and episodes run; auto takes CUDA where there
-            is a GPU.
-        reuse_code: Use finished units of other code too, and mark their rows.
+        device: Device of predictions and episodes; auto uses CUDA if there is a GPU.
+        reuse_code: Also use finished units of other code, and mark their rows.
         check_determinism: First run a unit of each condition twice, in fresh processes
-            and another order; if rows differ, name them and end with status 1.
+            and another order; if rows differ, name them and exit with status 1.
     """
     from benchnav.eval.run.runner import run_suite
     from benchnav.eval.run.unit import Settings
 
     _check_workers(jobs, backend, scheduler)
-    own = read_shard(shard)
+    shard_to_run = read_shard(shard)
     expect(
         0 <= planner_limit_s <= _MAX_LIMIT_S,
         f"`planner_limit_s` in 0–{_MAX_LIMIT_S}, got {planner_limit_s}.",
@@ -67,7 +64,14 @@ def run_command(
         return 1
     settings = Settings.on(device, planner_limit_s)
     steps = run_suite(
-        suite, folder, scheduler or jobs, overwrite, settings, _say, own, reuse_code
+        suite,
+        folder,
+        scheduler or jobs,
+        overwrite,
+        settings,
+        _say,
+        shard_to_run,
+        reuse_code,
     )
     show_progress(steps, "units")
     if not _is_whole(folder):
@@ -76,22 +80,22 @@ def run_command(
             "--partial"
         )
         return _failed(folder)
-    if own is None:
+    if shard_to_run is None:
         return _finish(folder)
-    print(f"shard {own} is finished in {folder}")
+    print(f"shard {shard_to_run} is finished in {folder}")
     print(
-        f"merge:   {program('benchnav-eval')} merge OUT PART …, once all {own.of} "
+        f"merge:   {program('benchnav-eval')} merge OUT PART …, once all {shard_to_run.of} "
         "shards are finished"
     )
     return _failed(folder)
 
 
 def merge(out: str, parts: list[str]) -> int:
-    """Merge the shards of a run, and report on it.
+    """Merge the shards of a run, and write its report.
 
     Args:
         out: New run folder.
-        parts: Folders of all the run's shards, in any order.
+        parts: Folders of all shards of the run, in any order.
     """
     from benchnav.eval.run.merge import merge_shards
 
@@ -108,13 +112,13 @@ def rerun(
     backend: Literal["local", "dask"] = "local",
     scheduler: str = "",
 ) -> int:
-    """Repeat a run from its provenance, and say whether every row came out the same.
+    """Repeat a run from its provenance, and compare every row.
 
     Args:
         folder: Run folder of a finished run.
-        out: Run folder of the repeated run; RUN-rerun when not given.
-        jobs: Worker processes.
-        overwrite: Delete the run that is there first.
+        out: Run folder of the repeated run; if empty, RUN-rerun.
+        jobs: Number of worker processes.
+        overwrite: Delete the run in `out` first.
         backend: Worker processes on this machine, or those of a Dask cluster.
         scheduler: Address of the Dask cluster's scheduler, tcp://HOST:PORT.
     """
@@ -132,7 +136,7 @@ def rerun(
 
 
 def verify(folder: str) -> int:
-    """Check all files of a run against the digests that were written with them.
+    """Check all files of a run against their recorded digests.
 
     Args:
         folder: Run folder, finished or not.
@@ -173,13 +177,13 @@ def report(
 
     Args:
         folder: Run folder.
-        out: Folder for them, for a run that cannot be written; if empty, the run
-            folder, or FOLDER/partial.
-        partial: Also of a run that is not finished, while it is running too; every
-            table and figure says so.
-        figures: Figures of your own, with commas between, such as path/to/file.py:Name.
-            If one cannot be drawn, the report is written without it, a line says why,
-            and the status is 1.
+        out: Folder of the report, for a read-only run; if empty, the run folder, or
+            FOLDER/partial.
+        partial: Accept a run that is not finished, also while it is running; all tables
+            and figures are marked.
+        figures: Custom figures, separated by commas, such as path/to/file.py:Name. If
+            one cannot be drawn, the report is written without it, a line says why, and
+            the status is 1.
     """
     if out:
         other_folder(folder, out)
@@ -196,23 +200,22 @@ def compare(
     allow_different: Literal["nothing", "code"] = "nothing",
     out: str = "",
 ) -> None:
-    """Compare conditions that met the same maps with the same draws of λ, with
-    intervals and corrected tests.
+    """Compare conditions on the same maps and draws of λ, with corrected tests.
 
     Args:
-        labels: Of the conditions to compare.
+        labels: Labels of the conditions to compare.
         folders: Folders of finished runs, one or more.
-        against: Label that all others are compared with, such as mean or straight; all
-            pairs when not given.
-        by: The one thing in which the conditions of a pair differ: risk, planner,
-            model, objective, robot, sensor, ground, belief, world or run. When not
-            given: the kind of `against`; run where runs share conditions; else risk.
-        points: Difference of success in percentage points; a note tells how many maps
-            it needs.
+        against: Label that all others are compared with, such as mean or straight; if
+            empty, all pairs.
+        by: Column in which the conditions of a pair differ: risk, planner, model,
+            objective, robot, sensor, ground, belief, world or run. If empty: the column
+            of `against`; run if runs have common conditions; else risk.
+        points: Difference of success in percentage points, for which a note has the
+            required number of maps.
         metric: Name of the metric to compare, such as path_length or energy; if empty,
             success and T_total.
-        allow_different: code also compares conditions made by different code, and says
-            so under the table.
+        allow_different: code also compares conditions of different code, with a note
+            under the table.
         out: Path without a suffix, to which .csv, .md and .tex are added.
     """
     from benchnav.core.tables import print_table
@@ -226,7 +229,7 @@ def compare(
     runs = [Path(folder) for folder in folders]
     different = allow_different == "code"
     table, shown = compare_runs(
-        runs, by, against, labels.asked, points / 100, different, metric
+        runs, by, against, labels.selected, points / 100, different, metric
     )
     print_table(shown)
     if out:
@@ -238,7 +241,7 @@ def compare(
 
 
 def _own_folder(path: str) -> Path:
-    """A run folder by its path; one that has no name of its own, as `/`, is none."""
+    """Return a run folder by its path; reject one without a name, such as `/`."""
     if not Path(path).resolve().name:
         raise ConfigError(f"Expected the path of a run folder, got {path}.")
     return Path(path)
@@ -254,7 +257,7 @@ def _check_workers(jobs: int, backend: str, scheduler: str) -> None:
 
 
 def _finish(folder: Path) -> int:
-    """Reports on a finished run; gives the exit status."""
+    """Write the report of a finished run; return the exit status."""
     from benchnav.eval.report.playback.viewer_file import write_viewer_files
 
     write_viewer_files(folder)
@@ -265,7 +268,7 @@ def _finish(folder: Path) -> int:
 
 
 def _repeats(suite: Suite, planner_limit_s: float, device: str) -> bool:
-    """Check that the conditions of a suite repeat, and say which do not."""
+    """Return whether the conditions of a suite repeat, and print which do not."""
     from benchnav.eval.run.determinism import check_determinism
 
     count, lines = check_determinism(suite, _say, planner_limit_s, device)
@@ -284,19 +287,19 @@ def _say(line: str) -> None:
 
 
 def _is_whole(folder: Path) -> bool:
-    """Whether a run has its table, or a shard all its units."""
+    """Return whether a run has its table, or a shard all its units."""
     from benchnav.eval.folder.results import newest_units
     from benchnav.eval.folder.run_folder import EPISODES, open_run
 
     run = open_run(folder)
     if run.shard is None:
         return (folder / EPISODES).exists()
-    own = [
+    shard_units = [
         finished
         for unit, finished in newest_units(run)
         if unit.shard(run.shard.of) == run.shard
     ]
-    return all(own)
+    return all(shard_units)
 
 
 def _report(
@@ -305,24 +308,22 @@ def _report(
     unfinished: bool = False,
     figures: Sequence[str] = (),
 ) -> int:
-    """Write and print a report; return the exit status: 1 where a figure of the user
-    could not be drawn.
-    """
+    """Write and print a report; return 1 if a custom figure could not be drawn."""
     from benchnav.core import registry
     from benchnav.eval.folder.results import read_results
     from benchnav.eval.report.write import PAGE, PARTIAL, print_report, write_report
     from benchnav.eval.run.recordings import record_driven
 
-    # What cannot be reported is refused before anything is said.
+    # Errors are raised before anything is printed.
     mark = read_results(folder, unfinished).mark
-    made = [registry.make("figure", figure) for figure in figures]
-    place = out or (folder / PARTIAL if mark else folder)
+    custom = [registry.make("figure", figure) for figure in figures]
+    target = out or (folder / PARTIAL if mark else folder)
     _say(f"writing the report{f' ({mark})' if mark else ''}")
     written = write_report(
-        folder, partial(record_driven, folder), place, unfinished, made
+        folder, partial(record_driven, folder), target, unfinished, custom
     )
     print_report(written)
-    print(f"report:  {place / PAGE}")
+    print(f"report:  {target / PAGE}")
     return 1 if written.faults else 0
 
 
@@ -348,42 +349,40 @@ def _print_replay(folder: Path) -> None:
     from benchnav.eval.find_episodes import propose
     from benchnav.eval.folder.run_folder import open_run
 
-    every = [condition.labels for condition, _ in open_run(folder).conditions.values()]
-    shown, place = propose(folder)
+    all_labels = [
+        condition.labels for condition, _ in open_run(folder).conditions.values()
+    ]
+    shown, draw = propose(folder)
     words = ["replay", str(folder)]
     for name, labels in shown.items():
-        several = (
-            name in ("planner", "scenario")
-            or len({one[name] for one in every} - {NOT_USED}) > 1
-        )
+        values = {labels_[name] for labels_ in all_labels} - {NOT_USED}
+        several = name in ("planner", "scenario") or len(values) > 1
         if labels != [NOT_USED] and several:
             text = ",".join(labels)
             is_plain = yaml.safe_load(f"[{text}]") == labels
             words += [f"--{name}", text if is_plain else json.dumps(labels)]
-    for name, value in place.items():
+    for name, value in draw.items():
         if name == "map" or value:
             words += [f"--{name}", str(value)]
     print(f"replay:  {program('benchnav-eval')} {shlex.join(words)}")
 
 
 def _failed(folder: Path) -> int:
-    """Exit status of a finished run or shard: 1 where a part failed in some episode,
-    which one line says.
-    """
+    """Return 1, and print a line, if a part failed in some episode of a run."""
     from benchnav.eval.folder.run_folder import EPISODES, ERRORS, read_table
     from benchnav.planning.world.outcome import ERROR_OUTCOMES
 
     if not (folder / ERRORS).exists():
         return 0
-    said = "warning: a planner, model, sensor or belief failed in some episodes"
-    if (folder / EPISODES).exists():  # which a shard does not have
+    message = "warning: a planner, model, sensor or belief failed in some episodes"
+    if (folder / EPISODES).exists():  # a shard has no table
         rows = read_table(folder, EPISODES)
         faults = rows[rows["outcome"].isin(ERROR_OUTCOMES)]
         counts = faults["outcome"].value_counts()
         counted = " and ".join(f"{count} {kind}" for kind, count in counts.items())
         first = faults["error"].iloc[0]
-        said += f" ({counted}); the first fault: {first}"
-    _say(f"{said}; see {folder / ERRORS}")
+        message += f" ({counted}); the first fault: {first}"
+    _say(f"{message}; see {folder / ERRORS}")
     return 1
 
 
@@ -406,10 +405,10 @@ def main() -> None:
     )
     status = run("benchnav-eval", description, COMMANDS)
     if status == INTERRUPTED and sys.argv[1] in ("run", "rerun"):
-        anew = any(word.startswith("--overwrite") for word in sys.argv)
+        overwrites = any(word.startswith("--overwrite") for word in sys.argv)
         _say(
             "finished units are kept; to go on, give the same "
-            f"command{' without --overwrite' * anew} again"
+            f"command{' without --overwrite' * overwrites} again"
         )
     sys.exit(status)
 

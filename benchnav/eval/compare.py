@@ -1,6 +1,4 @@
-"""Compares conditions of one run or several: reads them, refuses what else differs, and
-writes the table.
-"""
+"""Comparison of conditions of one or several runs: reading, checks and tables."""
 
 import json
 import math
@@ -48,42 +46,42 @@ from benchnav.eval.stats.pairs import (
 from benchnav.eval.stats.summary import time_budgets
 from benchnav.eval.words import reading_name
 
-_CAPTION = (
-    "Differences between conditions that met the same maps with the same draws of λ."
-)
-_LISTED, _NAMED = 8, 3
+_CAPTION = "Differences between conditions on the same maps with the same draws of λ."
+_LISTED = 8
+_NAMED = 3
 _MIN_DIFFERENCE = 1e-5  # of success; a run has 10⁸ episodes at most
-# From so many pairs on their time is announced, from that of a few.
-_MANY, _TIMED = 5_000, 5
+# From _MANY pairs on, the time is estimated from that of _TIMED pairs.
+_MANY = 5_000
+_TIMED = 5
 
 
 def compare_runs(
     folders: Sequence[Path],
     by: str,
     against: str,
-    asked: Mapping[str, Sequence[str]],
+    labels: Mapping[str, Sequence[str]],
     difference: float,
     allow_different_code: bool = False,
     metric: str = "",
 ) -> tuple[pd.DataFrame, Table]:
-    """Compares the conditions of runs pair by pair.
+    """Compare the conditions of runs pair by pair.
 
     Args:
         folders: finished runs.
-        by: in what conditions differ; see `pairs.by_what`.
-        against: what all others are compared with; all pairs when empty.
-        asked: labels of the conditions that are looked at, by column; of columns that
-            are not named all.
-        difference: of success, for which the maps needed are counted.
-        allow_different_code: compare what other code made too, and say so in the table.
-            Runs that are compared with each other always are.
-        metric: name of the metric that is compared; if empty, success and T_total are.
+        by: column in which conditions differ; see `pairs.by_what`.
+        against: label that all others are compared with; if empty, all pairs.
+        labels: labels that select conditions, by column; a missing column selects all.
+        difference: difference of success whose required number of maps is computed.
+        allow_different_code: whether to compare conditions of different code, with a
+            note. Runs compared with each other always may differ in code.
+        metric: name of a metric; if empty, success and T_total.
 
     Returns:
-        The numbers, and the table that is shown.
+        The numbers, and the formatted table.
 
     Raises:
-        ConfigError: there is nothing to compare, it cannot be paired, or code differs.
+        ConfigError: If there is nothing to compare, it cannot be paired, or code
+            differs.
     """
     if not folders:
         raise ConfigError("Expected one or more run folders, got none.")
@@ -94,7 +92,7 @@ def compare_runs(
         )
     runs = [open_run(folder) for folder in folders]
     quantity = _find_quantity(runs, metric) if metric else None
-    conditions = _chosen(read_conditions(runs), asked)
+    conditions = _select(read_conditions(runs), labels)
     check_one_value_each(conditions)
     by = by_what(conditions, by, against)
     if by != "run":
@@ -102,12 +100,12 @@ def compare_runs(
     _announce(conditions, by, against, difference)
     pairs = find_pairs(conditions, by, against)
     unlike = [_unlike_code(pair.members) for pair in pairs]
-    # Versions and machines may differ between rows; what a label names may not.
+    # Versions and machines may differ between rows; the code of a part may not.
     members = {member for pair in pairs for member in pair.members}
     lines = _unlike_code(members, parts_alone=not any(unlike))
     if lines and by != "run" and not allow_different_code:
         raise ConfigError(
-            f"Expected conditions that differ in their {by} alone, got conditions "
+            f"Expected conditions that differ only in their {by}, got conditions "
             "made by different code: "
             f"{'; '.join(lines)}. Run them with one code, or pass --allow-different "
             "code, which names it in the table."
@@ -118,7 +116,7 @@ def compare_runs(
     else:
         table = compare_by(pairs, quantity)
         shown = metric_table(table, quantity, by)
-    table = table.assign(different_code=["; ".join(found) for found in unlike])
+    table = table.assign(different_code=["; ".join(differing) for differing in unlike])
     notes = (
         *_about(pairs, table),
         *_left_out(pairs, by),
@@ -126,36 +124,35 @@ def compare_runs(
         *shown.notes,
     )
     notes += tuple(f"Different code: {line}." for line in lines)
-    notes += tuple(
-        dict.fromkeys(
-            line for run in runs for line in caveats(_concerning(conditions, run.about))
-        )
-    )
+    caveat_lines: list[str] = []
+    for run in runs:
+        caveat_lines += caveats(_concerning(conditions, run.about))
+    notes += tuple(dict.fromkeys(caveat_lines))
     return table, replace(shown, notes=notes)
 
 
 def _find_quantity(runs: Sequence[Run], name: str) -> Quantity:
-    """What is compared, which every run must have.
+    """Return the quantity of a metric, which all runs must have.
 
     Raises:
-        ConfigError: If a run does not have it.
+        ConfigError: If a run does not have the metric.
     """
     for run in runs:
-        known = quantities(further_quantities(run.about))
-        check_known(f"`metric`, of {run.folder},", name, known)
-    return known[name]
+        known_quantities = quantities(further_quantities(run.about))
+        check_known(f"`metric`, of {run.folder},", name, known_quantities)
+    return known_quantities[name]
 
 
 def write_comparison(stem: Path, table: pd.DataFrame, shown: Table) -> list[Path]:
-    """Writes a comparison as CSV, with all its numbers, Markdown and LaTeX.
+    """Write a comparison as CSV, Markdown and LaTeX.
 
     Args:
         stem: path without a suffix.
-        table: the numbers.
-        shown: the table.
+        table: the numbers, for CSV.
+        shown: the formatted table.
 
     Returns:
-        What was written.
+        The paths written.
     """
     texts = {
         ".csv": table.to_csv(index=False, float_format="%.6g"),
@@ -171,78 +168,71 @@ def write_comparison(stem: Path, table: pd.DataFrame, shown: Table) -> list[Path
 
 
 def read_conditions(runs: Sequence[Run]) -> list[Compared]:
-    """Reads the conditions of runs, each with its episodes.
+    """Read the conditions of runs, each with its episodes.
 
     Raises:
-        ConfigError: a run is not finished, or there twice.
+        ConfigError: If a run is not finished, or listed twice.
     """
     names = _names([run.folder for run in runs])
     shared = Counter(condition for run in runs for condition in run.conditions)
-    found = []
+    compared = []
     for run, name in zip(runs, names, strict=True):
         episodes = dict(
             list(read_table(run.folder, EPISODES).groupby("condition", sort=False))
         )
-        for condition, (known, _) in run.conditions.items():
-            labels, value, rows = known.labels, known.value, episodes[condition]
+        for condition, (condition_, _) in run.conditions.items():
+            labels = condition_.labels
+            value = condition_.value
+            rows = episodes[condition]
+            budgets = time_budgets(rows, value["world"])
             dataset = run.about["datasets"][labels["data"]]
-            found.append(
+            run_label = name if shared[condition] > 1 else NOT_USED
+            compared.append(
                 Compared(
-                    labels={
-                        **labels,
-                        "run": name if shared[condition] > 1 else NOT_USED,
-                    },
+                    labels={**labels, "run": run_label},
                     value=value,
                     maps=dataset["maps"][value["split"]],
-                    episodes=rows.assign(
-                        time_budget_s=time_budgets(rows, value["world"])
-                    ),
+                    episodes=rows.assign(time_budget_s=budgets),
                     code=_codes(run.about, name, rows["code"].unique()),
                     about=dataset.get("about", {}).get(value["split"], ""),
                 )
             )
-    return found
+    return compared
 
 
 def _announce(
     conditions: Sequence[Compared], by: str, against: str, difference: float
 ) -> None:
-    """Print on stderr about how long a comparison of many pairs takes, from the time of
-    a few.
-    """
-    every = (
-        list(matches(conditions, by, against))
-        if math.comb(len(conditions), 2) >= _MANY
-        else []
-    )
-    if len(every) < _MANY:
+    """Estimate on stderr how long a comparison of many pairs takes."""
+    if math.comb(len(conditions), 2) < _MANY:
+        return
+    all_pairs = list(matches(conditions, by, against))
+    if len(all_pairs) < _MANY:
         return
     begin = time.perf_counter()
-    compare(
-        find_pairs(list(dict.fromkeys(chain(*every[:_TIMED]))), by, against)[:_TIMED],
-        difference,
-    )
-    seconds = (time.perf_counter() - begin) / _TIMED * len(every)
+    sample = list(dict.fromkeys(chain(*all_pairs[:_TIMED])))
+    compare(find_pairs(sample, by, against)[:_TIMED], difference)
+    seconds = (time.perf_counter() - begin) / _TIMED * len(all_pairs)
     tell(
-        f"benchnav-eval: comparing {len(every)} pairs takes about "
+        f"benchnav-eval: comparing {len(all_pairs)} pairs takes about "
         f"{timedelta(seconds=round(seconds))}."
     )
 
 
 def _codes(
-    about: Mapping[str, Any], run: str, digests: Iterable[str]
+    manifest: Mapping[str, Any], run: str, digests: Iterable[str]
 ) -> dict[str, Any]:
-    """The code of some rows of a run, by the run's name, and by digests too where it
-    holds rows of other code.
-    """
-    if about["reused"]:
-        return {f"{run} (code {digest})": about["codes"][digest] for digest in digests}
+    """Return the code of some rows of a run, by its name, and digest if it has several."""
+    if manifest["reused"]:
+        return {
+            f"{run} (code {digest})": manifest["codes"][digest] for digest in digests
+        }
     (digest,) = digests
-    return {run: about["codes"][digest]}
+    return {run: manifest["codes"][digest]}
 
 
 def _names(folders: Sequence[Path]) -> list[str]:
-    """Short names of runs, with as much of the path as tells them apart."""
+    """Return short names of runs, the shortest ends of paths that differ."""
     paths = [folder.resolve() for folder in folders]
     if len(set(paths)) < len(paths):
         raise ConfigError(
@@ -256,30 +246,33 @@ def _names(folders: Sequence[Path]) -> list[str]:
     return ["/".join(path.parts[-parts:]) for path in paths]
 
 
-def _chosen(
-    chosen: list[Compared], asked: Mapping[str, Sequence[str]]
+def _select(
+    conditions: list[Compared], labels: Mapping[str, Sequence[str]]
 ) -> list[Compared]:
-    for name, values in asked.items():
-        known = dict.fromkeys(condition.labels[name] for condition in chosen)
+    for name, values in labels.items():
+        known_labels = dict.fromkeys(condition.labels[name] for condition in conditions)
         for value in values:
-            check_known(f"`{name}`", value, known)
-        chosen = [condition for condition in chosen if condition.labels[name] in values]
-    return chosen
+            check_known(f"`{name}`", value, known_labels)
+        conditions = [
+            condition for condition in conditions if condition.labels[name] in values
+        ]
+    return conditions
 
 
 def _unlike_code(
     conditions: Iterable[Compared], parts_alone: bool = False
 ) -> list[str]:
-    """What of the code that made conditions differs, a line for two runs; perhaps of
-    parts and sources alone.
+    """Describe how the code of conditions differs, a line for two runs.
+
+    If `parts_alone`, differences of the environment are ignored.
     """
     codes: dict[str, dict[str, dict[str, Any]]] = {}
     for condition in conditions:
         for run, code in condition.code.items():
             groups = codes.setdefault(run, {})
-            for group, known in code.items():
+            for group, entries in code.items():
                 is_left_out = parts_alone and group == "environment"
-                groups[group] = groups.get(group, {}) | ({} if is_left_out else known)
+                groups[group] = groups.get(group, {}) | ({} if is_left_out else entries)
     return [
         f"{second} differs from {first} in {', '.join(names)}"
         for first, second in combinations(sorted(codes), 2)
@@ -288,48 +281,43 @@ def _unlike_code(
 
 
 def _once_each(conditions: Iterable[Compared]) -> list[Compared]:
-    """Makes one of each condition that several runs hold, with the episodes of all.
+    """Merge each condition that several runs contain, with the episodes of all.
 
     Raises:
-        ConfigError: an episode came out differently in two runs.
+        ConfigError: If an episode differs between two runs.
     """
-    found: dict[str, Compared] = {}
+    merged: dict[str, Compared] = {}
     for condition in conditions:
         name = json.dumps(condition.value, sort_keys=True)
-        earlier = found.setdefault(name, condition)
+        earlier = merged.setdefault(name, condition)
         if earlier is not condition:
-            found[name] = _joined(earlier, condition)
-    return list(found.values())
+            merged[name] = _joined(earlier, condition)
+    return list(merged.values())
 
 
-def _joined(one: Compared, other: Compared) -> Compared:
-    runs, words = (
-        " and ".join([*one.code, *other.code]),
-        " ".join(label_words(one.labels)),
-    )
-    check_maps(one, other, f"{words} in {runs}")
-    first, second = (
-        condition.episodes.drop(columns=list(LABELS)) for condition in (one, other)
-    )
+def _joined(a: Compared, b: Compared) -> Compared:
+    runs = " and ".join([*a.code, *b.code])
+    words = " ".join(label_words(a.labels))
+    check_maps(a, b, f"{words} in {runs}")
+    first = a.episodes.drop(columns=list(LABELS))
+    second = b.episodes.drop(columns=list(LABELS))
     cells, _ = differences(first, second)
     if len(cells):
         unlike = cells.index.droplevel(-1).unique()
-        both = len(first.merge(second, on=DRAW))
-        why = "; ".join(_unlike_code((one, other)))
+        n_common = len(first.merge(second, on=DRAW))
+        reason = "; ".join(_unlike_code((a, b)))
         raise ConfigError(
             "Expected the same rows of a condition in all runs that hold it, got "
-            f"{len(unlike)} of {both} episodes of "
-            f"{words} that differ between {runs}{f' ({why})' if why else ''}. Leave "
+            f"{len(unlike)} of {n_common} episodes of "
+            f"{words} that differ between {runs}{f' ({reason})' if reason else ''}. Leave "
             "one of the runs out, or "
             "compare the runs with each other by --by run."
         )
-    rows = pd.concat([one.episodes, other.episodes]).drop_duplicates(
-        DRAW, ignore_index=True
-    )
-    longer = max((one.maps, other.maps), key=len)
-    labels = {**one.labels, "run": NOT_USED}
+    rows = pd.concat([a.episodes, b.episodes]).drop_duplicates(DRAW, ignore_index=True)
+    longer = max((a.maps, b.maps), key=len)
+    labels = {**a.labels, "run": NOT_USED}
     return replace(
-        one, labels=labels, episodes=rows, maps=longer, code={**one.code, **other.code}
+        a, labels=labels, episodes=rows, maps=longer, code={**a.code, **b.code}
     )
 
 
@@ -351,17 +339,19 @@ def _about(pairs: Sequence[Pair], table: pd.DataFrame) -> list[str]:
 
 
 def _left_out(pairs: Sequence[Pair], by: str) -> list[str]:
-    """Says which episodes of a condition its partner was not run on."""
+    """Return lines on episodes of a condition that its partner was not run on."""
     lines: dict[str, None] = {}
     for pair in pairs:
-        one, other = (reading_name(by, label) for label in (pair.one, pair.other))
-        sides = (one, other), (other, one)
-        for condition, (own, partner) in zip(pair.members, sides, strict=True):
-            both = condition.episodes[DRAW].merge(
+        first_name, second_name = (
+            reading_name(by, label) for label in (pair.one, pair.other)
+        )
+        sides = (first_name, second_name), (second_name, first_name)
+        for condition, (name, partner) in zip(pair.members, sides, strict=True):
+            compared_draws = condition.episodes[DRAW].merge(
                 pair.episodes[DRAW], how="left", indicator=True
             )
-            rows = both[both["_merge"] == "left_only"]
-            places = [
+            rows = compared_draws[compared_draws["_merge"] == "left_only"]
+            draws = [
                 f"seed {seed}"
                 + (f", realisation {realisation}" if realisation else "")
                 + f" on {_maps(sorted(maps))}"
@@ -369,23 +359,21 @@ def _left_out(pairs: Sequence[Pair], by: str) -> list[str]:
                     "map"
                 ]
             ]
-            if places:
-                more = (
-                    f" and {len(places) - _NAMED} more draws"
-                    if len(places) > _NAMED
-                    else ""
-                )
+            if draws:
+                remainder = ""
+                if len(draws) > _NAMED:
+                    remainder = f" and {len(draws) - _NAMED} more draws"
                 line = (
-                    f"{len(rows)} of {len(condition.episodes)} episodes of {own} are "
+                    f"{len(rows)} of {len(condition.episodes)} episodes of {name} are "
                     f"left out: {partner} was not run "
-                    f"on them ({'; '.join(places[:_NAMED])}{more})."
+                    f"on them ({'; '.join(draws[:_NAMED])}{remainder})."
                 )
                 lines[line] = None
     return _first_of(list(lines), "pairs with episodes left out")
 
 
 def _maps(maps: Sequence[int]) -> str:
-    """Numbers of maps in words; runs of them by their ends."""
+    """Return indices of maps in words, consecutive ones as a range."""
     if len(maps) == 1:
         return f"map {maps[0]}"
     if maps[-1] - maps[0] == len(maps) - 1:
@@ -395,28 +383,26 @@ def _maps(maps: Sequence[int]) -> str:
 
 
 def _concerning(
-    conditions: Sequence[Compared], about: Mapping[str, Any]
+    conditions: Sequence[Compared], manifest: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """What a run is about; of what it left out those combinations whose labels are all
-    compared.
-    """
-    known = {
+    """Return `run.json` with only those left-out combinations whose labels are compared."""
+    labels = {
         name: {condition.labels[name] for condition in conditions} for name in LABELS
     }
     dropped = [
         entry
-        for entry in about["dropped"]
-        if all(label in known[name] for name, label in dropped_labels(entry).items())
+        for entry in manifest["dropped"]
+        if all(label in labels[name] for name, label in dropped_labels(entry).items())
     ]
-    return {**about, "dropped": dropped}
+    return {**manifest, "dropped": dropped}
 
 
 def _no_partner(
     conditions: Sequence[Compared], pairs: Sequence[Pair], by: str
 ) -> list[str]:
-    """Names the conditions that are in no pair."""
+    """Return a line that names the conditions without a pair."""
     paired = {member for pair in pairs for member in pair.members}
-    alone = [condition for condition in conditions if condition not in paired]
+    unpaired = [condition for condition in conditions if condition not in paired]
     varying = [
         name
         for name in (*LABELS, "run")
@@ -424,12 +410,12 @@ def _no_partner(
     ]
     names = [
         " ".join(label_words(_as_read(condition.labels), varying))
-        for condition in alone
+        for condition in unpaired
     ]
     if not names:
         return []
     return [
-        f"Not in the table, since no condition differs from them in {by} alone: "
+        f"Not in the table, since no condition differs from them only in {by}: "
         f"{'; '.join(_first_of(names, 'conditions'))}."
     ]
 
@@ -438,9 +424,7 @@ def _as_read(labels: Mapping[str, str]) -> dict[str, str]:
     return {name: reading_name(name, label) for name, label in labels.items()}
 
 
-def _first_of(lines: list[str], what: str) -> list[str]:
-    return (
-        lines
-        if len(lines) <= _LISTED
-        else [*lines[:_LISTED], f"and {len(lines) - _LISTED} more {what}"]
-    )
+def _first_of(lines: list[str], noun: str) -> list[str]:
+    if len(lines) <= _LISTED:
+        return lines
+    return [*lines[:_LISTED], f"and {len(lines) - _LISTED} more {noun}"]

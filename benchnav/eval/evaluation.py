@@ -29,8 +29,7 @@ def evaluate(
     verbose: bool = True,
     **experiment: Any,
 ) -> Results:
-    """Run every combination of planners, models, risk settings, … on the test maps of a
-    dataset.
+    """Evaluate each combination of planners, models, risks, … on a dataset's test maps.
 
     Parts are objects, such as `AStarDWA()` and `CVaR(0.8)`, or names as in suites. An
     object that other processes cannot create again (a function without a name, a class
@@ -40,18 +39,18 @@ def evaluate(
     Args:
         terrain: a dataset, by path, id or object; or a recipe, whose test maps are
             generated first.
-        folder: run folder, which is resumed or extended if it holds a run. If None,
-            results are kept in a temporary folder as long as the returned object
+        folder: run folder, which is resumed or extended if it contains a run. If None,
+            results are stored in a temporary folder as long as the returned object
             exists; see `Results.save`.
-        jobs: number of worker processes; the results are the same for any number.
+        jobs: number of worker processes; it does not affect results.
         device: "cpu", "cuda", or "auto" for CUDA if there is a GPU.
         verbose: whether to show progress and notes on stderr.
-        **experiment: what is evaluated, by the fields of `Suite`: `models`, `planners`,
+        **experiment: fields of `Suite`: `models`, `planners`,
             `risks`, `robots`, `objectives`, `sensors`, `grounds`, `beliefs`, `world`
             (such as `World.stakes()`), `task` (or `rules`, a `Rules`), `scenarios`,
             `maps`, `seed` or `seeds`, `realisations`, `record`, `conditions`,
-            `hypotheses`, `metrics` besides those that every run has (such as
-            `Energy(power_w=120)`), and `figures` of your own for the report.
+            `hypotheses`, further `metrics` (such as
+            `Energy(power_w=120)`), and custom `figures` for the report.
 
     Returns:
         The results of the run.
@@ -59,7 +58,7 @@ def evaluate(
     Raises:
         ConfigError: If the combination of parts cannot be run; the message names the
             part and the remedy.
-        DatasetError: If there is no such dataset, or it lacks what is asked for.
+        DatasetError: If the dataset, a split or a map is missing.
     """
     for name in experiment:
         check_known("keywords of `evaluate`", name, {*_NAMES, "rules"})
@@ -73,32 +72,34 @@ def evaluate(
         'models=["oracle"].',
     )
     temporary = None if folder else tempfile.TemporaryDirectory(prefix="benchnav-")
-    place = Path(temporary.name, "run") if temporary else Path(str(folder))
+    run_folder = Path(temporary.name, "run") if temporary else Path(str(folder))
     suite = Suite(
-        data=_path_of(terrain, place),
+        data=_path_of(terrain, run_folder),
         **{name: _as_tuple(value) for name, value in experiment.items()},
     )
     notes: list[str] = []
     settings = Settings.on(device)
     steps = run_suite(
-        suite, place, jobs, settings=settings, say=print if verbose else notes.append
+        suite,
+        run_folder,
+        jobs,
+        settings=settings,
+        say=print if verbose else notes.append,
     )
     if verbose:
         show_progress(steps, "units")
     else:
         for _ in steps:
             pass
-    return Results(place, temporary)
+    return Results(run_folder, temporary)
 
 
 def _as_tuple(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
-def _path_of(terrain: Any, place: Path) -> str:
-    """Return the path or id of a dataset; generate the test maps of a recipe next to
-    the run folder.
-    """
+def _path_of(terrain: Any, run_folder: Path) -> str:
+    """Return the path or id of a dataset; generate a recipe's maps next to the run."""
     if isinstance(terrain, TerrainDataset):
         return str(terrain.path)
     if not isinstance(terrain, Recipe):
@@ -108,7 +109,7 @@ def _path_of(terrain: Any, place: Path) -> str:
         for name, split in terrain.splits.items()
         if name.startswith("test/")
     }
-    path = place.with_name(f"{place.name}-terrain.h5")
+    path = run_folder.with_name(f"{run_folder.name}-terrain.h5")
     path.parent.mkdir(parents=True, exist_ok=True)
     for _ in create(replace(terrain, splits=splits), path):
         pass

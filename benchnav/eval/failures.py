@@ -1,6 +1,6 @@
-"""How, when and where each failed episode ended; and which failures the sheets show.
+"""Failed episodes: outcome, time and position of their end, and sheets of examples.
 
-The sheets are of each block: failures of the best setting and of the worst.
+A sheet shows failures of the best and of the worst setting of a block.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,13 +18,13 @@ from benchnav.eval.recording import Recording
 from benchnav.eval.stats.best import competing
 from benchnav.eval.words import blocks, with_names
 
-# Gives a recording of each of some failures of one condition, rows of `failures_table`.
+# Returns recordings of failures of one condition, rows of `failures_table`.
 RecordDriven = Callable[[pd.DataFrame], Sequence[Recording]]
 
 ACROSS = 4  # failures of a condition that are shown
-_MOST_BLOCKS = 6
-# Failures of one condition whose ground is predicted again.
-_MOST_FAILURES = 100
+_MAX_BLOCKS = 6
+# Failures of one condition whose maps are predicted again.
+_MAX_FAILURES = 100
 
 _KEYS = ["condition", "seed", "realisation", "map"]
 _ENDS = ("x_m", "y_m", "end_traversability", "last_traversability")
@@ -32,18 +32,18 @@ _LAST_S = 2.0
 
 
 def failures_table(folder: Path, episodes: pd.DataFrame) -> pd.DataFrame:
-    """Tabulates the failed episodes of a run.
+    """Tabulate the failed episodes of a run.
 
     Args:
-        folder: the run folder, of which the steps are read.
-        episodes: its rows.
+        folder: the run folder, whose steps are read.
+        episodes: rows of the run.
 
     Returns:
         A row a failure: `condition`, `planner`, `risk`, `model`, `scenario`, `world`,
         `seed`, `realisation`, `map`, `outcome`, `end_time_s`, `code`; `x_m`, `y_m`,
-        where it ended; `end_traversability`, the observed λ in the last step; and
+        its last position; `end_traversability`, the observed λ in the last step; and
         `last_traversability`, the mean of observed λ in the last 2 s. The last four are
-        NaN where steps were not kept.
+        NaN if steps were not stored.
     """
     columns = [
         "condition",
@@ -68,31 +68,28 @@ def failures_table(folder: Path, episodes: pd.DataFrame) -> pd.DataFrame:
 
 
 def _ends(steps: pd.DataFrame) -> pd.DataFrame:
-    """The last place of each episode, and λ at its end; the last state of an episode
-    has no λ of its own.
+    """Return the last position of each episode, and λ at its end.
+
+    The last state of an episode has no λ.
     """
     groups = steps.groupby(_KEYS, sort=False)
     last = groups[["x_m", "y_m"]].last()
-    met = steps[steps["traversability"].notna()]
-    end = (
-        met.groupby(_KEYS, sort=False)["traversability"]
-        .last()
-        .rename("end_traversability")
-    )
+    has_traversability = steps[steps["traversability"].notna()]
+    end = _traversability_of(has_traversability).last().rename("end_traversability")
     from_s = groups["time_s"].transform("max") - _LAST_S
-    late = met[met["time_s"] >= from_s.loc[met.index] - 1e-9]
-    mean = (
-        late.groupby(_KEYS, sort=False)["traversability"]
-        .mean()
-        .rename("last_traversability")
+    is_late = has_traversability["time_s"] >= (
+        from_s.loc[has_traversability.index] - 1e-9
     )
-    return (
-        last.join([end, mean])
-        .reset_index()
-        .astype(
-            {"x_m": np.float64, "y_m": np.float64, "end_traversability": np.float64}
-        )
+    mean = _traversability_of(has_traversability[is_late]).mean()
+    ends = last.join([end, mean.rename("last_traversability")]).reset_index()
+    return ends.astype(
+        {"x_m": np.float64, "y_m": np.float64, "end_traversability": np.float64}
     )
+
+
+def _traversability_of(steps: pd.DataFrame) -> Any:
+    """Group observed λ by episode."""
+    return steps.groupby(_KEYS, sort=False)["traversability"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,10 +97,10 @@ class FailedLine:
     """A line of a sheet: failures of one condition.
 
     Args:
-        name: of the condition.
+        name: name of the condition.
         failures: rows of `failures_table`, at most `ACROSS`.
-        recordings: of each, with what was predicted and driven.
-        among: number of failures that these were chosen of.
+        recordings: recordings of these failures.
+        among: number of all failures of the condition.
     """
 
     name: str
@@ -114,12 +111,12 @@ class FailedLine:
 
 @dataclass(frozen=True, kw_only=True)
 class Sheets:
-    """What is shown of failures.
+    """Sheets of failures, and λ̂ where episodes failed.
 
     Args:
-        shown: of each block its title and the lines of its sheet.
-        predicted: by condition λ̂ where its failed episodes ended, shape [N].
-        left_out: why sheets are missing; empty where none is, or nothing failed.
+        shown: title and lines of the sheet of each block.
+        predicted: λ̂ where failed episodes ended, by condition, shape [N].
+        left_out: why sheets are missing; empty if none is, or nothing failed.
     """
 
     shown: tuple[tuple[str, tuple[FailedLine, ...]], ...]
@@ -130,51 +127,49 @@ class Sheets:
 def collect_sheets(
     summary: pd.DataFrame, failures: pd.DataFrame, record_driven: RecordDriven | None
 ) -> Sheets:
-    """Collects the sheets of a run.
+    """Collect the sheets of a run.
 
     Args:
         summary: from `summary.summarise`, joined with `best.against_best`.
         failures: from `failures_table`.
-        record_driven: it may raise a `BenchnavError`. None where no sheet is asked for.
+        record_driven: records failures; may raise `BenchnavError`. If None, no sheets.
     """
-    placed = failures[failures["x_m"].notna()]
-    if record_driven is None or placed.empty:
-        asked = record_driven is not None and not failures.empty
-        why = (
-            "there is no figure of failures, since the run kept no steps"
-            if asked
-            else ""
-        )
-        return Sheets(shown=(), predicted={}, left_out=why)
-    shown, predicted, left_out = [], {}, []
-    if len(every := blocks(with_names(summary))) > _MOST_BLOCKS:
+    located = failures[failures["x_m"].notna()]
+    if record_driven is None or located.empty:
+        reason = ""
+        if record_driven is not None and not failures.empty:
+            reason = "there is no figure of failures, since the run kept no steps"
+        return Sheets(shown=(), predicted={}, left_out=reason)
+    shown = []
+    predicted: dict[str, np.ndarray] = {}
+    left_out = []
+    all_blocks = blocks(with_names(summary))
+    if len(all_blocks) > _MAX_BLOCKS:
         left_out.append(
-            f"figures of failures show the first {_MOST_BLOCKS} of {len(every)} blocks"
+            f"figures of failures show the first {_MAX_BLOCKS} of {len(all_blocks)} "
+            "blocks"
         )
-    for title, rows in every[:_MOST_BLOCKS]:
+    for title, rows in all_blocks[:_MAX_BLOCKS]:
         lines = []
         try:
-            for row in _looked_at(rows):
+            for row in _best_and_worst(rows):
                 condition = row["condition"]
-                own = (
-                    placed[placed["condition"] == condition]
-                    .head(_MOST_FAILURES)
-                    .reset_index(drop=True)
-                )
-                if own.empty:
+                of_condition = located[located["condition"] == condition]
+                if of_condition.empty:
                     continue
-                recordings, chosen = record_driven(own), choose_failures(own)
+                recorded = of_condition.head(_MAX_FAILURES).reset_index(drop=True)
+                recordings = record_driven(recorded)
+                chosen = choose_failures(recorded)
                 predicted[condition] = np.array(
                     [recording.predicted_at_end for recording in recordings]
                 )
-                lines.append(
-                    FailedLine(
-                        name=row["name"],
-                        failures=chosen.reset_index(drop=True),
-                        recordings=[recordings[place] for place in chosen.index],
-                        among=int((failures["condition"] == condition).sum()),
-                    )
+                line = FailedLine(
+                    name=row["name"],
+                    failures=chosen.reset_index(drop=True),
+                    recordings=[recordings[index] for index in chosen.index],
+                    among=int((failures["condition"] == condition).sum()),
                 )
+                lines.append(line)
         except (BenchnavError, OSError) as error:
             left_out.append(f"a figure of failures is missing: {error}")
             continue
@@ -187,23 +182,21 @@ def collect_sheets(
     )
 
 
-def _looked_at(rows: pd.DataFrame) -> list[dict[Any, Any]]:
-    """The best of a block and the worst, of those that look at a prediction."""
+def _best_and_worst(rows: pd.DataFrame) -> list[dict[Any, Any]]:
+    """Return the best and the worst of the conditions of a block with a prediction."""
     seeing = rows[competing(rows) & (rows["model"] != NOT_USED)]
     worst = seeing.sort_values("success_rate", kind="stable").head(1)
-    both = pd.concat([seeing[seeing["condition"] == seeing["best"]], worst])
-    return both.drop_duplicates("condition").to_dict("records")
+    chosen = pd.concat([seeing[seeing["condition"] == seeing["best"]], worst])
+    return chosen.drop_duplicates("condition").to_dict("records")
 
 
 def choose_failures(failures: pd.DataFrame) -> pd.DataFrame:
-    """Chooses failures to be shown: each outcome once before any twice, the most
-    frequent outcome first.
-    """
-    placed = failures[failures["x_m"].notna()]
-    turn = placed.groupby("outcome", sort=False).cumcount()
-    often = -placed.groupby("outcome")["outcome"].transform("size")
+    """Choose failures to show, one of each outcome in turn, frequent outcomes first."""
+    located = failures[failures["x_m"].notna()]
+    turn = located.groupby("outcome", sort=False).cumcount()
+    often = -located.groupby("outcome")["outcome"].transform("size")
     return (
-        placed.assign(turn=turn, often=often)
+        located.assign(turn=turn, often=often)
         .sort_values(["turn", "often"], kind="stable")
         .head(ACROSS)
     )

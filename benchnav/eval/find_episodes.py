@@ -1,4 +1,4 @@
-"""Which episodes of a run are meant, by what tables call their conditions."""
+"""Selection of episodes of a run by the labels of their conditions."""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -27,63 +27,62 @@ def find_episodes(
     realisation: int,
     map_index: int,
 ) -> list[tuple[Unit, int]]:
-    """Finds an episode of each condition that is asked for, all of them on one map.
+    """Find an episode of each requested condition, all on one map.
 
     Args:
-        folder: a run.
-        labels: what tables call the conditions, by column; several of a column ask for
-            several conditions, and of the columns that are left out the first condition
-            that fits is taken.
-        seed: root seed; the first condition's first when None.
-        realisation: draw of λ.
-        map_index: map of the split.
+        folder: a run folder.
+        labels: labels of conditions by column; several labels of a column select
+            several conditions, and a missing column takes the first that fits.
+        seed: root seed; if None, the first of the first condition.
+        realisation: index of the draw of λ.
+        map_index: index of the map in its split.
 
     Returns:
-        Units, and which of their episodes.
+        Units, each with the index of its episode.
 
     Raises:
-        ConfigError: the run has no such episode, or they are not on one map.
+        ConfigError: If the run has no such episode, or episodes are on several maps.
     """
     run = open_run(folder)
     conditions = [condition for condition, _ in run.conditions.values()]
-    known = {}
+    labels_of_run = {}
     for name in LABELS:
-        labelled = dict.fromkeys(condition.labels[name] for condition in conditions)
-        stood_for = dict.fromkeys(
-            label for one in conditions for label in one.stands_for.get(name, ())
-        )
-        known[name] = [label for label in labelled | stood_for if label != NOT_USED]
-    found: dict[str, tuple[Unit, int]] = {}
+        labels_ = [condition.labels[name] for condition in conditions]
+        for condition in conditions:
+            labels_ += condition.stands_for.get(name, ())
+        used = [label for label in labels_ if label != NOT_USED]
+        labels_of_run[name] = list(dict.fromkeys(used))
+    chosen: dict[str, tuple[Unit, int]] = {}
     for values in itertools.product(*labels.values()):
-        asked = dict(zip(labels, values, strict=True))
-        unit = _find(run, asked, (seed, realisation, map_index))
-        # A blind planner has no risk setting and fits any, but not one that no planner
-        # of the run has.
-        strange = [
+        requested = dict(zip(labels, values, strict=True))
+        unit = _find(run, requested, (seed, realisation, map_index))
+        # A blind planner fits any risk setting, but the run must have that setting.
+        unknown = [
             name
-            for name, label in asked.items()
-            if known[name] and label not in known[name]
+            for name, label in requested.items()
+            if labels_of_run[name] and label not in labels_of_run[name]
         ]
-        if unit is None or strange:
-            words = [f"{name} {label!r}" for name, label in asked.items()]
+        if unit is None or unknown:
+            words = [f"{name} {label!r}" for name, label in requested.items()]
             words += [f"realisation {realisation}", f"map {map_index}"]
             words += [] if seed is None else [f"seed {seed}"]
-            near = "".join(hint(asked[name], known[name]) for name in strange[:1])
-            held = [
+            hint_text = "".join(
+                hint(requested[name], labels_of_run[name]) for name in unknown[:1]
+            )
+            available = [
                 f"{name} {', '.join(labels)}"
-                for name, labels in known.items()
+                for name, labels in labels_of_run.items()
                 if labels
             ]
-            held.append(
-                f"map 0 to {max(extent.maps for _, extent in run.conditions.values()) - 1}"
-            )
+            n_maps = max(extent.maps for _, extent in run.conditions.values())
+            available.append(f"map 0 to {n_maps - 1}")
             raise ConfigError(
                 f"Expected an episode of the run, got {', '.join(words)}. It has "
-                f"{'; '.join(held)}.{near}"
+                f"{'; '.join(available)}.{hint_text}"
             )
         seed = unit.seed
-        found.setdefault(unit.condition.id, (unit, unit.maps.index(map_index)))
-    episodes = list(found.values())
+        chosen.setdefault(unit.condition.id, (unit, unit.maps.index(map_index)))
+    episodes = list(chosen.values())
     maps = dict.fromkeys(
         f"{unit.condition.data} {unit.condition.scenario}" for unit, _ in episodes
     )
@@ -95,88 +94,85 @@ def find_episodes(
 
 
 def propose(folder: Path) -> tuple[dict[str, list[str]], dict[str, int]]:
-    """Proposes what to play back: conditions with unlike outcomes on the map on which
-    outcomes differ most.
+    """Propose conditions with different outcomes, on the map where outcomes differ most.
 
     Args:
         folder: a finished run.
 
     Returns:
-        Labels by column, of one condition or of two that differ in their risk setting
-        alone, those of the first hypothesis that has such; and `map`, `seed` and
+        Labels by column, of one condition, or of two that differ only in their risk
+        setting (those of the first such hypothesis); and `map`, `seed` and
         `realisation`.
     """
     run = open_run(folder)
-    every = [condition.labels for condition, _ in run.conditions.values()]
-    # What looks at a prediction has more to show.
-    first = next((labels for labels in every if labels["risk"] != NOT_USED), every[0])
+    all_labels = [condition.labels for condition, _ in run.conditions.values()]
+    # A planner that uses a prediction has more to show.
+    first = next(
+        (labels for labels in all_labels if labels["risk"] != NOT_USED), all_labels[0]
+    )
     if not (folder / GROUND).exists():
         return {name: [label] for name, label in first.items()}, {"map": 0}
-    about = Ground.load(folder / GROUND).about
+    map_keys = Ground.load(folder / GROUND).about
     rows = read_table(folder, EPISODES)
-    rows = rows[(rows[list(about)] == pd.Series(about)).all(axis=1)]
-    # Those of the first hypothesis come first.
+    rows = rows[(rows[list(map_keys)] == pd.Series(map_keys)).all(axis=1)]
+    original_first = rows["condition"].iloc[0]
+    # Conditions of the first hypothesis come first.
     tests = run.about.get("hypotheses", {}).get("tests", ())
-    asked = [condition for test in tests for condition in (test["one"], test["other"])]
-    turn = {
-        condition: place
-        for place, condition in enumerate(dict.fromkeys([*asked, *rows["condition"]]))
-    }
-    labels = [
-        (run.conditions[row["condition"]][0].labels, bool(row["success"]))
-        for row in sorted(
-            rows.to_dict("records"), key=lambda row: turn[row["condition"]]
-        )
-        if row["risk"] != NOT_USED
-    ]
-    place = {name: int(about[name]) for name in ("map", "seed", "realisation")}
-    for (one, arrived), (other, also) in itertools.combinations(labels, 2):
-        if arrived != also and all(
-            one[name] == other[name] for name in LABELS if name != "risk"
-        ):
-            return {
-                name: list(dict.fromkeys((one[name], other[name]))) for name in LABELS
-            }, place
-    shown = (
-        labels[0][0] if labels else run.conditions[rows["condition"].iloc[0]][0].labels
+    tested = [condition for test in tests for condition in (test["one"], test["other"])]
+    ordered = list(dict.fromkeys([*tested, *rows["condition"]]))
+    rows = rows.sort_values(
+        "condition", key=lambda ids: ids.map(ordered.index), kind="stable"
     )
-    return {name: [label] for name, label in shown.items()}, place
+    candidates = []
+    for row in rows[rows["risk"] != NOT_USED].to_dict("records"):
+        condition, _ = run.conditions[row["condition"]]
+        candidates.append((condition.labels, bool(row["success"])))
+    draw = {name: int(map_keys[name]) for name in ("map", "seed", "realisation")}
+    columns = [name for name in LABELS if name != "risk"]
+    for (a, a_succeeded), (b, b_succeeded) in itertools.combinations(candidates, 2):
+        is_same_setting = all(a[name] == b[name] for name in columns)
+        if a_succeeded != b_succeeded and is_same_setting:
+            pair = {name: list(dict.fromkeys((a[name], b[name]))) for name in LABELS}
+            return pair, draw
+    shown = run.conditions[original_first][0].labels
+    if candidates:
+        shown = candidates[0][0]
+    return {name: [label] for name, label in shown.items()}, draw
 
 
 def _find(
-    run: Run, asked: Mapping[str, str], episode: tuple[int | None, int, int]
+    run: Run, requested: Mapping[str, str], episode: tuple[int | None, int, int]
 ) -> Unit | None:
-    """The unit of the first condition that fits, of a run that is not finished of the
-    first that has rows.
+    """Return the unit of the first matching condition; prefer one that has rows.
 
-    One that does not use a part fits any label where no other does.
+    A condition that does not use a part matches any label if no other condition does.
 
     Args:
-        run: where.
-        asked: labels.
+        run: the run.
+        requested: labels by column.
         episode: seed, realisation and map.
     """
     seed, realisation, map_index = episode
     is_finished = (run.folder / EPISODES).exists()
     first = None
-    for others in (set(), {NOT_USED}):
+    for ignored in (set(), {NOT_USED}):
         for condition, extent in run.conditions.values():
-            own = {
+            differing = {
                 condition.labels[name]
-                for name, label in asked.items()
+                for name, label in requested.items()
                 if condition.labels[name] != label
             }
-            wanted = extent.seeds[0] if seed is None else seed
-            for unit in (
-                units({condition.id: (condition, extent)}) if own <= others else ()
-            ):
-                if (unit.seed, unit.realisation) == (
-                    wanted,
-                    realisation,
-                ) and map_index in unit.maps:
-                    if is_finished or find_units(run.folder, unit):
-                        return unit
-                    first = first or unit
+            wanted_seed = extent.seeds[0] if seed is None else seed
+            if not differing <= ignored:
+                continue
+            for unit in units({condition.id: (condition, extent)}):
+                if (unit.seed, unit.realisation) != (wanted_seed, realisation):
+                    continue
+                if map_index not in unit.maps:
+                    continue
+                if is_finished or find_units(run.folder, unit):
+                    return unit
+                first = first or unit
         if first:
             return first
     return None

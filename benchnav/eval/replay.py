@@ -31,23 +31,22 @@ def replay(
     video: str = "",
     out: str = "",
 ) -> int:
-    """Play back an episode, or several on one map; missing recordings are made first.
+    """Play back an episode, or several on one map; create missing recordings first.
 
     Several labels of a column, such as --risk mean,cvar:0.9, show their conditions
-    together. Of a column that is not named the run's first label that fits is taken.
+    together. A column without a label takes the run's first that fits.
 
     Args:
-        labels: Of the conditions.
+        labels: Labels of the conditions.
         folder: Run folder.
-        seed: Root seed; the run's first when not given.
-        realisation: Draw of λ.
-        map: Number of the map in the scenario.
-        view: Open the viewer; false makes the recording only.
+        seed: Root seed; by default, the run's first.
+        realisation: Index of the draw of λ.
+        map: Index of the map in the scenario.
+        view: Open the viewer; false only creates the recording.
         web: Serve the viewer to a browser on this machine until Ctrl-C.
-        video: Write a video to this file, .mp4, in place of opening the viewer;
-            conditions stand side by side.
-        out: Folder for recordings, for a run that cannot be written; the run folder
-            when not given.
+        video: Write a video to this file, .mp4, instead of opening the viewer;
+            conditions are side by side.
+        out: Folder for recordings of a read-only run; if empty, the run folder.
     """
     from benchnav.eval.find_episodes import find_episodes
 
@@ -55,25 +54,26 @@ def replay(
         raise ConfigError(f"Expected `video` as a file {VIDEO}, got {video!r}.")
     if video and web:
         raise ConfigError("Expected `video` or `web`, got both.")
-    run, place = Path(folder), other_folder(folder, out)
-    found = find_episodes(run, labels.asked, seed, realisation, map)
+    run = Path(folder)
+    out_folder = other_folder(folder, out)
+    episodes = find_episodes(run, labels.selected, seed, realisation, map)
     if video:
         from benchnav.core.progress import show_progress
         from benchnav.eval.report.playback.video import write_video
 
         show_progress(
-            write_video(_recordings(run, found, place), Path(video)), "frames"
+            write_video(_recordings(run, episodes, out_folder), Path(video)), "frames"
         )
         print(f"video:   {video}")
         return 0
-    worlds = dict.fromkeys(unit.condition.labels["world"] for unit, _ in found)
-    if len({repr(unit.condition.world) for unit, _ in found}) > 1:
+    worlds = dict.fromkeys(unit.condition.labels["world"] for unit, _ in episodes)
+    if len({repr(unit.condition.world) for unit, _ in episodes}) > 1:
         raise ConfigError(
             "Expected conditions of one world to show on one map, got "
             f"{', '.join(worlds)}. Pass --video FILE.mp4, "
             "which shows them side by side."
         )
-    path = _viewer_file(run, found, place)
+    path = _viewer_file(run, episodes, out_folder)
     print(f"recording: {path}")
     if web:
         from benchnav.eval.report.playback.web import serve
@@ -86,23 +86,19 @@ def replay(
         or "WAYLAND_DISPLAY" in os.environ
     )
     if view and shown:
-        return (
-            1
-            if subprocess.run(
-                [sys.executable, "-m", "rerun_cli", str(path)], check=False
-            ).returncode
-            else 0
-        )
-    lacking = "no display was found; " if view else ""
+        command = [sys.executable, "-m", "rerun_cli", str(path)]
+        completed = subprocess.run(command, check=False)
+        return 1 if completed.returncode else 0
+    reason = "no display was found; " if view else ""
     print(
-        f"{lacking}view it with: {program('rerun')} {path}, in a browser with --web, "
+        f"{reason}view it with: {program('rerun')} {path}, in a browser with --web, "
         f"or as --video FILE{VIDEO}"
     )
     return 0
 
 
 def program(name: str) -> str:
-    """How a program of this environment is called from here."""
+    """Return the command that starts a program of this environment."""
     path = Path(sys.executable).parent / name
     if any(
         Path(folder) == path.parent
@@ -115,43 +111,42 @@ def program(name: str) -> str:
 
 
 def other_folder(run: str, out: str) -> Path:
-    """Where something made of a run is written: into it, or into a folder that is no
-    other run.
+    """Return the folder for files derived from a run: the run, or another folder.
 
     Args:
         run: the run folder.
         out: another folder; empty for none.
 
     Raises:
-        ConfigError: the other folder is another run.
+        ConfigError: If the other folder is another run.
     """
-    place = Path(out or run)
-    if (place / "run.json").exists() and place.resolve() != Path(run).resolve():
+    out_folder = Path(out or run)
+    if (out_folder / "run.json").exists() and out_folder.resolve() != Path(
+        run
+    ).resolve():
         raise ConfigError(
             f"Expected `out` as a folder that holds no other run, got {out}."
         )
-    return place
+    return out_folder
 
 
 def _recordings(
-    folder: Path, found: "list[tuple[Unit, int]]", out: Path
+    folder: Path, episodes: "list[tuple[Unit, int]]", out: Path
 ) -> "list[Recording]":
     from benchnav.eval.run.recordings import find_recording
 
-    return [find_recording(folder, unit, member, out) for unit, member in found]
+    return [find_recording(folder, unit, member, out) for unit, member in episodes]
 
 
-def _viewer_file(folder: Path, found: "list[tuple[Unit, int]]", out: Path) -> Path:
-    """The viewer's file of the episodes, which is made in a folder where it is not
-    there.
-    """
+def _viewer_file(folder: Path, episodes: "list[tuple[Unit, int]]", out: Path) -> Path:
+    """Return the path of the episodes' viewer file, creating it if it is missing."""
     from benchnav.eval.folder.checksums import is_as_noted, note_checksums
     from benchnav.eval.report.playback.viewer_file import write_rerun
 
-    unit, member = found[0]
+    unit, member = episodes[0]
     path = out / unit.recording_path(member, ".rrd")
-    if len(found) > 1:
-        conditions = "".join(other.condition.id for other, _ in found)
+    if len(episodes) > 1:
+        conditions = "".join(unit_.condition.id for unit_, _ in episodes)
         digest = hashlib.sha256(conditions.encode()).hexdigest()[:8]
         words = (
             unit.condition.scenario,
@@ -161,7 +156,7 @@ def _viewer_file(folder: Path, found: "list[tuple[Unit, int]]", out: Path) -> Pa
             f"{unit.maps[member]:05d}",
         )
         path = path.with_name(f"together-{'-'.join(map(str, words))}.rrd")
-    if len(found) > 1 or not path.exists() or not is_as_noted(out, path):
-        write_rerun(_recordings(folder, found, out), path)
+    if len(episodes) > 1 or not path.exists() or not is_as_noted(out, path):
+        write_rerun(_recordings(folder, episodes, out), path)
         note_checksums(out, [path])
     return path

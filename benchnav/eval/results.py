@@ -31,7 +31,7 @@ class Comparison:
 
     Args:
         numbers: a row per pair; the columns of `compare`'s CSV.
-        table: the same for readers, with notes.
+        table: formatted table, with notes.
     """
 
     numbers: pd.DataFrame
@@ -61,7 +61,7 @@ class Results:
 
     Args:
         folder: a run folder.
-        temporary: the temporary folder that holds it, which is deleted together with
+        temporary: temporary folder that contains it, which is deleted together with
             this object.
     """
 
@@ -73,7 +73,7 @@ class Results:
         """Open a run folder.
 
         Raises:
-            ConfigError: If the folder is no run folder, or no unit of it is finished.
+            ConfigError: If the folder is no run folder, or has no finished unit.
         """
         self.folder = Path(folder)
         self._temporary = temporary
@@ -87,24 +87,20 @@ class Results:
     @property
     def conditions(self) -> pd.DataFrame:
         """One row per condition, by its id: the labels of its parts."""
-        about = self._rows.conditions
-        labels = [entry["labels"] for entry in about.values()]
+        entries = self._rows.conditions
+        labels = [entry["labels"] for entry in entries.values()]
         return pd.DataFrame(
-            labels, index=pd.Index(about, name="condition"), columns=list(LABELS)
+            labels, index=pd.Index(entries, name="condition"), columns=list(LABELS)
         )
 
     @property
     def notes(self) -> list[str]:
-        """What a reader of the results must know: warnings, combinations that were left
-        out.
-        """
+        """Warnings, and combinations that were left out."""
         return [*self._rows.notes(), *caveats(self._rows.run.about)]
 
     @property
     def summary(self) -> pd.DataFrame:
-        """One row per condition: rates, means and intervals, and the comparison with
-        the best of its block.
-        """
+        """One row per condition: rates, means, intervals, comparison with the best."""
         return self._report.summary.copy()
 
     @property
@@ -115,16 +111,14 @@ class Results:
         return self._report.tests.copy()
 
     def best(self) -> pd.DataFrame:
-        """Return the conditions of each block that are not significantly worse than its
-        best, best first.
+        """Return the conditions that are not significantly worse than the best of a block.
 
-        The test is the max-T bootstrap test by map; see docs/concepts/statistics.md. In
-        a block where nothing is significantly worse, these are all conditions that
-        compete.
+        Conditions are ordered by success rate. The test is the max-T bootstrap test per
+        map; see docs/concepts/statistics.md. If no condition of a block is
+        significantly worse, all its competing conditions are returned.
         """
-        competing = self._report.summary[
-            self._report.summary["best_alike"].astype(bool)
-        ]
+        summary = self._report.summary
+        competing = summary[summary["best_alike"].astype(bool)]
         columns = [
             *LABELS,
             "success_rate",
@@ -133,9 +127,8 @@ class Results:
             "total_time_mean_s",
             "best_p",
         ]
-        return competing.sort_values("success_rate", ascending=False, kind="stable")[
-            columns
-        ].reset_index(drop=True)
+        ordered = competing.sort_values("success_rate", ascending=False, kind="stable")
+        return ordered[columns].reset_index(drop=True)
 
     def compare(
         self,
@@ -144,36 +137,33 @@ class Results:
         points: float = 5.0,
         **labels: str | Sequence[str],
     ) -> Comparison:
-        """Compare conditions that were evaluated on the same maps with the same draws
-        of λ.
+        """Compare conditions evaluated on the same maps with the same draws of λ.
 
         Args:
-            by: the one label in which the conditions of a pair differ, such as "risk";
-                if empty, that of `against`, or "risk".
+            by: column in which the conditions of a pair differ, such as "risk"; if
+                empty, the column of `against`, or "risk".
             against: label that all others are compared with; if empty, all pairs.
             points: difference of success in percentage points, for which the table
                 counts the maps needed.
-            **labels: which conditions are compared: by column one label or several,
+            **labels: labels of the compared conditions, one or several of each column,
                 such as planner="mppi".
 
         Raises:
             ConfigError: If there is nothing to compare, or conditions cannot be paired.
         """
-        asked = {
+        selected = {
             name: [value] if isinstance(value, str) else list(value)
             for name, value in labels.items()
         }
-        for name in asked:
+        for name in selected:
             expect(name in LABELS, f"labels among {', '.join(LABELS)}, got {name!r}.")
         return Comparison(
-            *compare_runs([self.folder], by, against, asked, points / 100)
+            *compare_runs([self.folder], by, against, selected, points / 100)
         )
 
     @property
     def plot(self) -> "Plots":
-        """The figures of the report, each a method that returns a matplotlib figure;
-        see `Plots`.
-        """
+        """Figures of the report, as methods that return matplotlib figures; see `Plots`."""
         return Plots(self)
 
     def report(
@@ -182,9 +172,9 @@ class Results:
         """Write the report (page, tables, figures), and return the path of its page.
 
         Args:
-            folder: where to; if None, the run folder.
-            figures: of your own, after the shipped ones. One that raises is left out,
-                and the page says why.
+            folder: folder of the report; if None, the run folder.
+            figures: custom figures, after the shipped ones. One that raises is left
+                out, and the page says why.
         """
         out = Path(folder) if folder else self.folder
         if out == self.folder and not self._rows.is_partial:
@@ -202,7 +192,7 @@ class Results:
         """Copy the run to a folder, and return the results there.
 
         Raises:
-            ConfigError: If the folder holds anything.
+            ConfigError: If the folder is not empty.
         """
         target = Path(folder)
         if is_taken(target):
@@ -214,9 +204,9 @@ class Results:
         with tempfile.TemporaryDirectory(
             dir=target.parent, prefix=f".{target.name}-"
         ) as copied:
-            whole = Path(copied, "run")
-            shutil.copytree(self.folder, whole)
-            whole.replace(target)
+            copy = Path(copied, "run")
+            shutil.copytree(self.folder, copy)
+            copy.replace(target)
         return Results(target)
 
     @cached_property
@@ -224,11 +214,9 @@ class Results:
         return read_report(self.folder, partial=self._rows.is_partial)
 
     def __repr__(self) -> str:
-        """Return up to six lines: size, place, success, what to read first."""
-        n_conditions, n_maps = (
-            len(self._rows.conditions),
-            self._rows.episodes["map"].nunique(),
-        )
+        """Return up to six lines: size, success, folder, and what to read first."""
+        n_conditions = len(self._rows.conditions)
+        n_maps = self._rows.episodes["map"].nunique()
         rate = 100 * self._rows.episodes["success"].mean()
         lines = [
             f"Results of {len(self._rows.episodes)} episodes: {n_conditions} "
@@ -245,9 +233,9 @@ class Results:
 
 
 class Plots:
-    """Figures of a run, by the names of their files with `_` for `-`; called with a
-    figure, it draws that one.
+    """Figures of a run as methods, named as their files with `_` for `-`.
 
+    Calling the object with a figure draws that figure.
     A figure with several variants, such as `over`, is drawn in all of them, as a list.
     """
 
@@ -256,7 +244,7 @@ class Plots:
         self._results = results
 
     def __call__(self, figure: Figure) -> Drawing | list[Drawing]:
-        """Draw a figure of your own; return a list if it has several variants.
+        """Draw a custom figure; return a list if it has several variants.
 
         Raises:
             ConfigError: If the run lacks what the figure needs.
@@ -288,18 +276,18 @@ class Plots:
 
     def _draw(self, name: str) -> Drawing | list[Drawing]:
         """Draw the figure of a name, or all variants of a figure of that name."""
-        known = self._figures
-        named = [
+        figures = self._figures
+        matching = [
             figure
-            for own, figure in known.items()
-            if name in (own, type(figure).name.replace("-", "_"))
+            for figure_name, figure in figures.items()
+            if name in (figure_name, type(figure).name.replace("-", "_"))
         ]
-        if not named:
+        if not matching:
             raise ConfigError(
-                f"Expected a figure among {', '.join(known)}, got "
-                f"{name!r}.{hint(name, known)}"
+                f"Expected a figure among {', '.join(figures)}, got "
+                f"{name!r}.{hint(name, figures)}"
             )
-        return self._draw_all(named)
+        return self._draw_all(matching)
 
     def _draw_all(self, figures: Sequence[Figure]) -> Drawing | list[Drawing]:
         drawn = [figure(self._results._report) for figure in figures]
@@ -310,7 +298,7 @@ def open_results(folder: str | Path) -> Results:
     """Open a run folder, finished or not, as the results that `evaluate` returns.
 
     Raises:
-        ConfigError: If the folder is no run folder, or no unit of it is finished.
+        ConfigError: If the folder is no run folder, or has no finished unit.
     """
     open_run(Path(folder))
     return Results(folder)

@@ -29,7 +29,8 @@ def attribute_faults(metric: Metric) -> list[str]:
     for name in ("name", "column", "meaning"):
         value = getattr(metric, name, None)
         is_line = isinstance(value, str) and value.isprintable()
-        expect(is_line and bool(value.strip()), name, "as text on one line")
+        is_empty = isinstance(value, str) and not value.strip()
+        expect(is_line and not is_empty, name, "as text on one line")
     for name in ("suffix", "words", "unit", "heading"):
         value = getattr(metric, name)
         is_line = isinstance(value, str) and value.isprintable()

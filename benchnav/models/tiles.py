@@ -231,7 +231,7 @@ def _reach(model: TraversabilityModel, probe: Observation) -> int | None:
     row = torch.arange(side - _STRIDE, device=probe.rgb.device)
     distance = torch.minimum(row[:, None], row).flatten()
     worst = torch.zeros(len(row), dtype=torch.float64, device=row.device)
-    without_first = (slice(_STRIDE, side), [])
+    without_first: tuple[slice, list[int]] = (slice(_STRIDE, side), [])
     without_last = (slice(0, side - _STRIDE), [-2, -1])
     for part, flip in (without_first, without_last):
         cropped = predict_observation(model, take_cells(probe, part, part))

@@ -166,11 +166,12 @@ class _SensorCheck:
     ) -> Any:
         """Return the sensor's answer, or `NOTHING` if it is not usable."""
         noise_key = NoiseKey(tuple(keys), self.step if step is None else step)
-        arguments = vars(truth)
         answer = self.breaches.watch(
             "sense",
-            lambda: self.sensor.sense(*arguments.values(), noise_key),
-            **arguments,
+            lambda: self.sensor.sense(
+                truth.terrain, truth.field, truth.robot_state, noise_key
+            ),
+            **vars(truth),
         )
         faults = [] if answer is NOTHING else list(_faults(answer, truth))
         for fault in faults:

@@ -32,9 +32,9 @@ def untrained(model: Any) -> TrainableModel | None:
         return None
     kind = config_class(model)
     if not kind:
-        return model()
+        return model()  # type: ignore[call-arg]
     settings = read(kind, dict(options), of(model.__name__))
-    return model(settings)  # type: ignore[call-arg]
+    return model(settings)
 
 
 def with_inputs(terrain: Terrain, model: TrainableModel) -> Terrain:

@@ -4,5 +4,5 @@ latency time what runs time.
 
 from benchnav.eval.run import latency
 
-MOST_STEPS = latency._MOST_STEPS
-latency._MOST_STEPS = 3
+MAX_STEPS = latency._MAX_STEPS
+latency._MAX_STEPS = 3

@@ -306,12 +306,12 @@ def test_what_found_no_partner_is_named(tmp_path: Path) -> None:
         [other], "planner", "", {"planner": ("mppi", "cl_rrt")}, 0.05
     )
     assert (
-        "Not in the table, since no condition differs from them in planner alone: MPPI VaR."
+        "Not in the table, since no condition differs from them only in planner: MPPI VaR."
         in shown.notes
     )
     _, shown = compare_runs([folder], "", "mean", {}, 0.05)
     assert (
-        "Not in the table, since no condition differs from them in risk alone: straight."
+        "Not in the table, since no condition differs from them only in risk: straight."
         in shown.notes
     )
 

@@ -318,7 +318,7 @@ def own_metric(folder: Path, value: str, **attributes: str) -> str:
 @pytest.mark.parametrize(
     ("metrics", "message"),
     [
-        (("score",), "besides those that every run has, got 'score'. Leave it out"),
+        (("score",), "that a run does not already have, got 'score'. Leave it out"),
         (("enrgy",), "Did you mean 'energy'"),
         (("energy", "energy:5"), "names and columns of their own"),
         (

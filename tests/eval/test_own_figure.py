@@ -79,10 +79,10 @@ def test_a_suite_names_figures_of_its_report(tmp_path: Path) -> None:
     ("name", "why"),
     [
         ("Broken", "the figure broken is missing: ValueError: no such column"),
-        ("Double", "Expected the name of a figure that no other has, got 'success'."),
+        ("Double", "Expected a figure with a unique name, got 'success'."),
         (
             "Outside",
-            "Expected the name of a figure that no other has, got '../outside'.",
+            "Expected a figure with a unique name, got '../outside'.",
         ),
     ],
 )

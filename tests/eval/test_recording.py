@@ -6,16 +6,14 @@ import pytest
 import torch
 
 from benchnav.core.errors import ConfigError
-from benchnav.eval.recording import (
+from benchnav.eval.recorded_plans import (
     DrawnPlan,
     KnownMap,
-    Recording,
-    drawing_interval,
     drawn_plan,
     reach_outline,
-    read_recordings,
     thinned,
 )
+from benchnav.eval.recording import Recording, drawing_interval, read_recordings
 from benchnav.planning.planners.planner import Plan
 from benchnav.viz.plans import STYLES
 from tests.eval.report import made

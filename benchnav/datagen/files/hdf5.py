@@ -390,8 +390,10 @@ def _put(source: ndarray | h5py.Dataset, target: h5py.Dataset, first: int) -> No
 
     Stored maps with the same filters, one per chunk, are copied without decompression.
     """
-    is_copyable = target.chunks[0] <= 1 and not isinstance(source, ndarray)
-    if not is_copyable or _packing(source) != _packing(target):
+    if isinstance(source, ndarray) or target.chunks[0] > 1:
+        target[first : first + len(source)] = source[:]
+        return
+    if _packing(source) != _packing(target):
         target[first : first + len(source)] = source[:]
         return
     within = (0,) * (source.ndim - 1)

@@ -341,7 +341,7 @@ def recipe_from_dict(data: Any, origin: str) -> Recipe:
         }
     try:
         growth, data = vegetation.read_keys(data)
-        layers = read_layers(data.get("layers", []))
+        layers: Any = read_layers(data.get("layers", []))
         if growth:
             layers = (growth, *layers)
         data["layers"] = read_layers(layers)

@@ -1,9 +1,8 @@
-"""Conditions: the cell of an experiment as a value, and how a suite becomes a list of
-them.
+"""Conditions: the cells of an experiment as values, and how a suite lists them.
 
-A condition says which data split, model, risk setting, planner, robot, objective, rules
-and world. Its id is the digest of that value; its labels are for people. Seeds,
-realisations and maps are how often a condition is run, and belong to the suite.
+A condition is a data split, model, risk setting, planner, robot, objective, rules and
+world. Its id is the digest of that value; its labels are for people. Seeds,
+realisations and maps belong to the suite.
 """
 
 import itertools
@@ -35,8 +34,8 @@ from benchnav.planning.planners.planner import INPUTS
 from benchnav.planning.problem import Task
 from benchnav.planning.world.world import World, read_world
 
-# What a robot knows of its map, whose defaults stand in no id: they are what there was
-# before there were others.
+# Sensing and belief. Defaults are left out of ids, so that conditions from before these
+# parts existed keep their ids.
 KNOWLEDGE: Mapping[str, Mapping[str, Any]] = {
     "sensor": {"part": "full", "options": {}},
     "ground": {"part": "contact", "options": {}},
@@ -57,10 +56,10 @@ LABELS = (
 )
 NOT_USED = "–"
 ANY_RISK = Part(part="mean", label=NOT_USED, kind="risk")
-# What the numbers of a split's maps rest on besides the maps:
-# `TerrainDataset.about_digest` is its digest.
+# Properties of a split that results depend on in addition to its maps:
+# `TerrainDataset.about_digest` is their digest.
 MEANING = "class table, λ_stuck, resolution or kind of truth"
-# The only input by which a setting bears on a planner where no robot learns.
+# The only input by which a setting affects a planner if no robot learns.
 _BEARS_BY: Mapping[str, str] = {"risk": "risk_map", "belief": "fields"}
 _ORDER = ("robot", "objective", "model", *KNOWLEDGE, "risk", "planner")  # of tables
 
@@ -71,21 +70,21 @@ class Condition:
 
     Args:
         data: path or id of the dataset.
-        scenario: its test split.
-        model: predicts.
-        risk: turns a prediction into λ̂.
-        planner: plans.
-        robot: F.
-        objective: J.
-        sensor: what the robot sees of its map.
-        ground: what it senses of λ.
-        belief: what is made of that.
-        rules: free space, least λ̂, goal radius, and when what is known is updated.
-        world: what λ does.
-        world_label: what tables call rules and world.
-        blind: the planner is blind; model and risk stand in for any.
-        stands_for: by kind of part the labels of the settings that differ in nothing
-            that the planner uses and are run as this one.
+        scenario: scenario of the test split.
+        model: model that predicts traversability.
+        risk: risk measure that turns a prediction into λ̂.
+        planner: planner.
+        robot: robot dynamics F.
+        objective: objective J.
+        sensor: appearance sensor.
+        ground: traversability sensor.
+        belief: update of the prediction by measured λ.
+        rules: free space, minimum λ̂, goal radius and replanning interval.
+        world: draws of λ and immobilising terrain.
+        world_label: label of rules and world in tables.
+        blind: whether the planner is blind; then any model and risk measure will do.
+        stands_for: by kind of part, labels of settings that differ only in inputs
+            that the planner does not use and are run as this one.
     """
 
     __repr__ = short_repr
@@ -107,10 +106,11 @@ class Condition:
     stands_for: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out the task, whose classes another process may have to load from a
-        file first.
+        """Return the fields without the cached task.
+
+        Another process may first have to load the task's classes from a file.
         """
-        return {each.name: getattr(self, each.name) for each in fields(self)}
+        return {item.name: getattr(self, item.name) for item in fields(self)}
 
     @property
     def split(self) -> str:
@@ -119,29 +119,26 @@ class Condition:
 
     @property
     def dataset(self) -> TerrainDataset:
-        """The dataset, opened again each time, since its file may have changed."""
+        """The dataset, reopened at each access, since its file may have changed."""
         return TerrainDataset(find_dataset(self.data))
 
     @property
     def parts(self) -> dict[str, Part]:
-        """Its parts by kind."""
+        """Parts by kind."""
         return {kind: getattr(self, kind) for kind in PART_KINDS}
 
     @property
     def value(self) -> dict[str, Any]:
-        """All that bears on the condition's rows, as plain data; no labels."""
-        parts = {
-            kind: {"part": part.part, "options": dict(part.options)}
-            for kind, part in self.parts.items()
-        }
+        """All that affects the condition's rows, as plain data without labels."""
+        parts = {}
+        for kind, part in self.parts.items():
+            spec = {"part": part.part, "options": dict(part.options)}
+            if spec != KNOWLEDGE.get(kind):
+                parts[kind] = spec
         return {
             "data": self.data,
             "split": self.split,
-            **{
-                kind: part
-                for kind, part in parts.items()
-                if part != KNOWLEDGE.get(kind)
-            },
+            **parts,
             "rules": self.rules.to_dict(),
             "world": self.world.to_dict(),
         }
@@ -153,7 +150,7 @@ class Condition:
 
     @property
     def labels(self) -> dict[str, str]:
-        """What tables call it, by column."""
+        """Labels in tables, by column."""
         parts = {kind: part.label for kind, part in self.parts.items()}
         parts |= dict.fromkeys(self.stands_for, NOT_USED)
         if self.blind:
@@ -167,7 +164,7 @@ class Condition:
 
     @property
     def description(self) -> str:
-        """All labels, each after its column."""
+        """All labels, each preceded by its column."""
         return ", ".join(f"{name} {label}" for name, label in self.labels.items())
 
     @cached_property
@@ -181,9 +178,7 @@ class Condition:
 
     @property
     def unreproducible(self) -> tuple[str, ...]:
-        """Its parts that are objects of this process, each as kind and label; no other
-        process can create them.
-        """
+        """Kind and label of parts that are objects only this process has."""
         return tuple(
             f"{kind} {part.label}"
             for kind, part in self.parts.items()
@@ -192,13 +187,12 @@ class Condition:
 
     @property
     def learns(self) -> bool:
-        """Whether the robot learns anything on its way."""
+        """Whether the robot updates its prediction during the episode."""
         return not self.sensor.object.sees_all or self.belief.object.learns
 
     @property
     def statistics(self) -> GroundStatistics | None:
-        """Statistics of the training maps, None if neither sensor nor belief needs
-        them.
+        """Statistics of the training maps; None if no sensor or belief needs them.
 
         Raises:
             ConfigError: If they are needed and missing.
@@ -209,11 +203,10 @@ class Condition:
 
     @property
     def planner_uses(self) -> frozenset[str]:
-        """Names of the inputs that bear on what the planner does in this task, see
-        `Planner.uses`.
+        """Names of the inputs that affect the planner in this task, see `Planner.uses`.
 
         Raises:
-            ConfigError: If the planner does not say it in the words of `INPUTS`.
+            ConfigError: If the planner returns names that are not in `INPUTS`.
         """
         owner = f"`uses` of planner {self.planner.label!r}"
         used = call(owner, self.planner.object.uses, {"task": self.task})
@@ -226,11 +219,10 @@ class Condition:
 
     @property
     def unused(self) -> tuple[str, ...]:
-        """Kinds of parts whose setting bears on no row, besides those that no blind
-        planner uses.
+        """Kinds of parts whose setting affects no row of a planner that is not blind.
 
-        Where a robot learns, a change of λ̂ decides when its planner is given another
-        map, so that every setting bears.
+        If a robot learns, a change of λ̂ decides when its planner receives another map,
+        so that every setting affects rows.
         """
         if self.blind or self.learns:
             return ()
@@ -239,9 +231,7 @@ class Condition:
 
     @property
     def rows_id(self) -> str:
-        """Digest of what bears on its rows; conditions that differ only in what is not
-        used share it.
-        """
+        """Digest of the settings that affect rows; unused settings do not change it."""
         stand_ins: dict[str, Any] = {
             "risk": ANY_RISK,
             "belief": part_of("belief", KNOWLEDGE["belief"], NOT_USED),
@@ -249,14 +239,14 @@ class Condition:
         return replace(self, **{kind: stand_ins[kind] for kind in self.unused}).id
 
 
-def condition_from(about: Mapping[str, Any]) -> Condition:
-    """Rebuilds a condition from its `value`, `labels` and `stands_for`, as `run.json`
-    holds them.
-    """
-    value, labels = {**KNOWLEDGE, **about["value"]}, about["labels"]
+def condition_from(entry: Mapping[str, Any]) -> Condition:
+    """Rebuild a condition from its entry in `run.json`."""
+    value = {**KNOWLEDGE, **entry["value"]}
+    labels = entry["labels"]
     parts: dict[str, Any] = {
         kind: part_of(kind, value[kind], labels[kind]) for kind in PART_KINDS
     }
+    stands_for = entry.get("stands_for", {})
     return Condition(
         data=value["data"],
         scenario=value["split"].removeprefix("test/"),
@@ -265,14 +255,12 @@ def condition_from(about: Mapping[str, Any]) -> Condition:
         world=read(World, {"time_budget_s": None} | value["world"], of("world")),
         world_label=labels["world"],
         blind=labels["model"] == NOT_USED,
-        stands_for={
-            kind: tuple(own) for kind, own in about.get("stands_for", {}).items()
-        },
+        stands_for={kind: tuple(merged) for kind, merged in stands_for.items()},
     )
 
 
 def scenarios_of(data: str) -> list[str]:
-    """The scenarios of a dataset's test splits, by its path or id."""
+    """Return the scenarios of the test splits of a dataset, from its path or id."""
     splits = TerrainDataset(find_dataset(data)).splits
     return [name.removeprefix("test/") for name in splits if name.startswith("test/")]
 
@@ -280,90 +268,88 @@ def scenarios_of(data: str) -> list[str]:
 def conditions_of(
     suite: Suite, scenarios_of: Callable[[str], Sequence[str]] = scenarios_of
 ) -> list[Condition]:
-    """Lists the conditions of a suite, in the order of tables.
+    """List the conditions of a suite, in the order of tables.
 
     Args:
-        suite: what is evaluated.
+        suite: the suite.
         scenarios_of: returns the scenarios of a dataset's test splits, from its path or
             id.
 
     Raises:
-        ConfigError: a part cannot be had as asked for, two parts share a label, or one
-            is there twice.
+        ConfigError: If a part cannot be created as requested, two parts share a label,
+            or a condition is listed twice.
     """
-    every: list[Condition] = []
+    conditions: list[Condition] = []
     for listed in suite.products:
-        here: set[str] = set()
+        ids: set[str] = set()
         for condition in _product(listed, scenarios_of):
-            if condition.id in here:
+            if condition.id in ids:
                 words = " ".join(label_words(condition.labels))
                 raise ConfigError(f"Expected settings that differ, got {words} twice.")
-            here.add(condition.id)
-            every.append(_as_run_once(condition))
-    check_labels(every)
-    return merge_alike({condition.id: condition for condition in every}.values())
+            ids.add(condition.id)
+            conditions.append(_as_run_once(condition))
+    check_labels(conditions)
+    by_id = {condition.id: condition for condition in conditions}
+    return merge_alike(by_id.values())
 
 
 def merge_alike(conditions: Iterable[Condition]) -> list[Condition]:
-    """Merges the conditions that share a `rows_id`; the first of them is run, or that
-    under `mean`.
-    """
-    alike: dict[str, list[Condition]] = defaultdict(list)
+    """Merge conditions with one `rows_id` into the first, or the one under `mean`."""
+    groups: dict[str, list[Condition]] = defaultdict(list)
     for condition in conditions:
-        alike[condition.rows_id].append(condition)
-    return [
-        merge(next((one for one in same if one.risk.part == "mean"), same[0]), same)
-        for same in alike.values()
-    ]
+        groups[condition.rows_id].append(condition)
+    merged = []
+    for group in groups.values():
+        of_mean = [condition for condition in group if condition.risk.part == "mean"]
+        merged.append(merge([*of_mean, *group][0], group))
+    return merged
 
 
-def merge(kept: Condition, conditions: Sequence[Condition]) -> Condition:
-    """Merges conditions that share a `rows_id` into one that stands for all.
+def merge(representative: Condition, conditions: Sequence[Condition]) -> Condition:
+    """Merge conditions that share a `rows_id` into one that stands for all.
 
     Args:
-        kept: which of them is run.
+        representative: the condition that is run.
         conditions: all of them.
 
     Returns:
-        `kept`, labelled as not using what they differ in.
+        `representative`, labelled as not using what the conditions differ in.
     """
     stands_for: dict[str, tuple[str, ...]] = {}
+    parts: dict[str, Any] = {}
     for kind in _BEARS_BY:
-        own = (
-            one.stands_for.get(kind, (getattr(one, kind).label,)) for one in conditions
-        )
-        labels = itertools.chain.from_iterable(own)
-        if len(names := tuple(dict.fromkeys(labels))) > 1:
-            stands_for[kind] = names
-    parts: dict[str, Any] = {
-        kind: replace(getattr(kept, kind), label=NOT_USED) for kind in stands_for
-    }
-    return replace(kept, stands_for=stands_for, **parts)
+        labels: dict[str, None] = {}
+        for condition in conditions:
+            label = getattr(condition, kind).label
+            labels |= dict.fromkeys(condition.stands_for.get(kind, (label,)))
+        if len(labels) > 1:
+            stands_for[kind] = tuple(labels)
+            parts[kind] = replace(getattr(representative, kind), label=NOT_USED)
+    return replace(representative, stands_for=stands_for, **parts)
 
 
 def check_labels(conditions: Iterable[Condition]) -> None:
-    """Refuses two settings under one label, which no reader of a table could tell
-    apart, and two labels of one.
+    """Reject two settings under one label, and two labels of one setting.
 
     Args:
-        conditions: those that had their labels first come first; one condition may be
-            there twice.
+        conditions: conditions, those whose labels take precedence first; a condition
+            may be repeated.
 
     Raises:
-        ConfigError: there are such.
+        ConfigError: If there are such settings.
     """
-    known: dict[tuple[str, str], str] = {}
+    digests: dict[tuple[str, str], str] = {}
     labels: dict[tuple[str, str], str] = {}
     for condition in conditions:
         value = condition.value
-        described = {name: value.get(name) for name in PART_KINDS} | {
-            "world": [value["world"], value["rules"]]
-        }
-        for name, about in described.items():
-            label, digest = condition.labels[name], text_digest(about)
+        settings = {name: value.get(name) for name in PART_KINDS}
+        settings["world"] = [value["world"], value["rules"]]
+        for name, setting in settings.items():
+            label = condition.labels[name]
             if label == NOT_USED:
                 continue
-            if known.setdefault((name, label), digest) != digest:
+            digest = text_digest(setting)
+            if digests.setdefault((name, label), digest) != digest:
                 raise ConfigError(
                     f"Expected a label for each {name}, got two settings that are "
                     f"both called {label!r}. "
@@ -382,24 +368,23 @@ def _product(listed: Mapping[str, list[Any]], scenarios_of: Any) -> Iterator[Con
     scenarios = {
         data: listed["scenarios"] or scenarios_of(data) for data in listed["data"]
     }
-    parts = {
-        kind: [part for given in listed[f"{kind}s"] for part in read_parts(kind, given)]
-        for kind in PART_KINDS
-    }
+    parts: dict[str, list[Part]] = {}
+    for kind in PART_KINDS:
+        lists = [read_parts(kind, spec) for spec in listed[f"{kind}s"]]
+        parts[kind] = list(itertools.chain.from_iterable(lists))
+    world_specs = itertools.chain.from_iterable(map(each_mapping, listed["world"]))
+    task_specs = list(itertools.chain.from_iterable(map(each_mapping, listed["task"])))
     worlds = [
         read_world(world, task)
-        for listed_world in listed["world"]
-        for world in each_mapping(listed_world)
-        for listed_task in listed["task"]
-        for task in each_mapping(listed_task)
+        for world, task in itertools.product(world_specs, task_specs)
     ]
-    check_count(
-        [sum(map(len, scenarios.values())), len(worlds), *map(len, parts.values())]
-    )
+    n_scenarios = sum(map(len, scenarios.values()))
+    check_count([n_scenarios, len(worlds), *map(len, parts.values())])
     for data in listed["data"]:
-        for scenario, (world, rules, label), *chosen in itertools.product(
+        settings = itertools.product(
             scenarios[data], worlds, *(parts[kind] for kind in _ORDER)
-        ):
+        )
+        for scenario, (world, rules, label), *chosen in settings:
             yield Condition(
                 data=data,
                 scenario=scenario,
@@ -411,22 +396,21 @@ def _product(listed: Mapping[str, list[Any]], scenarios_of: Any) -> Iterator[Con
 
 
 def _as_run_once(condition: Condition) -> Condition:
-    """One condition for every setting that would change nothing.
+    """Replace settings that change nothing by a default.
 
-    What a blind planner is given is not looked at; of λ that is known every measure of
-    risk is λ itself, and nothing is left to be learnt; and a belief that does not learn
-    ignores what is sensed of the ground.
+    A blind planner uses no prediction. If λ is known, each risk measure is λ itself and
+    nothing remains to be learnt. A belief that does not learn ignores measured λ.
     """
     unused = {
         kind: part_of(kind, default, NOT_USED) for kind, default in KNOWLEDGE.items()
     }
     if condition.planner.object.blind or not condition.planner_uses:
-        given: dict[str, Any] = {
+        unused_parts: dict[str, Any] = {
             **unused,
             "model": ModelPart(part="oracle", label=NOT_USED),
             "risk": ANY_RISK,
         }
-        return replace(condition, blind=True, **given)
+        return replace(condition, blind=True, **unused_parts)
     if not condition.belief.object.learns:
         condition = replace(condition, ground=unused["ground"])
     if condition.model.part != "clairvoyant":
@@ -439,32 +423,26 @@ def _as_run_once(condition: Condition) -> Condition:
 def label_words(
     labels: Mapping[str, str], names: Iterable[str] = LABELS[1:]
 ) -> list[str]:
-    """The labels of some columns, those that are used."""
+    """Return the labels of some columns, without those not used."""
     return [labels[name] for name in names if labels[name] != NOT_USED]
 
 
 def condition_names(conditions: Sequence[Condition]) -> list[str]:
-    """Names conditions by scenario, planner, risk setting, and by those other labels
-    that differ among them.
-    """
+    """Name conditions by scenario, planner, risk setting and other labels that differ."""
     labels = [condition.labels for condition in conditions]
-    varying = [
-        name
-        for name in LABELS
-        if name in ("scenario", "planner", "risk")
-        or len({one[name] for one in labels} - {NOT_USED}) > 1
-    ]
-    return [" ".join(label_words(one, varying)) for one in labels]
+    columns = []
+    for name in LABELS:
+        values = {row[name] for row in labels} - {NOT_USED}
+        if name in ("scenario", "planner", "risk") or len(values) > 1:
+            columns.append(name)
+    return [" ".join(label_words(row, columns)) for row in labels]
 
 
-def differences(one: Any, other: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Where two values of plain data differ: dotted names of options, with both values;
-    None where one has none.
-    """
-    if isinstance(one, Mapping) and isinstance(other, Mapping):
-        for key in dict.fromkeys([*one, *other]):
-            yield from differences(
-                one.get(key), other.get(key), f"{name}.{key}".removeprefix(".")
-            )
-    elif one != other:
-        yield name, one, other
+def differences(a: Any, b: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Yield where plain data differ: dotted option name and both values, or None."""
+    if isinstance(a, Mapping) and isinstance(b, Mapping):
+        for key in dict.fromkeys([*a, *b]):
+            path = f"{name}.{key}".removeprefix(".")
+            yield from differences(a.get(key), b.get(key), path)
+    elif a != b:
+        yield name, a, b

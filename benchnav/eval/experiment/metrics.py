@@ -1,6 +1,4 @@
-"""Metrics that a suite names besides those that every run has: how they are read, and
-how `run.json` holds them.
-"""
+"""Metrics that a suite adds to the built-in ones, and their entries in `run.json`."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -19,7 +17,7 @@ from benchnav.metrics.check import attribute_faults, sample_episodes
 from benchnav.metrics.shipped import QUANTITIES, SHIPPED
 from benchnav.planning.robots import Robot
 
-# Columns of a row of episodes that are no metrics.
+# Columns of the table of episodes that are not metrics.
 _BOOKKEEPING = (
     "condition",
     *LABELS,
@@ -31,7 +29,7 @@ _BOOKKEEPING = (
     "code",
     "time_budget_s",
 )
-# What of a metric's description results and hypotheses rest on.
+# Fields of a metric's description that results and hypotheses depend on.
 _FIXED = ("name", "column", "unit", "scale", "of_arrivals")
 
 
@@ -40,8 +38,8 @@ class NamedMetric:
     """A metric that a suite names.
 
     Args:
-        part: which, with its options.
-        quantity: what is said of its values.
+        part: the metric and its options.
+        quantity: name, column, unit and direction of its values.
     """
 
     part: Part
@@ -49,11 +47,11 @@ class NamedMetric:
 
     @property
     def spec(self) -> dict[str, Any]:
-        """What makes the metric, as plain data."""
+        """The part and options that create the metric, as plain data."""
         return {"part": self.part.part, "options": dict(self.part.options)}
 
     @property
-    def about(self) -> dict[str, Any]:
+    def entry(self) -> dict[str, Any]:
         """The entry of `metrics` in `run.json`."""
         marked = {"unreproducible": True} if self.is_object else {}
         return {
@@ -65,70 +63,66 @@ class NamedMetric:
 
     @property
     def is_object(self) -> bool:
-        """Whether it is an object of this process, which no other process can create."""
+        """Whether the metric is an object that only this process has."""
         return registry.is_object("metric", self.part.part)
 
 
 def read_metrics(
-    given: Sequence[PartSpec], robots: Iterable[Robot]
+    specs: Sequence[PartSpec], robots: Iterable[Robot]
 ) -> tuple[NamedMetric, ...]:
-    """Reads the metrics of a suite, and tries each on an episode of each robot.
+    """Read the metrics of a suite and measure each on an episode of each robot.
 
     Args:
-        given: as the suite lists them.
-        robots: of the suite.
+        specs: metrics as the suite lists them.
+        robots: robots of the suite.
 
     Raises:
-        ConfigError: If there is no such metric, it breaks its contract, or two have one
-            name or column.
+        ConfigError: If a metric does not exist or breaks its contract, or two share a
+            name or a column.
     """
-    parts = [part for spec in given for part in read_parts("metric", spec)]
-    episodes = (
-        [episode for robot in robots for episode in sample_episodes(robot)]
-        if parts
-        else []
-    )
+    parts = [part for spec in specs for part in read_parts("metric", spec)]
+    episodes = []
+    if parts:
+        episodes = [episode for robot in robots for episode in sample_episodes(robot)]
     named: list[NamedMetric] = []
     for part in parts:
         metric: Metric = part.object
         if type(metric) in map(type, SHIPPED):
             raise ConfigError(
-                "Expected `metrics` besides those that every run has, got "
+                "Expected `metrics` that a run does not already have, got "
                 f"{part.part!r}. Leave it out."
             )
         if faults := attribute_faults(metric):
             raise ConfigError(
                 f"metric {part.part!r} breaks its contract. {' '.join(faults)}"
             )
-        try:
-            for episode in episodes:
+        for episode in episodes:
+            try:
                 measure(metric, episode)
-        except MetricError as error:
-            raise ConfigError(
-                f"{error} It was tried on {episode} before the run."
-            ) from error
+            except MetricError as error:
+                message = f"{error} It was tried on {episode} before the run."
+                raise ConfigError(message) from error
         named = add_metric(named, NamedMetric(part=part, quantity=metric.quantity))
     return tuple(named)
 
 
-def add_metric(known: Sequence[NamedMetric], new: NamedMetric) -> list[NamedMetric]:
-    """Adds a metric to those of a run; one that is there already keeps its place and
-    takes the new description.
+def add_metric(metrics: Sequence[NamedMetric], new: NamedMetric) -> list[NamedMetric]:
+    """Add a metric to those of a run.
+
+    A metric that the run already has keeps its position and takes the new description.
 
     Raises:
         ConfigError: If another metric, or a column of every run, has its name or
             column, or it has another name, column or unit than before.
     """
     quantity = new.quantity
-    owned = [(other.name, other.column) for other in QUANTITIES.values()]
-    owned += [("", column) for column in _BOOKKEEPING]
-    for other in known:
-        if other.spec == new.spec and all(
-            getattr(other.quantity, name) == getattr(quantity, name) for name in _FIXED
-        ):
-            return [new if one is other else one for one in known]
-        owned.append((other.quantity.name, other.quantity.column))
-    for name, column in owned:
+    taken = [(builtin.name, builtin.column) for builtin in QUANTITIES.values()]
+    taken += [("", column) for column in _BOOKKEEPING]
+    for index, metric in enumerate(metrics):
+        if metric.spec == new.spec and _is_unchanged(metric.quantity, quantity):
+            return [*metrics[:index], new, *metrics[index + 1 :]]
+        taken.append((metric.quantity.name, metric.quantity.column))
+    for name, column in taken:
         if name == quantity.name or column == quantity.column:
             raise ConfigError(
                 "Expected metrics with names and columns of their own, got "
@@ -137,38 +131,41 @@ def add_metric(known: Sequence[NamedMetric], new: NamedMetric) -> list[NamedMetr
                 f"{column!r}. Give one another "
                 "`name` and `column`, or another `out` to the run."
             )
-    return [*known, new]
+    return [*metrics, new]
 
 
-def metrics_of_run(about: Mapping[str, Any]) -> tuple[NamedMetric, ...]:
-    """The metrics that a run has besides those that every run has.
+def _is_unchanged(before: Quantity, now: Quantity) -> bool:
+    return all(getattr(before, name) == getattr(now, name) for name in _FIXED)
+
+
+def metrics_of_run(manifest: Mapping[str, Any]) -> tuple[NamedMetric, ...]:
+    """Return the metrics that a run has in addition to the built-in ones.
 
     Args:
-        about: all of `run.json`.
+        manifest: contents of `run.json`.
     """
-    return tuple(
-        NamedMetric(
-            part=Part(
-                part=entry["part"],
-                label=entry["label"],
-                options=entry["options"],
-                kind="metric",
-            ),
-            quantity=Quantity(**entry["quantity"]),
+    metrics = []
+    for entry in manifest.get("metrics", ()):
+        part = Part(
+            part=entry["part"],
+            label=entry["label"],
+            options=entry["options"],
+            kind="metric",
         )
-        for entry in about.get("metrics", ())
-    )
+        quantity = Quantity(**entry["quantity"])
+        metrics.append(NamedMetric(part=part, quantity=quantity))
+    return tuple(metrics)
 
 
-def further_quantities(about: Mapping[str, Any]) -> list[Quantity]:
-    """What is said of each metric that a run has besides those that every run has.
+def further_quantities(manifest: Mapping[str, Any]) -> list[Quantity]:
+    """Return the quantities of a run's metrics beyond the built-in ones.
 
     Args:
-        about: all of `run.json`.
+        manifest: contents of `run.json`.
     """
-    return [metric.quantity for metric in metrics_of_run(about)]
+    return [metric.quantity for metric in metrics_of_run(manifest)]
 
 
 def quantities(further: Iterable[Quantity]) -> dict[str, Quantity]:
-    """All quantities by name: those that every run has, and further ones."""
+    """Return all quantities by name: the built-in ones and further ones."""
     return {**QUANTITIES, **{quantity.name: quantity for quantity in further}}

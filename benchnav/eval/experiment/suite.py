@@ -1,7 +1,7 @@
-"""Evaluation suites as users write them: what is to be compared, as plain data.
+"""Evaluation suites as users write them, as plain data.
 
-`condition` makes conditions of a suite. This module imports nothing heavy, so that the
-command's help is quick.
+`condition` derives conditions from a suite. This module imports nothing slow, so that
+the command's help is quick.
 """
 
 from dataclasses import dataclass, field
@@ -25,49 +25,47 @@ PART_FIELDS = {
     "beliefs": "belief",
 }
 
-# What a product lists, by the names that a suite has for it.
+# Fields of a suite whose product is evaluated.
 _LISTED = ("data", "scenarios", *PART_FIELDS, "world", "task")
 
-# What is kept of episodes beside their rows, each with all that stands before it.
+# What is stored of episodes in addition to rows; each level includes those before it.
 Record = Literal["none", "steps", "first", "failures", "all"]
 RECORDS: tuple[Record, ...] = get_args(Record)
 
-# More than any study needs; what exceeds them is a slip, and would fill memory before
-# anything is run.
+# More than any study needs; larger suites are mistakes that would fill memory.
 MAX_EPISODES = 10**8
 MAX_UNITS = 10**6
 MAX_CONDITIONS = 10**5
 
-_SEEDS = 2**63  # what a table's column of whole numbers holds
+_SEEDS = 2**63  # limit of an int64 column
 
 
 @dataclass(frozen=True, kw_only=True)
 class Suite:
-    """What is evaluated: the product of everything listed, or of each mapping in
-    `conditions`.
+    """The product of everything listed, or of each mapping in `conditions`.
 
     A planner, model, risk measure, robot, objective, sensor, belief, metric or figure
     is given as NAME, package.module:Name, path/to/file.py:Name, or {part: NAME, label:
     LABEL, options: {...}}; in a program also as an object, which is replaced by the
-        description that creates it again.
+    description that creates it again.
 
     Args:
         data: Path or id of a dataset with splits test/SCENARIO.
-        scenarios: Test splits by scenario; all of the dataset when none is named.
+        scenarios: Test splits by scenario; if empty, all of the dataset.
         model: Model, or checkpoint by folder or by name in `checkpoints/`; `oracle` is
             given the true distribution.
-        models: Several models; refused with `model`.
+        models: Several models; not together with `model`.
         planners: Planners.
         risks: Risk settings, such as `mean` or `cvar:0.9`.
         robots: Robots F.
         objectives: Objectives J.
-        sensors: What a robot sees of its map: `full`, all of it before it sets out, or
-            `near`, the ground around it.
-        grounds: Which λ it senses on its way: `contact`, under it, or `probe`, around
-            it.
+        sensors: Appearance sensors: `full` observes the whole map before the start,
+            `near` the cells around the robot.
+        grounds: Traversability sensors: `contact` measures λ under the robot, `probe`
+            also around it.
         beliefs: How measured λ updates the prediction: `static`, not; `copula`, λ of
             nearby cells; `classes`, also which of two look-alike classes cells are of.
-        world: What λ does: a preset by name, paper or stakes, or {preset: NAME, noise:
+        world: Draws of λ: a preset by name, paper or stakes, or {preset: NAME, noise:
             resampled | stored |
             frozen, correlation_m: 1.5, kernel: gaussian | matern32, immobile: {below:
                 0.1, for_s: 2},
@@ -79,22 +77,22 @@ class Suite:
                 replan_every_s: 0.5}.
         maps: Maps of each scenario, the first of its split; 0 takes all.
         seed: Root seed of all draws.
-        seeds: Several root seeds; refused with `seed`.
-        realisations: How often λ is drawn for each map and seed.
-        record: Kept beside the rows, each with all before it: none; steps of all
-            episodes; recordings for playback of each condition's first map; of
-            failures; of all episodes.
-        conditions: Several products: mappings of the keys above. A key that a mapping
-            lacks has its value above.
+        seeds: Several root seeds; not together with `seed`.
+        realisations: Draws of λ for each map and seed.
+        record: Stored in addition to rows; each level includes those before it: none;
+            steps of all episodes; recordings for playback of each condition's first
+            map; of failures; of all episodes.
+        conditions: Several products: mappings of the keys above. A missing key takes
+            its value above.
         hypotheses: Hypotheses, fixed before the first unit is run: mappings of `one`
             and `other`, conditions by their labels, such as {planner: mppi, risk:
             mean}; `metric`: success, T_total, score, traversability, path_length or the
             name of another metric; `kind`: difference, non-inferiority, superiority or
             equivalence;
             `direction`: higher or lower; `margin`.
-        metrics: Metrics of episodes besides those that every run has, such as
+        metrics: Metrics of episodes in addition to the built-in ones, such as
             energy:120.
-        figures: Figures of your own for the report, after the shipped ones.
+        figures: Custom figures for the report, after the shipped ones.
     """
 
     __repr__ = short_repr
@@ -124,16 +122,10 @@ class Suite:
 
     def __post_init__(self) -> None:
         """Describe objects as plain data, and reject a suite without conditions."""
-        for name, kind in {
-            **PART_FIELDS,
-            "metrics": "metric",
-            "figures": "figure",
-        }.items():
-            object.__setattr__(
-                self,
-                name,
-                tuple(_as_plain(kind, given) for given in getattr(self, name)),
-            )
+        kinds = {**PART_FIELDS, "metrics": "metric", "figures": "figure"}
+        for name, kind in kinds.items():
+            specs = tuple(_as_plain(kind, spec) for spec in getattr(self, name))
+            object.__setattr__(self, name, specs)
         object.__setattr__(self, "model", _as_plain("model", self.model))
         for name in (
             "planners",
@@ -148,7 +140,8 @@ class Suite:
             if not getattr(self, name):
                 raise ConfigError(f"Expected one or more `{name}`, got none.")
         for name in ("model", "seed"):
-            value, values = getattr(self, name), getattr(self, f"{name}s")
+            value = getattr(self, name)
+            values = getattr(self, f"{name}s")
             if values and value != getattr(Suite, name):
                 raise ConfigError(
                     f"Expected `{name}` or `{name}s`, got both, {value!r} and "
@@ -177,27 +170,26 @@ class Suite:
 
     @property
     def products(self) -> list[dict[str, list[Any]]]:
-        """What each product lists, by the field of the suite; the suite's own values
-        where it names none.
+        """Values that each product lists, by field; the suite's values by default.
 
         Raises:
             ConfigError: If a mapping of `conditions` has an unknown key, or one in the
                 singular and in the plural.
         """
-        whole = {key: getattr(self, key) for key in _LISTED} | {
-            "models": self.models or self.model
-        }
+        defaults = {key: getattr(self, key) for key in _LISTED}
+        defaults["models"] = self.models or self.model
         products = []
         for product in self.conditions or ({},):
-            listed, spelt = dict(whole), dict[str, str]()
-            for given, values in product.items():
-                spellings = (given, f"{given}s", str(given).removesuffix("s"))
-                key = next((key for key in spellings if key in listed), given)
+            listed = dict(defaults)
+            spelt: dict[str, str] = {}
+            for spelling, values in product.items():
+                spellings = (spelling, f"{spelling}s", str(spelling).removesuffix("s"))
+                key = next((key for key in spellings if key in listed), spelling)
                 check_known("keys of `conditions`", key, listed)
-                first = spelt.setdefault(key, given)
+                first = spelt.setdefault(key, spelling)
                 expect(
-                    first == given,
-                    f"`{first}` or `{given}` in one of `conditions`, got both. Leave "
+                    first == spelling,
+                    f"`{first}` or `{spelling}` in one of `conditions`, got both. Leave "
                     "one out.",
                 )
                 listed[key] = values
@@ -215,20 +207,16 @@ class Suite:
         return [(seed, r) for seed in self.all_seeds for r in range(self.realisations)]
 
 
-def _as_plain(kind: str, given: Any) -> PartSpec:
-    """Return what describes a part as text or mapping; an object is described by
-    `describe`.
-    """
-    if isinstance(given, str) or (
-        isinstance(given, dict) and isinstance(given.get("part"), str)
-    ):
-        return given
-    if isinstance(given, dict) and "part" in given:
-        return {
-            **_described(kind, given["part"]),
-            **{name: given[name] for name in given if name != "part"},
-        }
-    return given if isinstance(given, dict) else _described(kind, given)
+def _as_plain(kind: str, spec: Any) -> PartSpec:
+    """Describe a part as text or mapping, so that `run.json` can store it."""
+    if isinstance(spec, str):
+        return spec
+    if not isinstance(spec, dict):
+        return _described(kind, spec)
+    if "part" not in spec or isinstance(spec["part"], str):
+        return spec
+    rest = {name: value for name, value in spec.items() if name != "part"}
+    return {**_described(kind, spec["part"]), **rest}
 
 
 def _described(kind: str, instance: Any) -> dict[str, Any]:
@@ -250,20 +238,21 @@ def check_size(
     maps: int,
     block_maps: int = MAX_EPISODES,
 ) -> None:
-    """Refuse a run that is larger than any study, before anything of it is built.
+    """Reject a run that is larger than any study, before it is built.
 
     Args:
-        conditions: their number.
-        seeds: root seeds of each.
-        realisations: draws of λ for each seed.
-        maps: of each draw.
-        block_maps: most maps of a unit.
+        conditions: number of conditions.
+        seeds: number of root seeds.
+        realisations: number of draws of λ for each seed.
+        maps: number of maps of each draw.
+        block_maps: maximum number of maps of a unit.
 
     Raises:
         ConfigError: If it has more than `MAX_EPISODES` episodes or `MAX_UNITS` units.
     """
     draws = conditions * seeds * realisations
-    episodes, n_units = draws * maps, draws * -(-maps // block_maps)
+    episodes = draws * maps
+    n_units = draws * -(-maps // block_maps)
     if episodes > MAX_EPISODES or n_units > MAX_UNITS:
         raise ConfigError(
             f"Expected a run of at most {MAX_EPISODES:,} episodes in {MAX_UNITS:,} "
@@ -276,19 +265,18 @@ def check_size(
 
 @dataclass(frozen=True, kw_only=True)
 class Labels:
-    """Which conditions of a run are meant, by what its table calls them: of each column
-    one label or several.
+    """Labels that select conditions of a run: one or several of each column.
 
     Args:
-        planner: Planners, with commas between, such as astar_dwa; a part of a file by
-            the name of its class. The other labels work alike.
+        planner: Planners, separated by commas, such as astar_dwa; a part of a file by
+            the name of its class. The other columns work alike.
         risk: Risk settings.
         scenario: Scenarios.
         model: Models.
         robot: Robots.
         objective: Objectives.
-        sensor: Sensors of appearance.
-        ground: Sensors of λ.
+        sensor: Appearance sensors.
+        ground: Traversability sensors.
         belief: Beliefs.
         world: Worlds.
         data: Datasets.
@@ -307,6 +295,6 @@ class Labels:
     data: tuple[str, ...] = ()
 
     @property
-    def asked(self) -> dict[str, tuple[str, ...]]:
-        """Labels by column, of the columns that are named."""
+    def selected(self) -> dict[str, tuple[str, ...]]:
+        """Labels by column, without the columns that select nothing."""
         return {column: labels for column, labels in vars(self).items() if labels}

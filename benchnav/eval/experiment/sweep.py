@@ -1,11 +1,10 @@
-"""Parts and sweeps of a suite: where it gives several values for one, it means each of
-them.
-"""
+"""Sweeps of a suite: an option given a list of values stands for each of them."""
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -19,76 +18,83 @@ from benchnav.eval.experiment.suite import MAX_CONDITIONS
 from benchnav.models.base import is_family
 from benchnav.models.predictor import ModelPart, no_model
 
-_Chosen = dict[tuple[str, ...], Any]  # values by where they stand
+_Chosen = dict[tuple[str, ...], Any]  # values by their path in a mapping
 
 
-def part_of(kind: str, about: Mapping[str, Any], label: str) -> Part:
+def part_of(kind: str, spec: Mapping[str, Any], label: str) -> Part:
     """Return the part that `part` and `options` describe."""
     part_class = ModelPart if kind == "model" else Part
     return part_class(
-        kind=kind, part=about["part"], label=label, options=about["options"]
+        kind=kind, part=spec["part"], label=label, options=spec["options"]
     )
 
 
-def read_parts(kind: str, given: Any) -> list[Part]:
-    """Read what a suite lists as one part: several parts where options are given lists
-    of values.
+def read_parts(kind: str, spec: Any) -> list[Part]:
+    """Read one entry of a suite; an option given a list yields several parts.
 
     Args:
         kind: one of `registry.KINDS`.
-        given: in any form that `registry.read_part` reads.
+        spec: entry in any form that `registry.read_part` reads.
 
     Raises:
-        ConfigError: If there is no such part or option, or the part rejects its
+        ConfigError: If the part or an option does not exist, or the part rejects its
             options.
     """
-    part = registry.read_part(kind, given)
+    part = registry.read_part(kind, spec)
     if kind == "model":
         model = ModelPart(**vars(part))
-        if folder := model.folder:
-            is_named = part.label not in (part.part, part.part.rpartition(":")[2])
-            label = (
-                part.part.rpartition("/")[2]
-                if hub.is_address(part.part)
-                else folder.name
-            )
-            return [model if is_named else replace(model, label=label)]
+        if model.folder:
+            return [_with_folder_label(model, model.folder)]
         if is_family(model.found.target):
             raise no_model(model)
-    completed = [registry.complete(kind, one) for one in each_part(kind, part)]
-    parts = [part_of(kind, vars(one), one.label) for one in completed]
-    for one in parts:
-        if kind == "risk" and one.found.shipped:
-            # Lets it reject its options on one cell, also where no condition uses it.
-            cell = torch.full((1, 1, 1, 1), 0.5)
-            one.object(TraversabilityMixture(torch.ones_like(cell), cell, cell, (0,)))
-        elif kind in ("sensor", "ground", "belief"):
-            _ = one.object  # rejects its options
+    parts = []
+    for variant in each_part(kind, part):
+        completed = registry.complete(kind, variant)
+        parts.append(part_of(kind, vars(completed), completed.label))
+    for part in parts:
+        _check_options(kind, part)
     return parts
 
 
-def each_part(kind: str, part: Part) -> list[Part]:
-    """Gives a part for each combination of values where an option is given a list of
-    them.
+def _with_folder_label(model: ModelPart, folder: Path) -> ModelPart:
+    """Label a checkpoint by its address or folder unless the suite labels it."""
+    if model.label not in (model.part, model.part.rpartition(":")[2]):
+        return model
+    if hub.is_address(model.part):
+        return replace(model, label=model.part.rpartition("/")[2])
+    return replace(model, label=folder.name)
 
-    A list that the option itself takes, such as a pair of bounds, is one value. Each
-    part is labelled by its
-    values: `cvar:0.9` for the first option, which stands behind a colon, `astar_dwa
-        lookahead_m=4` for others.
+
+def _check_options(kind: str, part: Part) -> None:
+    """Let a part reject its options, also if no condition uses it."""
+    if kind == "risk" and part.found.shipped:
+        cell = torch.full((1, 1, 1, 1), 0.5)
+        weight = torch.ones_like(cell)
+        part.object(TraversabilityMixture(weight, cell, cell, (0,)))
+    elif kind in ("sensor", "ground", "belief"):
+        _ = part.object
+
+
+def each_part(kind: str, part: Part) -> list[Part]:
+    """Return a part for each combination of swept option values.
+
+    A list that the option itself accepts, such as a pair of bounds, is one value. Each
+    part is labelled by its values: `cvar:0.9` for the first option, which follows a
+    colon, `astar_dwa lookahead_m=4` for others.
 
     Args:
-        kind: of the part, as in `registry.KINDS`.
-        part: with options that may hold lists.
+        kind: kind of the part, one of `registry.KINDS`.
+        part: part whose options may contain lists.
 
     Returns:
-        The part itself where nothing is swept.
+        Parts in the order of the product; only the part itself if nothing is swept.
     """
-    known = registry.options_of(kind, registry.find(kind, part.part).target)
-    first = next(iter(known), "")
+    options = registry.options_of(kind, registry.find(kind, part.part).target)
+    first = next(iter(options), "")
     swept = {
         name: value
         for name, value in part.options.items()
-        if name in known and not _taken(kind, part.part, name, known[name], value)
+        if name in options and not _accepts(kind, part.part, name, options[name], value)
     }
     parts = []
     for chosen in _choices(swept):
@@ -98,31 +104,29 @@ def each_part(kind: str, part: Part) -> list[Part]:
     return parts
 
 
-def each_mapping(given: Any) -> list[Any]:
-    """Gives a mapping for each combination of values where one is a list, at any depth;
-    anything else as it is.
-    """
-    if not isinstance(given, Mapping):
-        return [given]
-    return [_with(given, chosen) for chosen in _choices(given)]
+def each_mapping(value: Any) -> list[Any]:
+    """Return a mapping for each combination of listed values, at any depth."""
+    if not isinstance(value, Mapping):
+        return [value]
+    return [_with(value, chosen) for chosen in _choices(value)]
 
 
-def _choices(given: Mapping[str, Any]) -> Iterator[_Chosen]:
-    """A value for each list in a mapping, by where it stands, in all combinations."""
-    lists = dict(_lists(given, ()))
+def _choices(mapping: Mapping[str, Any]) -> Iterator[_Chosen]:
+    """Yield each combination of values of the lists in a mapping, by path."""
+    lists = dict(_lists(mapping, ()))
     check_count(map(len, lists.values()))
     for values in product(*lists.values()):
         yield dict(zip(lists, values, strict=True))
 
 
 def check_count(counts: Iterable[int]) -> None:
-    """Refuse a product of more than `MAX_CONDITIONS` settings before it is built.
+    """Reject a product of more than `MAX_CONDITIONS` settings before it is built.
 
     Args:
-        counts: of values, in each list of the product.
+        counts: number of values in each list of the product.
 
     Raises:
-        ConfigError: If there are more.
+        ConfigError: If the product is larger.
     """
     counts = [count for count in counts if count > 1]
     if math.prod(counts) > MAX_CONDITIONS:
@@ -133,7 +137,7 @@ def check_count(counts: Iterable[int]) -> None:
         )
 
 
-def _taken(kind: str, source: str, name: str, option: Any, value: Any) -> bool:
+def _accepts(kind: str, source: str, name: str, option: Any, value: Any) -> bool:
     try:
         read(option.kind, value, of(f"{kind} {source!r}"), name)
     except ConfigError:
@@ -144,11 +148,11 @@ def _taken(kind: str, source: str, name: str, option: Any, value: Any) -> bool:
 def _lists(
     value: Any, path: tuple[str, ...]
 ) -> Iterator[tuple[tuple[str, ...], list[Any]]]:
-    """Lists in a value, at any depth, each with where it stands."""
+    """Yield the lists in a value, at any depth, each with its path."""
     if isinstance(value, list | tuple):
         if not value:
             raise ConfigError(
-                f"Expected one or more values of `{'.'.join(path)}`, got none."
+                f"Expected one or more values of `{'.'.join(path)}`, got an empty list."
             )
         yield path, list(value)
     elif isinstance(value, Mapping):
@@ -157,7 +161,7 @@ def _lists(
 
 
 def _with(options: Mapping[str, Any], chosen: _Chosen) -> dict[str, Any]:
-    made = dict(options)
+    updated = dict(options)
     for path, value in chosen.items():
-        made = changed(made, path, value)
-    return made
+        updated = changed(updated, path, value)
+    return updated

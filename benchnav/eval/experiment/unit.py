@@ -1,11 +1,10 @@
-"""Units of work: a condition's block of maps under one seed and realisation, run as one
-batch.
-"""
+"""Units of work: a block of maps of a condition, run as one batch."""
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from benchnav.core.registry import Part
 from benchnav.core.store import Shard
@@ -17,23 +16,23 @@ DRAW = [
     "seed",
     "realisation",
     "map",
-]  # columns by which an episode of a condition is known
+]  # columns that identify an episode of a condition
 
 
 @dataclass(frozen=True, kw_only=True)
 class Extent:
-    """How often a condition is run.
+    """Seeds, realisations and maps that a condition is run on.
 
     Args:
-        draws: (seed, realisation, maps): under each seed and draw of λ the first so
-            many maps of the split.
+        draws: (seed, realisation, maps) of each draw of λ; `maps` counts maps from the
+            start of the split.
     """
 
     draws: tuple[tuple[int, int, int], ...]
 
     @classmethod
     def product(cls, seeds: Iterable[int], realisations: int, maps: int) -> "Extent":
-        """The same maps under every seed and realisation."""
+        """Return the extent of the same maps under each seed and realisation."""
         return cls(
             draws=tuple((seed, r, maps) for seed in seeds for r in range(realisations))
         )
@@ -45,7 +44,7 @@ class Extent:
 
     @property
     def maps(self) -> int:
-        """The most maps that any draw has."""
+        """Maximum number of maps of a draw."""
         return max(maps for _, _, maps in self.draws)
 
     @property
@@ -54,14 +53,14 @@ class Extent:
         return sum(maps for _, _, maps in self.draws)
 
     def union(self, other: "Extent") -> "Extent":
-        """What is in either, and no more."""
-        most: dict[tuple[int, int], int] = {}
+        """Return the union of two extents."""
+        n_maps: dict[tuple[int, int], int] = {}
         for seed, realisation, maps in (*self.draws, *other.draws):
-            most[seed, realisation] = max(maps, most.get((seed, realisation), 0))
-        return Extent(draws=tuple((*key, maps) for key, maps in most.items()))
+            n_maps[seed, realisation] = max(maps, n_maps.get((seed, realisation), 0))
+        return Extent(draws=tuple((*key, maps) for key, maps in n_maps.items()))
 
 
-Conditions = Mapping[str, tuple[Condition, Extent]]  # by id, with how often each is run
+Conditions = Mapping[str, tuple[Condition, Extent]]  # by id, each with its extent
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,14 +68,14 @@ class Unit:
     """One batch of episodes.
 
     Args:
-        condition: what is run.
+        condition: the condition.
         seed: root seed.
-        realisation: which draw of λ.
-        maps: which maps of the condition's split; of one block.
-        record: what is kept beside rows: the `steps` of all episodes; recordings of the
-            `first` map of the condition, of `failures`, or of `all`.
-        leads: the unit begins its condition, so that its first map is the condition's.
-        metrics: metrics that its rows have besides those that every run has.
+        realisation: index of the draw of λ.
+        maps: indices of maps of the condition's split, all of one block.
+        record: what is stored in addition to rows: the `steps` of all episodes;
+            recordings of the condition's `first` map, of `failures`, or of `all`.
+        leads: whether this is the first unit of its condition.
+        metrics: metrics in addition to the built-in ones.
     """
 
     condition: Condition
@@ -89,36 +88,34 @@ class Unit:
 
     @property
     def block(self) -> int:
-        """Number of the block."""
+        """Index of the block."""
         return self.maps[0] // BLOCK_MAPS
 
     def shard(self, of: int) -> Shard:
-        """The shard that the unit is in, where so many machines make a run apart.
+        """Return the shard that contains the unit if a run has `of` shards.
 
-        It depends on the unit and that number alone, so that an extended run leaves
-        every unit where it was. Blocks, realisations and seeds of a condition go to the
-        shards in turn; the one that a condition begins with is drawn by its id, which
-        is a digest.
+        The shard depends only on the unit and `of`, so that extending a run moves no
+        unit. Blocks, realisations and seeds of a condition go to the shards in turn,
+        from the shard that the condition's id (a digest) selects.
         """
         turn = int(self.condition.id, 16) + self.seed + self.realisation + self.block
         return Shard(index=turn % of + 1, of=of)
 
     @property
     def name(self) -> str:
-        """Its name among the units of its condition."""
+        """Name, unique among the units of its condition."""
         return f"{self.seed}-{self.realisation}-{self.block:05d}"
 
     @property
     def steps_path(self) -> Path:
-        """The file of the unit's steps in a run folder, one partition a condition."""
+        """Path of the unit's steps in a run folder, one partition a condition."""
         return steps_path(self.condition.id, self.name)
 
     def recording_path(self, member: int, suffix: str = ".npz") -> Path:
-        """The file of one episode's recording in a run folder; `.rrd` for the viewer's,
-        which is made of it.
+        """Return the path of an episode's recording in a run folder.
 
-        The viewer names what it opens by the file, and takes letters, digits, `_` and
-        `-` without a warning; all else becomes `-`.
+        The Rerun viewer (suffix `.rrd`) shows the file's name; it accepts letters,
+        digits, `_` and `-` without a warning, and all else becomes `-`.
         """
         labels = self.condition.labels
         words = [labels[name] for name in ("planner", "risk", "scenario")]
@@ -128,17 +125,15 @@ class Unit:
             f"{self.realisation}",
             f"{self.maps[member]:05d}",
         ]
-        return Path(
-            "playback",
-            "-".join(re.sub(r"[^A-Za-z0-9_-]+", "-", word) for word in words) + suffix,
-        )
+        cleaned = [re.sub(r"[^A-Za-z0-9_-]+", "-", word) for word in words]
+        return Path("playback", "-".join(cleaned) + suffix)
 
     def watched(self) -> list[int]:
-        """Which episodes may come to be recorded, known before they are run."""
+        """Return the episodes that may be recorded if all of them fail."""
         return self.recorded([False] * len(self.maps))
 
     def recorded(self, succeeded: Sequence[bool]) -> list[int]:
-        """Which episodes are recorded, by how they ended."""
+        """Return the indices of the recorded episodes, from whether each succeeded."""
         first = [0] if self.leads else []
         failed = [member for member, success in enumerate(succeeded) if not success]
         chosen = {
@@ -150,83 +145,73 @@ class Unit:
 
 
 def steps_path(condition_id: str, name: str) -> Path:
-    """Return the file of a unit's steps in a run folder, from its condition and its
-    name.
-    """
+    """Return the path of a unit's steps in a run folder."""
     return Path("steps", f"condition={condition_id}", f"{name}.parquet")
 
 
 def units(
     conditions: Conditions, record: Record = "none", metrics: Sequence[Part] = ()
 ) -> list[Unit]:
-    """Cuts conditions into units of work, those that share a prediction next to one
-    another.
+    """Split conditions into units of work, ordered so that predictions are shared.
 
-    Those that look at no prediction are the shortest and come last of their block: a
-    worker's memory is measured after its first unit, and one whose memory grows much
-    thereafter is replaced, which takes long.
+    Units of blind planners need no prediction, are the shortest and come last of their
+    block: a worker's memory is measured after its first unit, and a worker whose memory
+    grows much thereafter is replaced, which takes long.
 
     Args:
-        conditions: what is run.
-        record: what is kept beside rows.
-        metrics: metrics that rows have besides those that every run has.
+        conditions: conditions by id, each with its extent.
+        record: what is stored in addition to rows.
+        metrics: metrics in addition to the built-in ones.
     """
-    made = [
+    units_ = [
         replace(unit, metrics=tuple(metrics))
         for condition, extent in conditions.values()
         for unit in _blocks(condition, extent, record)
     ]
-    order = {condition_id: place for place, condition_id in enumerate(conditions)}
+    order = {condition_id: index for index, condition_id in enumerate(conditions)}
+
+    def run_order(unit: Unit) -> tuple[Any, ...]:
+        condition = unit.condition
+        block = (condition.data, condition.scenario, unit.block)
+        prediction = (condition.blind, condition.model.part)
+        draw = (unit.seed, unit.realisation)
+        return (*block, *prediction, *draw, order[condition.id])
+
+    return sorted(units_, key=run_order)
+
+
+def in_table_order(units_: Iterable[Unit], conditions: Conditions) -> list[Unit]:
+    """Return units in the order of tables, regardless of the order of running."""
+    order = {condition_id: index for index, condition_id in enumerate(conditions)}
     return sorted(
-        made,
-        key=lambda u: (
-            u.condition.data,
-            u.condition.scenario,
-            u.block,
-            u.condition.blind,
-            u.condition.model.part,
-            u.seed,
-            u.realisation,
-            order[u.condition.id],
-        ),
+        units_, key=lambda u: (order[u.condition.id], u.seed, u.realisation, u.block)
     )
 
 
-def in_table_order(made: Iterable[Unit], conditions: Conditions) -> list[Unit]:
-    """Units in the order in which tables list them, whatever the order they were run
-    in.
-    """
-    order = {condition_id: place for place, condition_id in enumerate(conditions)}
-    return sorted(
-        made, key=lambda u: (order[u.condition.id], u.seed, u.realisation, u.block)
-    )
-
-
-def unit_names(known: Sequence[Unit]) -> Callable[[Unit], str]:
-    """Names units among others by scenario, planner, risk setting and what else
-    differs, and by their maps.
+def unit_names(units_: Sequence[Unit]) -> Callable[[Unit], str]:
+    """Return a function that names units by the labels that differ and their maps.
 
     Args:
-        known: all that are to be distinguished.
+        units_: all units that must be distinguished.
     """
-    conditions = {unit.condition.id: unit.condition for unit in known}
+    conditions = {unit.condition.id: unit.condition for unit in units_}
     labels = condition_names(list(conditions.values()))
     names = dict(zip(conditions, labels, strict=True))
-    draws = [
-        name
-        for name in ("seed", "realisation")
-        if len({getattr(unit, name) for unit in known}) > 1
-    ]
+    draws = [name for name in ("seed", "realisation") if _n_values(units_, name) > 1]
 
     def name(unit: Unit) -> str:
         words = [names[unit.condition.id]]
         words += [f"{draw} {getattr(unit, draw)}" for draw in draws]
-        first, last = unit.maps[0], unit.maps[-1]
-        return ", ".join(
-            [*words, f"map {first}" if first == last else f"maps {first} to {last}"]
-        )
+        first = unit.maps[0]
+        last = unit.maps[-1]
+        words.append(f"map {first}" if first == last else f"maps {first} to {last}")
+        return ", ".join(words)
 
     return name
+
+
+def _n_values(units_: Sequence[Unit], name: str) -> int:
+    return len({getattr(unit, name) for unit in units_})
 
 
 def _blocks(condition: Condition, extent: Extent, record: Record) -> Iterator[Unit]:

@@ -1,4 +1,4 @@
-"""What figures of a run are drawn from, and the episodes that they show."""
+"""Data of the figures of a run, and the episodes that they show."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -26,41 +26,38 @@ class Driven:
     Args:
         ground: the map.
         rows: an episode a condition.
-        tracks: of each the positions, shape [N + 1, 2].
+        tracks: positions of each episode, shape [N + 1, 2].
     """
 
     ground: Ground
     rows: pd.DataFrame
     tracks: Sequence[np.ndarray]
 
-    def chosen(self, most: int) -> list[int]:
-        """Indices of at most so many episodes in the order of the rows, as many
-        successes as failures if possible.
-        """
+    def chosen(self, max_count: int) -> list[int]:
+        """Return up to `max_count` indices of rows, balancing successes and failures."""
         turn = self.rows.groupby("success", sort=False).cumcount().to_numpy()
-        return sorted(np.argsort(turn, kind="stable")[:most].tolist())
+        return sorted(np.argsort(turn, kind="stable")[:max_count].tolist())
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunData:
-    """What figures of a run are drawn from; what lies in the run's folder is read when
-    it is first asked for.
+    """Data of the figures of a run; files of the folder are read on first access.
 
     Args:
-        about: all of `run.json`; of a run that is not finished with the conditions that
-            have rows.
+        about: contents of `run.json`; if the run is not finished, only with conditions
+            that have rows.
         summary: a row a condition, from `summary.summarise`, joined with
             `best.against_best`.
-        episodes: the rows behind the summary.
-        tests: a row a hypothesis, from `hypotheses.test_hypotheses`; empty where the
-            suite held none.
-        regret: from `regret.split_regret`; empty where the run has no chain.
+        episodes: rows of episodes.
+        tests: a row a hypothesis, from `hypotheses.test_hypotheses`; empty if the suite
+            has none.
+        regret: from `regret.split_regret`; empty if the run has no chain.
         failures: a row a failed episode.
         sheets: failures on their maps.
-        folder: of the run; None where it was not saved, so that no steps or recordings
-            are known.
-        record_driven: records driven episodes again, as `run.recordings.record_driven`
-            does of the folder.
+        folder: the run folder; None if the run was not saved, and thus has no steps or
+            recordings.
+        record_driven: records driven episodes again, such as
+            `run.recordings.record_driven`.
     """
 
     about: Mapping[str, Any]
@@ -77,23 +74,20 @@ class RunData:
 
     @cached_property
     def recordings(self) -> list[Recording]:
-        """Every recorded episode."""
+        """All recorded episodes."""
         return read_recordings(self.folder) if self.folder else []
 
     @cached_property
     def driven(self) -> Driven | None:
-        """Whole driven paths on the map that the run kept; None where it kept none, or
-        no steps.
-        """
+        """Driven paths on the map stored with the run; None without map or steps."""
         return read_driven(self.folder, self.episodes) if self.folder else None
 
     @cached_property
     def on_one_map(self) -> list[Recording]:
-        """Recordings of at most `MAX_PANELS` conditions on the map on which outcomes
-        differ most.
+        """Recordings of up to `MAX_PANELS` conditions, where outcomes differ most.
 
-        Each is that of the folder, which has plans too, or is made again of the steps
-        that were kept. None where one cannot be made.
+        A recording is read from the folder, with plans, or recreated from stored steps.
+        The list is empty if one cannot be recreated.
         """
         if self.driven is None:
             return []
@@ -117,12 +111,11 @@ class RunData:
 
 
 def read_driven(folder: Path, episodes: pd.DataFrame) -> Driven | None:
-    """Read whole driven paths on the map that a run kept; None where it kept none, or
-    no steps.
+    """Read driven paths on the map stored with a run; None without map or steps.
 
     Args:
         folder: a finished run.
-        episodes: its rows.
+        episodes: rows of the run.
     """
     path = folder / GROUND
     if not path.exists() or not (folder / STEPS).is_dir():
@@ -131,8 +124,8 @@ def read_driven(folder: Path, episodes: pd.DataFrame) -> Driven | None:
     rows = episodes[
         (episodes[list(ground.about)] == pd.Series(ground.about)).all(axis=1)
     ]
-    place = {name: ground.about[name] for name in ("seed", "realisation", "map")}
-    steps = read_steps(folder, condition=list(rows["condition"]), **place).groupby(
+    draw = {name: ground.about[name] for name in ("seed", "realisation", "map")}
+    steps = read_steps(folder, condition=list(rows["condition"]), **draw).groupby(
         "condition"
     )
     rows = rows[rows["condition"].isin(steps.groups)]
@@ -146,14 +139,13 @@ def read_driven(folder: Path, episodes: pd.DataFrame) -> Driven | None:
 def choose_recordings(
     recordings: Sequence[Recording], conditions: Sequence[str]
 ) -> list[Recording]:
-    """Choose one recording a condition, all of one map where there are such, at most
-    `MAX_PANELS`.
+    """Choose one recording a condition, up to `MAX_PANELS`, on one map if possible.
 
-    Of the maps that the first condition was recorded on it is the first on which
-    outcomes differ, if there is one; else the first on which an episode failed.
+    The map is the first on which outcomes differ, among those that the first condition
+    was recorded on, else the first on which an episode failed.
 
     Args:
-        recordings: all there are.
+        recordings: all recordings.
         conditions: ids in order.
     """
     table = pd.DataFrame(

@@ -22,15 +22,13 @@ _SPREAD = 0.32  # of a row's height, to either side
 
 
 class Distributions(Figure):
-    """A dot an episode with median and quartiles: T_total left, mean observed λ right,
-    a line a block.
-    """
+    """T_total and mean observed λ of each episode, with median and quartiles."""
 
     name = "distributions"
     text = (
-        "Each dot is an episode. Left: T_total, a failure counted as T. Right: "
-        "λ̄, "
-        "the mean observed λ."
+        "Each dot is an episode. Left: T_total, where a failure counts as T. Right: "
+        "λ̄, the mean observed λ. Black: median (tick) and quartiles (line) of all "
+        "episodes of a setting."
     )
 
     def draw(self, data: RunData) -> Drawing:
@@ -38,9 +36,9 @@ class Distributions(Figure):
         figure, panels = lay_out(
             data.summary, list(_QUANTITIES.values()), legend_in=0.15
         )
-        for place, (panel, rows) in enumerate(panels):
+        for index, (panel, rows) in enumerate(panels):
             _draw_dots(
-                panel, rows, data.episodes, list(_QUANTITIES)[place % len(_QUANTITIES)]
+                panel, rows, data.episodes, list(_QUANTITIES)[index % len(_QUANTITIES)]
             )
         panels[0][0].set_xlim(left=0)
         panels[1][0].set_xlim(0, 1)
@@ -59,15 +57,13 @@ class Distributions(Figure):
 def _draw_dots(
     panel: Axes, rows: pd.DataFrame, episodes: pd.DataFrame, name: str
 ) -> None:
-    """Draw a quantity of the episodes of several conditions, each condition at its
-    height; all dots at once.
-    """
+    """Draw a quantity of all episodes, each condition at its height."""
     dots = rows[["condition", "height"]].merge(episodes, on="condition")
     turn = dots.groupby("condition").cumcount()
     dots["up"] = dots["height"] + jitter(len(dots), _SPREAD)[turn]
     dots = dots[dots[name].notna()]
     for (colour, marker), is_success in zip(_ENDS.values(), (True, False), strict=True):
-        own = dots[dots["success"] == is_success]
+        group = dots[dots["success"] == is_success]
         size, line = (5, 0.5) if marker == "x" else (3, 0)
         looks: dict[str, Any] = {
             "color": colour,
@@ -75,7 +71,7 @@ def _draw_dots(
             "s": size,
             "lw": line,
         }
-        panel.scatter(own[name], own["up"], alpha=0.45, rasterized=True, **looks)
+        panel.scatter(group[name], group["up"], alpha=0.45, rasterized=True, **looks)
     for height, values in dots.groupby("height")[name]:
         low, middle, high = values.quantile([0.25, 0.5, 0.75])
         draw_interval(panel, low, high, height, "black")

@@ -27,41 +27,39 @@ _DARKEST = 0.35  # grey of λ = 0
 
 
 class DrivenPaths(Figure):
-    """Whole driven paths over the λ field, or over faded terrain where λ was resampled."""
+    """Driven paths over the λ field, or over faded terrain if λ was resampled."""
 
     name = "driven"
     trim = True
 
     def needs(self, data: RunData) -> bool:
-        """Return whether the run kept steps and a map."""
+        """Return whether the run has steps and a map."""
         return data.driven is not None
 
     def caption(self, data: RunData) -> str:
         """Return which map is shown and why."""
         assert data.driven is not None
-        about, rows = data.driven.ground.about, data.driven.rows
+        map_keys = data.driven.ground.about
+        rows = data.driven.rows
         differing = rows["success"].nunique() > 1
-        why = (
-            "On this map outcomes differ most."
-            if differing
-            else "Outcomes differ on no map."
-        )
+        reason = "Outcomes differ on no map."
+        if differing:
+            reason = "On this map outcomes differ most."
         return (
-            f"Driven paths on {about['scenario']}, map {about['map']}, seed "
-            f"{about['seed']}, realisation "
-            f"{about['realisation']}. "
-            f"{why}{chosen_in_words(min(len(rows), _MAX_PATHS), len(rows))}"
+            f"Driven paths on {map_keys['scenario']}, map {map_keys['map']}, seed "
+            f"{map_keys['seed']}, realisation "
+            f"{map_keys['realisation']}. "
+            f"{reason}{chosen_in_words(min(len(rows), _MAX_PATHS), len(rows))}"
         )
 
     def draw(self, data: RunData) -> Drawing:
         """Draw at most eight paths, with a legend at the side of the map."""
         driven = data.driven
         assert driven is not None
-        ground, places = driven.ground, driven.chosen(_MAX_PATHS)
-        rows, tracks = (
-            driven.rows.iloc[places],
-            [driven.tracks[place] for place in places],
-        )
+        ground = driven.ground
+        indices = driven.chosen(_MAX_PATHS)
+        rows = driven.rows.iloc[indices]
+        tracks = [driven.tracks[index] for index in indices]
         high, wide = ground.grid.shape
         is_wide = wide >= 2 * high
         width = TWO_COLUMNS_IN if is_wide else ONE_COLUMN_IN
@@ -76,35 +74,33 @@ class DrivenPaths(Figure):
             rows[[name for name in NAMING if name in rows]].to_dict("records")
         )
         colours = condition_colours(list(rows["planner"]), LINE_COLOURS)
-        for place, (row, track) in enumerate(
+        for index, (row, track) in enumerate(
             zip(rows.to_dict("records"), tracks, strict=True)
         ):
             # Later ones are thinner, so that paths that coincide are all seen.
-            thickness = 0.9 + 2.2 * (1 - place / max(len(rows), 2))
+            thickness = 0.9 + 2.2 * (1 - index / max(len(rows), 2))
             label = (
-                f"{names[place]}: {outcome_in_words(row['outcome'])}, "
+                f"{names[index]}: {outcome_in_words(row['outcome'])}, "
                 f"{row['end_time_s']:.0f} s"
             )
             maps.draw_path(
                 panel,
                 track,
                 thickness,
-                colours[place],
-                ls=line_style(place),
+                colours[index],
+                ls=line_style(index),
                 label=label,
             )
         maps.mark(panel, "start", tracks[0][0])
         maps.mark(panel, "goal", ground.goal_m)
         maps.name_immobilising(panel, ground.immobilising)
-        title = (
-            "terrain, faded"
-            if ground.field is None
-            else "λ field of the episode; lighter is higher"
-        )
+        title = "λ field of the episode; lighter is higher"
+        if ground.field is None:
+            title = "terrain, faded"
         panel.set(xlabel="x [m]", ylabel="y [m]", title=title)
         maps.frame_map(panel)
         failed = np.flatnonzero(~rows["success"].to_numpy(bool))
-        outcomes = [rows["outcome"].iloc[place] for place in failed]
+        outcomes = [rows["outcome"].iloc[index] for index in failed]
         handles, _ = panel.get_legend_handles_labels()
         for name in dict.fromkeys(map(maps.end_mark, outcomes)):
             handles.append(
@@ -119,9 +115,9 @@ class DrivenPaths(Figure):
         )
         maps.mark_ends(
             panel,
-            [tracks[place] for place in failed],
+            [tracks[index] for index in failed],
             outcomes,
-            [colours[place] for place in failed],
+            [colours[index] for index in failed],
         )
         return figure
 

@@ -37,9 +37,8 @@ class Failures(Figure):
         title, _ = data.sheets.shown[self.index]
         return (
             "Failures of the settings with the highest and the lowest success rate, "
-            f"{title}: predicted λ̂ (colour), "
-            "driven path and its end. λ̂ is that of the cell of the end, observed λ "
-            "the mean of the last 2 s."
+            f"{title}: predicted λ̂ (colour), driven path and its end. λ̂ in the titles "
+            "is that of the last cell, observed λ the mean of the last 2 s."
         )
 
     def draw(self, data: RunData) -> Drawing:

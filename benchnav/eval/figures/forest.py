@@ -17,7 +17,8 @@ from benchnav.viz.figure import Figure
 from benchnav.viz.panels import GRID, draw_interval
 from benchnav.viz.style import BLUE, TWO_COLUMNS_IN, legend_outside
 
-_TEST_IN, _METRIC_IN = 0.3, 0.55
+_TEST_IN = 0.3
+_METRIC_IN = 0.55
 _MARGIN = "0.88"
 
 
@@ -27,24 +28,22 @@ class Forest(Figure):
     name = "forest"
     text = (
         "Paired differences of the hypotheses that were fixed before the run. Filled "
-        "points are supported "
-        "(p < 0.05 after Holm's correction). Lines are 90 % (thick) and 95 % (thin) "
-        "intervals of one difference."
+        "points are supported (p < 0.05 after Holm's correction). Thick lines are "
+        "90 %, thin lines 95 % intervals of one difference, not corrected. The grey "
+        "band contains the differences that a margin allows."
     )
 
     def needs(self, data: RunData) -> bool:
-        """Return whether the suite held hypotheses."""
+        """Return whether the suite has hypotheses."""
         return not data.tests.empty
 
     def draw(self, data: RunData) -> Drawing:
-        """Draw a row a hypothesis, a panel a metric; the band is where a margin wants
-        the difference to lie.
-        """
-        known = quantities(further_quantities(data.about))
+        """Draw a row a hypothesis and a panel a metric, with a band a margin allows."""
+        all_quantities = quantities(further_quantities(data.about))
         numbered = data.tests.assign(number=range(1, len(data.tests) + 1))
         panels = {
             name: numbered[numbered["metric"] == name]
-            for name in known
+            for name in all_quantities
             if (data.tests["metric"] == name).any()
         }
         heights = [_METRIC_IN + _TEST_IN * len(rows) for rows in panels.values()]
@@ -55,7 +54,7 @@ class Forest(Figure):
             len(panels), squeeze=False, gridspec_kw={"height_ratios": heights}
         )[:, 0]
         for panel, (name, rows) in zip(axes, panels.items(), strict=True):
-            _draw_tests(panel, rows, known[name])
+            _draw_tests(panel, rows, all_quantities[name])
         point: dict[str, Any] = {"marker": "o", "ms": 4, "lw": 0}
         is_tested = data.tests["p_holm"].notna().all()
         looks: dict[str, Any] = {
@@ -75,7 +74,7 @@ class Forest(Figure):
 
 
 def _draw_tests(panel: Axes, rows: pd.DataFrame, quantity: Quantity) -> None:
-    # A difference without episodes has no numbers.
+    # A difference without episodes is NaN.
     ends = rows[["low", "high", "difference", "margin"]].astype(float).abs()
     reach = max(ends.max().max(), 1e-9) * 1.08
     panel.set(xlim=(-reach, reach), ylim=(len(rows) - 0.4, -0.6))
@@ -99,15 +98,15 @@ def _draw_tests(panel: Axes, rows: pd.DataFrame, quantity: Quantity) -> None:
         )
         side = panel.get_yaxis_transform()
         panel.text(1.01, height, p_in_words(row["p_holm"]), transform=side, va="center")
-        one, other = map(reading_names, row["names"])
-        names.append(f"{row['number']}. {one}\n− {other}")
+        first, second = map(reading_names, row["names"])
+        names.append(f"{row['number']}. {first}\n− {second}")
     panel.set_yticks(range(len(rows)), names)
     panel.tick_params(axis="y", length=0)
     panel.grid(axis="x", color=GRID, zorder=0)
     unit = f" [{quantity.unit}]" if quantity.unit else ""
     panel.set(xlabel=f"Δ {quantity.words}{unit}", axisbelow=True)
-    # Which way is better, at the end of the axis where it lies.
-    place, side_name, words = (
+    # The better direction, at its end of the axis.
+    x, side_name, words = (
         (1, "right", "better →")
         if quantity.better == "higher"
         else (0, "left", "← better")
@@ -115,7 +114,7 @@ def _draw_tests(panel: Axes, rows: pd.DataFrame, quantity: Quantity) -> None:
     if quantity.better != "neither":
         panel.annotate(
             words,
-            (place, 1),
+            (x, 1),
             xycoords="axes fraction",
             va="bottom",
             ha=side_name,

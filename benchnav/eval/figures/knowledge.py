@@ -1,4 +1,4 @@
-"""What a robot knew at four moments, from its start to its end."""
+"""Belief of a robot at four times, from its start to its end."""
 
 from collections.abc import Sequence
 from typing import Self
@@ -15,7 +15,7 @@ from benchnav.viz import maps
 from benchnav.viz.figure import Figure
 from benchnav.viz.style import TWO_COLUMNS_IN, legend_outside
 
-# Of each line of panels its label, its colours, and what has the lightest.
+# Label, colours and maximum of each line of panels.
 _SHOWN = {
     "mean": ("E[λ]", maps.TRAVERSABILITY_COLOURS, 1.0),
     "spread": ("spread of λ", maps.SPREAD_COLOURS, maps.MAX_SPREAD),
@@ -24,11 +24,10 @@ _MOMENTS = 4
 
 
 class KnowledgeMaps(Figure):
-    """E[λ] of the belief of a robot at four moments, and its spread, one for each of at
-    most four conditions.
+    """E[λ] and spread of a robot's belief at four times, for up to four conditions.
 
     Attributes:
-        index: index of the recording among those that are shown.
+        index: index of the recording among those shown.
     """
 
     name = "knowledge"
@@ -40,15 +39,14 @@ class KnowledgeMaps(Figure):
         return self.numbered(len(_learners(data)))
 
     def caption(self, data: RunData) -> str:
-        """Return whose knowledge it is."""
+        """Return which condition is shown, and what the maps mean."""
         shown = _learners(data)
-        about = shown[self.index].about
-        name = contender_names([own.about for own in shown])[self.index]
+        labels = shown[self.index].about
+        name = contender_names([recording.about for recording in shown])[self.index]
         return (
-            f"What a robot knew of {about['scenario']}, map {about['map']}, during "
-            f"its episode ({name}): E[λ] of its "
-            "belief above, and below its spread, half of the range from the 16 % to "
-            "the 84 % quantile of λ."
+            f"Belief of a robot on {labels['scenario']}, map {labels['map']}, during "
+            f"its episode ({name}). Above: E[λ]. Below: its spread, half of the range "
+            "from the 16 % to the 84 % quantile of λ."
         )
 
     def draw(self, data: RunData) -> Drawing:
@@ -57,24 +55,26 @@ class KnowledgeMaps(Figure):
 
 
 def _learners(data: RunData) -> list[Recording]:
-    known = [own for own in data.recordings if own.known]
-    return choose_recordings(known, list(data.summary["condition"]))
+    learning = [recording for recording in data.recordings if recording.known]
+    return choose_recordings(learning, list(data.summary["condition"]))
 
 
 def draw_knowledge(recording: Recording) -> Drawing:
-    """Draw what a robot knew, of a recording that has it, as `KnowledgeMaps` does."""
+    """Draw the belief of a recording that has it, as `KnowledgeMaps` does."""
     last = len(recording.traversability)
     steps = sorted({round(step) for step in np.linspace(0, last, _MOMENTS)})
     ratio = min(max(recording.grid.height / recording.grid.width, 0.3), 2.0)
     tall = (TWO_COLUMNS_IN - 0.9) / _MOMENTS * ratio
     figure = Drawing(figsize=(TWO_COLUMNS_IN, 2 * tall + 1.1), layout="compressed")
     panels = figure.subplots(2, len(steps), squeeze=False, sharex=True, sharey=True)
-    for row, (name, (label, colours, most)) in zip(panels, _SHOWN.items(), strict=True):
+    for row, (name, (label, colours, maximum)) in zip(
+        panels, _SHOWN.items(), strict=True
+    ):
         for panel, step in zip(row, steps, strict=True):
             moment.show_known(panel, recording, step, name)
-            known = recording.known_at(step)
-            if known is not None and known.sensed.any():
-                edge = outline(known.sensed, recording.resolution_m)
+            known_map = recording.known_at(step)
+            if known_map is not None and known_map.sensed.any():
+                edge = outline(known_map.sensed, recording.resolution_m)
                 maps.draw_lines(panel, edge, "white", 0.5)
                 maps.name_terrain(
                     panel, "edge of where λ was sensed", fc="0.6", ec="white"
@@ -84,7 +84,7 @@ def draw_knowledge(recording: Recording) -> Drawing:
             )
             maps.frame_map(panel)
         row[0].set_ylabel("y [m]")
-        maps.draw_bar(figure, label, row, (colours, most), aspect=20)
+        maps.draw_bar(figure, label, row, (colours, maximum), aspect=20)
     for (above, below), step in zip(panels.T, steps, strict=True):
         ended = f"\n{recording.outcome}" if step == last else ""
         above.set_title(f"t = {step * recording.dt_s:.1f} s{ended}", fontsize="small")

@@ -1,4 +1,4 @@
-"""How well λ is known ahead of robots that learn, over the time since they set out."""
+"""Accuracy of the belief ahead of robots that learn, over the episode's time."""
 
 import textwrap
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from benchnav.viz.figure import Figure
 from benchnav.viz.panels import Curves, line_looks
 from benchnav.viz.style import TWO_COLUMNS_IN, legend_outside
 
-# Of each column what its panels are called, and which way is better.
+# Title of each column's panels, with the better direction.
 METRICS = dict(
     zip(
         AHEAD_COLUMNS,
@@ -31,42 +31,35 @@ METRICS = dict(
     )
 )
 _BIN_S = 2.0
-_WAYS = ((), ("model",), ("planner", "model"), ("planner", "risk", "model"))
+_PANEL_COLUMNS = ((), ("model",), ("planner", "model"), ("planner", "risk", "model"))
 _LETTER_IN = 0.055
 _EPISODE = ["condition", "seed", "realisation", "map"]
 
 
 class Learning(Figure):
-    """RMSE and log score of what is believed ahead of robots, over the seconds of
-    experience.
-    """
+    """RMSE and log score of the belief ahead of robots, over seconds of experience."""
 
     name = "learning"
     text = (
-        f"What robots know of the terrain ahead of them, within {AHEAD_M:g} m and "
-        f"{AHEAD_DEG:g}° to either side, "
-        "where they have not sensed λ: RMSE of E[λ] and mean log score of the belief, "
-        "over the time since they set "
-        "out. Means over the maps on which a robot still drives, one for every "
-        f"{_BIN_S:g} s, with 95 % intervals "
-        f"(bootstrap over maps). Times with fewer than {LEAST_MAPS} maps are left out."
+        f"Belief of robots about the terrain ahead of them, within {AHEAD_M:g} m and "
+        f"{AHEAD_DEG:g}° to either side, where they have not measured λ: RMSE of E[λ] "
+        "and mean log score, over the time since the start. Lines are means over the "
+        f"maps on which a robot still drives, one for every {_BIN_S:g} s; bands are "
+        "95 % intervals (bootstrap over maps). Times with fewer than "
+        f"{LEAST_MAPS} maps are left out."
     )
 
     curves = pd.DataFrame()
 
     def variants(self, data: RunData) -> Sequence[Self]:
-        """Return one figure where robots learnt, steps were kept, and there are enough
-        maps.
-        """
+        """Return one figure if robots learnt on enough maps and steps were stored."""
         curves = (
             read_learning(data.folder, data.episodes) if data.folder else self.curves
         )
         return [self.variant(curves=curves)] if len(curves) else []
 
     def draw(self, data: RunData) -> Drawing:
-        """Draw a line a condition, with its band; where these are many, a panel a
-        model, planner and risk setting.
-        """
+        """Draw a line with a band for each condition, in several panels if many."""
         rows = data.summary[
             data.summary["condition"].isin(self.curves["condition"])
         ].reset_index(drop=True)
@@ -75,23 +68,26 @@ class Learning(Figure):
             for name in dict.fromkeys((*BLOCK, *NAMING))
             if name in rows and rows[name].nunique() > 1
         ]
-        titled, groups = divide_lines(rows, [(*BLOCK, *more) for more in _WAYS])
+        titled, groups = divide_lines(
+            rows, [(*BLOCK, *extra) for extra in _PANEL_COLUMNS]
+        )
         named = [name for name in differing if name not in titled]
         labels = (
             [reading_name(name, row[name]) for name in named]
             for row in rows.to_dict("records")
         )
-        names = [joined(own) or "mean over maps" for own in labels]
+        names = [joined(row_labels) or "mean over maps" for row_labels in labels]
         letters = int(
             (TWO_COLUMNS_IN / min(len(groups), MAX_ACROSS) - 0.4) / _LETTER_IN
         )
-        points = [
-            self.curves[self.curves["condition"] == rows["condition"][index]].assign(
-                panel=textwrap.fill(title, letters), line=names[index]
-            )
-            for title, shown in groups
-            for index in shown
-        ]
+        points = []
+        for title, shown in groups:
+            panel = textwrap.fill(title, letters)
+            for index in shown:
+                is_line = self.curves["condition"] == rows["condition"][index]
+                points.append(
+                    self.curves[is_line].assign(panel=panel, line=names[index])
+                )
         table = pd.concat(points).rename(columns={"time_s": "x"})
         looks = line_looks(names, dashed=True)
         figure, panels = Curves(
@@ -103,19 +99,17 @@ class Learning(Figure):
 
 
 def read_learning(folder: Path, episodes: pd.DataFrame) -> pd.DataFrame:
-    """Read how well λ was known ahead of the robots of a run, over the time since they
-    set out.
+    """Read the accuracy of the belief ahead of robots, over the time since the start.
 
     Args:
         folder: a finished run.
-        episodes: its rows.
+        episodes: rows of the run.
 
     Returns:
-        A row a condition and bin of time that at least `LEAST_MAPS` maps, or groups of
-        maps, tell of: `condition`, `time_s`, the middle of the bin, `maps`, how many
-        these are, and of each of `METRICS` its mean over them, with its 95 % interval
-        in the columns that end in `_low` and `_high`. No row where no robot learnt, or
-        no steps were kept.
+        A row a condition and time bin with at least `LEAST_MAPS` maps, or groups of
+        maps: `condition`; `time_s`, the middle of the bin; `maps`, their number; and
+        the mean of each of `METRICS` over them, with its 95 % interval in the columns
+        `_low` and `_high`. Empty if no robot learnt, or no steps were stored.
     """
     names = list(METRICS)
     columns = [
@@ -124,26 +118,26 @@ def read_learning(folder: Path, episodes: pd.DataFrame) -> pd.DataFrame:
         "maps",
         *(f"{name}{end}" for name in names for end in ("", "_low", "_high")),
     ]
-    known = [
+    tables = [
         rows.loc[rows[names[0]].notna(), [*_EPISODE, "time_s", *names]]
         for rows in step_files(folder)
         if names[0] in rows
     ]
-    if not known:
+    if not tables:
         return pd.DataFrame(columns=columns)
-    steps = pd.concat(known).merge(episodes[[*_EPISODE, "group"]], on=_EPISODE)
+    steps = pd.concat(tables).merge(episodes[[*_EPISODE, "group"]], on=_EPISODE)
     steps["bin"] = (steps["time_s"] / _BIN_S + 1e-6).astype(int)
-    # An episode counts once in a bin, and a map once, however many episodes were on it.
+    # Each episode counts once in a bin, and each map once, however many episodes.
     once = steps.groupby([*_EPISODE, "group", "bin"])[names].mean()
     by_map = once.groupby(["condition", "bin", "group"])[names].mean()
     rows = []
-    for (condition, place), own in by_map.groupby(["condition", "bin"]):
-        if len(own) < LEAST_MAPS:
+    for (condition, bin_index), group in by_map.groupby(["condition", "bin"]):
+        if len(group) < LEAST_MAPS:
             continue
-        values = own.to_numpy(np.float64)
+        values = group.to_numpy(np.float64)
         low, high = np.quantile(
-            bootstrap_counts(len(own)) @ values / len(own), [0.025, 0.975], axis=0
+            bootstrap_counts(len(group)) @ values / len(group), [0.025, 0.975], axis=0
         )
         numbers = np.stack((values.mean(axis=0), low, high), axis=1).ravel()
-        rows.append((condition, (place + 0.5) * _BIN_S, len(own), *numbers))
+        rows.append((condition, (bin_index + 0.5) * _BIN_S, len(group), *numbers))
     return pd.DataFrame(rows, columns=columns)

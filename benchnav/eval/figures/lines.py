@@ -1,6 +1,4 @@
-"""Lines of curves, which are divided into panels until none holds more lines than a
-reader can distinguish.
-"""
+"""Division of curves into panels with as many lines as a reader can distinguish."""
 
 from collections.abc import Sequence
 
@@ -15,26 +13,27 @@ _BLIND_TO = ("model", "sensor", "ground", "belief", "who", "planner", "risk")
 
 
 def divide_lines(
-    labels: pd.DataFrame, ways: Sequence[Sequence[str]]
+    labels: pd.DataFrame, alternatives: Sequence[Sequence[str]]
 ) -> tuple[list[str], list[tuple[str, list[int]]]]:
-    """Divide lines into panels by their labels, the first way if its panels hold few
-    enough, else the next.
+    """Divide lines into panels by the first alternative that leaves few enough in each.
 
-    A blind planner stands in all panels of its place that have other lines.
+    A blind planner is repeated in all panels of its scenario that have other lines.
 
     Args:
-        labels: a row a line, numbered from 0, a column a kind of label.
-        ways: columns that panels differ in.
+        labels: a row a line, indexed from 0, a column a kind of label.
+        alternatives: columns that panels differ in.
 
     Returns:
-        The columns that panels are named by; of each panel its title and its lines.
+        The columns in the panels' titles, and title and lines of each panel.
     """
     is_blind = labels["model"] == NOT_USED
     numbered = labels.assign(line=labels.index)
-    for columns in ways:
-        places = [name for name in columns if name not in _BLIND_TO]
+    for columns in alternatives:
+        fixed_columns = [name for name in columns if name not in _BLIND_TO]
         panels = numbered.loc[~is_blind, list(columns)].drop_duplicates()
-        blind = numbered.loc[is_blind, [*places, "line"]].merge(panels, "left", places)
+        blind = numbered.loc[is_blind, [*fixed_columns, "line"]].merge(
+            panels, "left", fixed_columns
+        )
         blind = blind.fillna(NOT_USED)
         shown = pd.concat([numbered.loc[~is_blind, [*columns, "line"]], blind])
         groups = (
@@ -44,7 +43,8 @@ def divide_lines(
             break
     titled = [name for name in columns if groups[name].nunique() > 1]
     rows = groups.to_dict("records")
-    return titled, [
-        (joined(reading_name(name, row[name]) for name in titled), row["line"])
-        for row in rows
-    ]
+    panels_ = []
+    for row in rows:
+        title = joined(reading_name(name, row[name]) for name in titled)
+        panels_.append((title, row["line"]))
+    return titled, panels_

@@ -1,5 +1,4 @@
-"""What an episode shows at a step: maps, plan, driven path. Figures, videos and viewer
-files show the same.
+"""Maps, plan and driven path of an episode at a step, for figures, videos and viewers.
 
 Letters in shapes: H×W cells.
 """
@@ -23,32 +22,32 @@ def has_ended(recording: Recording, step: int) -> bool:
 
 
 def known_colours(recording: Recording, step: int) -> dict[str, np.ndarray]:
-    """Colour what the planner knew at a step, uint8 of shape [H, W, 3] each.
+    """Return colours of the planner's maps at a step, uint8 of shape [H, W, 3] each.
 
     Returns:
-        `risk`, λ̂ with what is not free. Of a robot that learns also `mean` and
-        `spread` of the belief, all three under a veil where the map was not seen; and
-        `seen`, light where it was seen and blue where λ was sensed.
+        `risk`, λ̂ with non-free cells. If the robot learns, also `mean` and `spread` of
+        the belief, all three veiled in unobserved cells; and `seen`, light in observed
+        cells and blue where λ was measured.
     """
     predicted, free = recording.given_at(step)
     risk = maps.shades(predicted)
     risk[~free] = bytes_of(maps.CLOSED)[:3]
-    known = recording.known_at(step)
-    if known is None:
+    known_map = recording.known_at(step)
+    if known_map is None:
         return {"risk": risk}
-    spread = maps.shades(known.spread / maps.MAX_SPREAD, maps.SPREAD_COLOURS)
-    colours = {"risk": risk, "mean": maps.shades(known.mean), "spread": spread}
-    veiled = {name: maps.veiled(shown, known.seen) for name, shown in colours.items()}
-    # A cell may be sensed that was not seen.
+    spread = maps.shades(known_map.spread / maps.MAX_SPREAD, maps.SPREAD_COLOURS)
+    colours = {"risk": risk, "mean": maps.shades(known_map.mean), "spread": spread}
+    veiled = {
+        name: maps.veiled(shown, known_map.seen) for name, shown in colours.items()
+    }
+    # λ may be measured in a cell whose appearance was not observed.
     return veiled | {
-        "seen": _SEEN_COLOURS[np.where(known.sensed, 2, known.seen.astype(int))]
+        "seen": _SEEN_COLOURS[np.where(known_map.sensed, 2, known_map.seen.astype(int))]
     }
 
 
 def true_colours(recording: Recording) -> np.ndarray:
-    """Colour the λ field with what immobilises a robot; the true mean of λ where it was
-    resampled.
-    """
+    """Return colours of the λ field with immobilising cells, or of E[λ] if resampled."""
     if recording.field is None:
         return maps.shades(recording.true_mean)
     return maps.field_colours(recording.field, recording.immobilising)
@@ -57,42 +56,36 @@ def true_colours(recording: Recording) -> np.ndarray:
 def show_known(
     panel: Axes, recording: Recording, step: int, name: str = "risk"
 ) -> None:
-    """Show a map of `known_colours`, with what was not seen hatched and how far the
-    sensors reached.
-    """
+    """Show a map of `known_colours`, with unobserved cells and the sensors' footprint."""
     maps.show_map(panel, known_colours(recording, step)[name], recording.grid.extent_m)
-    known, (_, free) = recording.known_at(step), recording.given_at(step)
+    known_map = recording.known_at(step)
+    _, free = recording.given_at(step)
     if name == "risk" and not free.all():
         maps.name_terrain(panel, "not free", color=maps.CLOSED)
-    if known is None:
+    if known_map is None:
         return
-    if not known.seen.all():
+    if not known_map.seen.all():
         maps.draw_lines(
-            panel, maps.hatching(~known.seen, recording.resolution_m), "black", 0.3
+            panel, maps.hatching(~known_map.seen, recording.resolution_m), "black", 0.3
         )
         maps.name_terrain(
             panel, "not seen", fc=maps.UNSEEN, ec="black", hatch="////", lw=0
         )
-    if known.outlines:
-        plans.draw_reach(panel, known.outline)
+    if known_map.outlines:
+        plans.draw_reach(panel, known_map.outline)
 
 
 def known_in_words(recording: Recording) -> str:
-    """Say what the map of λ̂ is that `show_known` shows."""
+    """Return the title of the map of λ̂ that `show_known` shows."""
     if recording.about["model"] == NOT_USED:
         return "true E[λ]; the planner uses no map"
     if recording.known:
         return "λ̂ known by then"
-    learns = (
-        recording.about.get("sensor", "full"),
-        recording.about.get("belief", "static"),
-    ) != (
-        "full",
-        "static",
-    )
-    return (
-        "λ̂ at the start" if learns else "λ̂ given to the planner"
-    )  # what was learnt was not recorded
+    sensor = recording.about.get("sensor", "full")
+    belief = recording.about.get("belief", "static")
+    if (sensor, belief) == ("full", "static"):
+        return "λ̂ given to the planner"
+    return "λ̂ at the start"  # updates were not recorded
 
 
 def show_truth(panel: Axes, recording: Recording) -> None:
@@ -103,7 +96,7 @@ def show_truth(panel: Axes, recording: Recording) -> None:
 
 
 def draw_plan(panel: Axes, recording: Recording, step: int) -> None:
-    """Draw what was planned at a step; nothing once the episode has ended."""
+    """Draw the plan of a step; nothing once the episode has ended."""
     if not has_ended(recording, step):
         plans.draw_plan(panel, recording.plan_at(step * recording.dt_s).lines)
 

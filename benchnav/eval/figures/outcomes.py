@@ -11,8 +11,8 @@ from benchnav.eval.words import outcome_in_words
 from benchnav.viz.figure import Figure
 from benchnav.viz.style import AMBER, BLUE, GREEN, ORANGE, PINK, SKY, legend_outside
 
-# From what the terrain did to what the code did: the colour of each failure, and its
-# hatching in white, so that outcomes of one lightness differ in grey. Success is light.
+# Colour of each failure, and its white hatching, so that outcomes of equal lightness
+# differ in grey. Causes in the terrain come before faults of the code.
 LOOKS = {
     "immobilised": (ORANGE, ""),
     "stuck": (AMBER, "/////"),
@@ -29,9 +29,7 @@ SUCCESS_COLOUR = "#E4E4E4"
 
 
 class Outcomes(Figure):
-    """Fractions of outcomes in one order for all conditions: failures first, then
-    success.
-    """
+    """Fractions of outcomes in one order for all conditions, success last."""
 
     name = "outcomes"
     text = "Outcomes of the episodes."
@@ -44,7 +42,7 @@ class Outcomes(Figure):
             data.summary, [label], legend_in=0.15 + 0.15 * (len(ended) // 3)
         )
         for panel, rows in panels:
-            left = np.zeros(len(rows))
+            offset = np.zeros(len(rows))
             for name in ended:
                 fraction = 100 * rows[f"{name}_count"] / rows["n_episodes"]
                 colour, hatch = LOOKS[name]
@@ -58,16 +56,16 @@ class Outcomes(Figure):
                     rows["height"],
                     fraction,
                     0.78,
-                    left,
+                    offset,
                     label=outcome_in_words(name),
                     **look,
                 )
-                left = left + fraction
+                offset = offset + fraction
             panel.barh(
                 rows["height"],
-                100 - left,
+                100 - offset,
                 0.78,
-                left,
+                offset,
                 color=SUCCESS_COLOUR,
                 lw=0,
                 label="success",

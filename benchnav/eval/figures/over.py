@@ -1,6 +1,4 @@
-"""Sweeps of a run: conditions that are equal in all but one number, which takes three
-values or more, as curves.
-"""
+"""Sweeps of a run as curves: conditions that differ in one number of three values."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -35,15 +33,14 @@ MIN_VALUES = 3
 
 _LEVEL = "risk.options.level"
 _NAMES = {_LEVEL: "level α", SEVERITY: "severity of the scenario"}
-# Of each measure its columns of the summary, and what they are multiplied by.
+# Columns of the summary of each measure, and their factor.
 _MEASURES = {
     "success [%]": ("success_rate", "success_low", "success_high", 100.0),
     "T_total [s]": ("total_time_mean_s", "total_time_low_s", "total_time_high_s", 1.0),
 }
 _SAME = ("data", "scenario", "world", "robot", "objective")
 
-# What panels are named by, in order; who plans and the risk setting only where lines
-# are many.
+# Columns in titles of panels; planner and risk setting only if there are many lines.
 _LABELS = (
     "scenario",
     "data",
@@ -55,7 +52,7 @@ _LABELS = (
     "robot",
     "objective",
 )
-_WAYS = [
+_PANEL_COLUMNS = [
     [name for name in _LABELS if name not in left_out]
     for left_out in (("who", "risk"), ("risk",), ())
 ]
@@ -63,12 +60,12 @@ _WAYS = [
 
 @dataclass(frozen=True, kw_only=True)
 class Line:
-    """Conditions of one sweep that differ in its number alone.
+    """Conditions of a sweep that differ only in its number.
 
     Args:
-        values: of the number, ascending.
+        values: values of the number, ascending.
         conditions: ids, one a value.
-        rest: all else that the conditions are, by name with dots.
+        rest: all other settings of the conditions, by dotted name.
     """
 
     values: tuple[float, ...]
@@ -77,56 +74,58 @@ class Line:
 
 
 def find_sweeps(conditions: Mapping[str, Mapping[str, Any]]) -> dict[str, list[Line]]:
-    """Finds the sweeps of a run.
+    """Find the sweeps of a run.
 
-    A number that others follow, such as two that were changed together, makes no sweep.
+    Numbers that change together are no sweep.
 
     Args:
-        conditions: by id, with `value`, as `run.json` holds them.
+        conditions: entries of `run.json` by id, with `value`.
 
     Returns:
-        Lines in the order of the run, by the name of their number with dots, such as
+        Lines in the order of the run, by the dotted name of their number, such as
         `risk.options.level`; `severity` is that of scenarios.
     """
     values = {
-        name: _with_defaults(about["value"])
-        for name, about in conditions.items()
-        if "split" in about["value"]
+        name: _with_defaults(entry["value"])
+        for name, entry in conditions.items()
+        if "split" in entry["value"]
     }
     flat = [pd.json_normalize(value).to_dict("records")[0] for value in values.values()]
-    known = pd.DataFrame(flat, index=list(values), dtype=object)
-    tables = [(number, known) for number in sorted(known)]
-    for scenario, pairs in find_series(dict.fromkeys(known.get("split", ()))).items():
+    table_of_values = pd.DataFrame(flat, index=list(values), dtype=object)
+    tables = [(number, table_of_values) for number in sorted(table_of_values)]
+    for scenario, pairs in find_series(
+        dict.fromkeys(table_of_values.get("split", ()))
+    ).items():
         severities = {split: severity for severity, split in pairs}
-        own = known[known["split"].isin(list(severities))]
+        of_series = table_of_values[table_of_values["split"].isin(list(severities))]
         tables.append(
             (
                 SEVERITY,
-                own.assign(severity=own["split"].map(severities), split=scenario),
+                of_series.assign(
+                    severity=of_series["split"].map(severities), split=scenario
+                ),
             )
         )
     sweeps: dict[str, list[Line]] = {}
     for number, table in tables:
         table = table[table[number].map(_is_number)]
-        rest = table.drop(columns=number)
-        for _, alike in table.groupby(
-            rest.astype(str).apply(tuple, axis=1), sort=False
+        fixed = table.drop(columns=number)
+        for _, group in table.groupby(
+            fixed.astype(str).apply(tuple, axis=1), sort=False
         ):
-            if alike[number].nunique() >= MIN_VALUES:
-                ordered = alike[number].astype(float).sort_values(kind="stable")
+            if group[number].nunique() >= MIN_VALUES:
+                ordered = group[number].astype(float).sort_values(kind="stable")
                 line = Line(
                     values=tuple(ordered),
                     conditions=tuple(ordered.index),
-                    rest=rest.loc[ordered.index[0]].dropna().to_dict(),
+                    rest=fixed.loc[ordered.index[0]].dropna().to_dict(),
                 )
                 sweeps.setdefault(number, []).append(line)
     return sweeps
 
 
 def _with_defaults(value: Mapping[str, Any]) -> dict[str, Any]:
-    """A condition's value with rules and options of shipped planners that stand in it
-    only where they differ.
-    """
+    """Return a condition's value completed by default rules and planner options."""
     planner = value["planner"]
     later = {}
     if planner["part"] in registry.names("planner"):
@@ -144,17 +143,16 @@ def _is_number(value: Any) -> bool:
 
 
 def sweep_name(number: str) -> str:
-    """What a figure and its file call a number: its last word, such as `level`."""
+    """Return the name of a number in figures and files: its last word, as `level`."""
     return number.rpartition(".")[2]
 
 
 class Over(Figure):
-    """Success and T_total over a number in which conditions that are equal in all else
-    differ.
+    """Success and T_total over a number that otherwise equal conditions differ in.
 
     Attributes:
         number: a name from `find_sweeps`.
-        lines: those of the number.
+        lines: lines of that number.
     """
 
     name = "over"
@@ -165,28 +163,30 @@ class Over(Figure):
         """Return a figure a sweep."""
         sweeps = find_sweeps(data.about["conditions"])
         counts = Counter(map(sweep_name, sweeps))
-        short = {
-            n: sweep_name(n) if counts[sweep_name(n)] == 1 else n.replace(".", "-")
-            for n in sweeps
+        short_names = {
+            sweep: sweep_name(sweep)
+            if counts[sweep_name(sweep)] == 1
+            else sweep.replace(".", "-")
+            for sweep in sweeps
         }
         return [
-            self.variant(number=number, lines=lines, name=f"over-{short[number]}")
+            self.variant(number=number, lines=lines, name=f"over-{short_names[number]}")
             for number, lines in sweeps.items()
         ]
 
     def caption(self, data: RunData) -> str:
         """Return which number it is."""
         return (
-            f"Success and T_total over {self.name.removeprefix('over-')}, with 95 "
-            "% intervals."
+            f"Success and T_total over {self.name.removeprefix('over-')}. Bands are "
+            "95 % intervals; horizontal lines are settings without this number."
         )
 
     def draw(self, data: RunData) -> Drawing:
         """Draw success above with Wilson's band, T_total below with the bootstrap's.
 
-        A panel a scenario, world, model and what else there is of that kind; where
-        lines are many, a panel a planner too. Over a number of a risk setting, the
-        other settings of the same planner are horizontal lines.
+        There is a panel for each scenario, world, model and so on, and for each planner
+        if there are many lines. Over a number of a risk setting, other settings of the
+        same planner are horizontal lines.
         """
         rows = data.summary.set_index("condition", drop=False)
         labels = _label_lines(self.number, self.lines, rows)
@@ -194,26 +194,23 @@ class Over(Figure):
         looks = line_looks(
             planners.index, condition_colours(planners.tolist(), LINE_COLOURS)
         )
-        _, groups = divide_lines(labels, _WAYS)
+        _, groups = divide_lines(labels, _PANEL_COLUMNS)
         groups = [
             (title or labels["scenario"][shown[0]], shown) for title, shown in groups
         ]
-        measured = pd.DataFrame(
-            {
-                name + end: scale * rows[column]
-                for name, (*columns, scale) in _MEASURES.items()
-                for end, column in zip(("", "_low", "_high"), columns, strict=True)
-            }
-        )
-        points = [
-            measured.loc[list(self.lines[index].conditions)].assign(
-                panel=title,
-                line=labels["name"][index],
-                x=_places(self.number, self.lines[index].values),
-            )
-            for title, shown in groups
-            for index in shown
-        ]
+        columns_of_measures: dict[str, pd.Series] = {}
+        for name, (*columns, scale) in _MEASURES.items():
+            for end, column in zip(("", "_low", "_high"), columns, strict=True):
+                columns_of_measures[name + end] = scale * rows[column]
+        measured = pd.DataFrame(columns_of_measures)
+        points = []
+        for title, shown in groups:
+            for index in shown:
+                line = self.lines[index]
+                x = _positions(self.number, line.values)
+                of_line = measured.loc[list(line.conditions)]
+                name = labels["name"][index]
+                points.append(of_line.assign(panel=title, line=name, x=x))
         across = min(len(groups), MAX_ACROSS)
         measures = {name: name for name in _MEASURES}
         label = _NAMES.get(self.number, sweep_name(self.number))
@@ -228,7 +225,7 @@ class Over(Figure):
         ticks = sorted({value for line in self.lines for value in line.values})
         for panel in panels.values():
             panel.set_xticks(
-                _places(self.number, ticks), [f"{value:g}" for value in ticks]
+                _positions(self.number, ticks), [f"{value:g}" for value in ticks]
             )
         if self.number.startswith("risk."):
             others = rows.drop(
@@ -260,9 +257,7 @@ def _draw_references(
     firsts: Mapping[int, pd.Series],
     colours: Mapping[int, Any],
 ) -> None:
-    """Draw settings without the number as horizontal lines: those of a line's planner,
-    and blind ones.
-    """
+    """Draw settings without the number, of the same planner or blind, as lines."""
     settings = [
         risk_name(row["risk"])
         if row["model"] != NOT_USED
@@ -270,13 +265,13 @@ def _draw_references(
         for row in others.to_dict("records")
     ]
     order = list(dict.fromkeys(settings))
-    for index, first in firsts.items():
+    for index, first_row in firsts.items():
         for name, (condition, row) in zip(settings, others.iterrows(), strict=True):
             is_blind = row["model"] == NOT_USED
             shared = list(_SAME) if is_blind else [*_SAME, "model", "planner"]
-            if (row[shared] == first[shared]).all():
+            if (row[shared] == first_row[shared]).all():
                 colour = BLIND if is_blind else colours[index]
-                # A pattern of dashes for each setting, with more and more dots between.
+                # Dashes with an increasing number of dots distinguish settings.
                 dashes = (0, (6, 2, *(1, 1.5) * order.index(name)))
                 panel.axhline(
                     values[condition],
@@ -291,10 +286,9 @@ def _draw_references(
 def _label_lines(
     number: str, lines: Sequence[Line], rows: pd.DataFrame
 ) -> pd.DataFrame:
-    """What names lines and their panels: a row a line, with the `planner` and the
-    `name` of the line beside `_LABELS`.
+    """Return `_LABELS`, `planner` and `name` of each line, a row a line.
 
-    Of the part that is swept it is the name alone, since its label holds the number.
+    A swept part is named without its label, which contains the number.
     """
     labelled = rows.loc[[line.conditions[0] for line in lines]].reset_index(drop=True)
     labelled["scenario"] = [
@@ -311,23 +305,21 @@ def _label_lines(
     labelled["who"] = labelled["who"].map(planner_name)
     labelled["risk"] = labelled["risk"].map(risk_name)
     names = {}
-    for _, alike in labelled.groupby(list(_LABELS), sort=False):
-        rests = [lines[place].rest for place in alike.index]
-        for place, rest in zip(alike.index, rests, strict=True):
-            # What labels do not say is said where that is needed.
+    for _, group in labelled.groupby(list(_LABELS), sort=False):
+        rests = [lines[index].rest for index in group.index]
+        for index, rest in zip(group.index, rests, strict=True):
+            # Settings that no label shows are appended if lines would coincide.
             differing = [
                 key
                 for key in rest
-                if len({repr(other.get(key)) for other in rests}) > 1
+                if len({repr(fixed.get(key)) for fixed in rests}) > 1
             ]
-            more = (f"{sweep_name(key)} {rest[key]}" for key in differing)
-            names[place] = joined([alike["who"][place], alike["risk"][place], *more])
+            extra = (f"{sweep_name(key)} {rest[key]}" for key in differing)
+            names[index] = joined([group["who"][index], group["risk"][index], *extra])
     return labelled.assign(name=pd.Series(names))
 
 
-def _places(number: str, values: Sequence[float]) -> np.ndarray:
-    """Where values stand: levels by the logarithm of the tail's share, since they crowd
-    toward 1.
-    """
+def _positions(number: str, values: Sequence[float]) -> np.ndarray:
+    """Return positions of values; levels by the logarithm of the tail's weight."""
     numbers = np.asarray(values)
     return -np.log(1 - numbers) if number == _LEVEL and numbers.max() < 1 else numbers

@@ -1,6 +1,4 @@
-"""The waterfall of regret: what each step of a chain of conditions takes from success,
-and adds to time.
-"""
+"""Waterfall of regret: change of success and time in each step of a chain."""
 
 from itertools import pairwise
 from typing import Any
@@ -33,7 +31,7 @@ MAX_CHAINS = 6
 _ROW_IN = 0.24
 _ENDS = "0.75"
 _BOUND = "0.25"
-# Of each measure its axis, its factor, and whether more is worse.
+# Axis label, factor, and whether more is worse, for each measure.
 _MEASURES = {
     "success": ("success [%]", 100.0, False),
     "time": ("T_total [s]", 1.0, True),
@@ -50,26 +48,21 @@ class Regret(Figure):
         return not data.regret.empty
 
     def caption(self, data: RunData) -> str:
-        """Return what a step means, and how many chains are shown."""
+        """Return the meaning of a step, and how many chains are shown."""
         chains = data.regret["chain"].nunique()
-        shown = (
-            f" The first {MAX_CHAINS} of {chains} chains are shown."
-            if chains > MAX_CHAINS
-            else ""
-        )
+        shown = ""
+        if chains > MAX_CHAINS:
+            shown = f" The first {MAX_CHAINS} of {chains} chains are shown."
         return (
-            "Regret against the near-optimal reference, a drive on λ itself and no "
-            "bound: step by step from a planner "
-            "to it, on the episodes that all have in common, paired differences with "
-            "95 % intervals. A step may be "
-            "negative, and in another order steps would be others, so that none is "
-            f"a share of the causes.{shown}"
+            "Regret against the near-optimal reference, which plans on λ itself and is "
+            "no bound: paired differences in each step from a planner to the "
+            "reference, on common episodes. Black lines are 95 % intervals, the dashed "
+            "line is a lower bound. A step may be negative, and another order of steps "
+            f"would give other values, so that no step is a cause.{shown}"
         )
 
     def draw(self, data: RunData) -> Drawing:
-        """Draw each chain from its planner, on top, to the reference: success left,
-        T_total right.
-        """
+        """Draw each chain from its planner (top) to the reference: success, T_total."""
         chains = [rows for _, rows in data.regret.groupby("chain", sort=True)][
             :MAX_CHAINS
         ]
@@ -86,11 +79,11 @@ class Regret(Figure):
             names = _row_names(rows)
             line[0].set_yticks(range(len(names)), names)
             line[0].set_ylim(len(rows) + 1.6, -0.6)
-            about = rows.iloc[0]
+            first = rows.iloc[0]
             title = joined(
-                [risk_name(about["risk"]), *(about[name] for name in differing)]
+                [risk_name(first["risk"]), *(first[name] for name in differing)]
             )
-            line[0].set_title(f"{title}, {about['n_maps']} maps", loc="left")
+            line[0].set_title(f"{title}, {first['n_maps']} maps", loc="left")
         for panel, (label, *_) in zip(axes[-1], _MEASURES.values(), strict=True):
             panel.set_xlabel(label)
             panel.set_xlim(left=0)
@@ -115,9 +108,7 @@ class Regret(Figure):
 
 
 def _row_names(rows: pd.DataFrame) -> list[str]:
-    """Name the first condition of a chain, what changes in each step, and the last
-    condition.
-    """
+    """Name the first condition of a chain, the change of each step, and the last."""
     ends = [("one", rows.iloc[0]), *(("other", row) for _, row in rows.iterrows())]
     named = [
         (planner_name(row[f"{end}_planner"]), row[f"{end}_model"]) for end, row in ends
@@ -134,46 +125,50 @@ def _row_names(rows: pd.DataFrame) -> list[str]:
 
 
 def _draw_chain(panel: Axes, rows: pd.DataFrame, measure: str) -> None:
-    """Bars of the first and the last mean, and between them each difference from where
-    the one before ended.
-    """
+    """Draw bars of the first and last mean, and the differences between them."""
     _, factor, more_is_worse = _MEASURES[measure]
     means = factor * np.array(
         [*rows[f"{measure}_one"], rows[f"{measure}_other"].iloc[-1]]
     )
     looks: dict[str, Any] = {"height": 0.7, "lw": 0}
-    beside = panel.get_yaxis_transform()
-    for place, value in ((0, means[0]), (len(rows) + 1, means[-1])):
-        panel.barh(place, value, color=_ENDS, **looks)
+    axes_and_data = panel.get_yaxis_transform()
+    for height, value in ((0, means[0]), (len(rows) + 1, means[-1])):
+        panel.barh(height, value, color=_ENDS, **looks)
         panel.text(
-            1.02, place, f"{value:.1f}", transform=beside, va="center", size=TEXT
+            1.02,
+            height,
+            f"{value:.1f}",
+            transform=axes_and_data,
+            va="center",
+            size=TEXT,
         )
-    for place, row in enumerate(rows.to_dict("records"), start=1):
+    for height, row in enumerate(rows.to_dict("records"), start=1):
         difference, low, high = (
             factor * row[f"{measure}_{end}"] for end in ("difference", "low", "high")
         )
-        start, end = means[place - 1], means[place]
+        start = means[height - 1]
+        end = means[height]
         better = difference > 0 if more_is_worse else difference < 0
         panel.barh(
-            place, end - start, left=start, color=ORANGE if better else BLUE, **looks
+            height, end - start, left=start, color=ORANGE if better else BLUE, **looks
         )
         from_x, to_x = np.clip(
             [start - high, start - low], 0, None if more_is_worse else factor
         )
-        draw_interval(panel, from_x, to_x, place, "black", 0.9)
+        draw_interval(panel, from_x, to_x, height, "black", 0.9)
         words = signed(-difference)
-        if low == low:  # of few maps there is no interval
+        if low == low:  # few maps have no interval
             words += f" ({signed_interval(-high, -low)})"
         panel.text(
             1.02,
-            place,
+            height,
             words.replace("-", "−"),
-            transform=beside,
+            transform=axes_and_data,
             va="center",
             size=TEXT,
         )
-    for place, value in enumerate(means):
-        panel.plot([value, value], [place - 0.35, place + 1.35], color="0.5", lw=0.5)
+    for height, value in enumerate(means):
+        panel.plot([value, value], [height - 0.35, height + 1.35], color="0.5", lw=0.5)
     bound = factor * rows[f"{measure}_bound"].iloc[0]
     if bound == bound:
         panel.axvline(bound, color=_BOUND, ls="--", lw=1.1)

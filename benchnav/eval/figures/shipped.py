@@ -1,6 +1,4 @@
-"""The figures that every run has, in the order of the report: what it was to show
-first, then how and where.
-"""
+"""The shipped figures, in the order of the report."""
 
 from collections.abc import Sequence
 
@@ -25,17 +23,16 @@ SHIPPED: tuple[type[Figure], ...] = (
 
 
 def figures_of(data: RunData, more: Sequence[Figure] = ()) -> list[Figure]:
-    """List the figures of a run, each with a name of its own.
+    """List the figures of a run, each with a unique name.
 
     Args:
-        data: of the run.
-        more: figures after the shipped ones; one that is of a shipped class is drawn
+        data: data of the run.
+        more: figures after the shipped ones; one of a shipped class is drawn only
             once.
 
     Returns:
-        Those whose needs are met.
+        Figures whose needs the run meets.
     """
-    figures = [cls() for cls in SHIPPED] + [
-        figure for figure in more if type(figure) not in SHIPPED
-    ]
+    figures: list[Figure] = [cls() for cls in SHIPPED]
+    figures += [figure for figure in more if type(figure) not in SHIPPED]
     return applicable(figures, data)

@@ -20,26 +20,20 @@ _POINT: dict[str, Any] = {"marker": "o", "ms": 4, "ls": "none", "color": "0.2"}
 
 
 class Success(Figure):
-    """The success rate of every condition with its 95 % interval, a panel a block of
-    the run.
-    """
+    """Success rate of each condition with its 95 % interval, a panel a block."""
 
     name = "success"
     text = (
-        "Success rates with 95 % intervals. Filled points are not significantly worse "
-        "than the best of their "
-        "panel; all are open where nothing is significantly worse. Grey planners are "
-        "blind: the dashed line and "
-        "the band carry their rate and its interval through the panel."
+        "Success rates (points) with 95 % intervals (lines). Filled points are not "
+        "significantly worse than the best of their panel; all are open if nothing is "
+        "significantly worse. Grey planners are blind: the dashed line and the grey "
+        "band extend their rate and its 95 % interval through the panel."
     )
 
     def draw(self, data: RunData) -> Drawing:
-        """Draw a point a condition; a blind planner is a line through its panel, the
-        baseline of all others.
-        """
-        is_blind = (
-            data.summary["model"] == NOT_USED
-        )  # the clairvoyant has a model, and no risk
+        """Draw a point a condition, and a blind planner as a line through its panel."""
+        # The clairvoyant has a model and no risk setting, so risk cannot decide.
+        is_blind = data.summary["model"] == NOT_USED
         is_marked = (
             data.summary.get("best_marked", pd.Series(False, data.summary.index))
             .fillna(False)
@@ -76,9 +70,9 @@ class Success(Figure):
                 blind = row["model"] == NOT_USED
                 colour = BLIND if blind else colours[row["planner"]]
                 face = colour if row.get("best_marked") else "white"
-                rate, low, high = (
-                    100 * row[f"success_{name}"] for name in ("rate", "low", "high")
-                )
+                rate = 100 * row["success_rate"]
+                low = 100 * row["success_low"]
+                high = 100 * row["success_high"]
                 draw_interval(panel, low, high, row["height"], colour)
                 panel.plot(rate, row["height"], "o", color=colour, ms=4, mfc=face)
                 if blind:

@@ -1,5 +1,6 @@
-"""Episodes side by side: terrain, the λ̂ that was planned on, and the λ field (after
-the paper's Fig. 2).
+"""Episodes side by side: terrain, λ̂ of the planner, and the λ field.
+
+The layout follows Fig. 2 of the paper.
 """
 
 import textwrap
@@ -28,7 +29,7 @@ _LETTER_IN = 0.048
 
 
 class Trajectories(Figure):
-    """At most four conditions on the map on which outcomes differ most."""
+    """Up to four conditions on the map where outcomes differ most."""
 
     name = "trajectories"
     trim = True
@@ -45,28 +46,27 @@ class Trajectories(Figure):
     def caption(self, data: RunData) -> str:
         """Return which map is shown, and how conditions were chosen."""
         shown = self._shown(data)
-        pairs = {(own.about["scenario"], own.about["map"]) for own in shown}
+        pairs = {
+            (recording.about["scenario"], recording.about["map"]) for recording in shown
+        }
         where = " on {}, map {}".format(*pairs.pop()) if len(pairs) == 1 else ""
-        what = (
-            "Plans and driven paths"
-            if any(own.own_plans for own in shown)
-            else "Driven paths"
-        )
+        subject = "Driven paths"
+        if any(recording.own_plans for recording in shown):
+            subject = "Plans and driven paths"
         caption = (
-            f"{what}{where}, over the terrain and over the λ̂ that the planner "
+            f"{subject}{where}, over the terrain and over the λ̂ that the planner "
             "was given."
         )
-        if any(own.field is not None for own in shown):
+        if any(recording.field is not None for recording in shown):
             caption += " Below: the whole driven path over the λ field."
         if data.on_one_map and data.driven:
             caption += chosen_in_words(len(shown), len(data.driven.rows))
         return caption
 
     def draw(self, data: RunData) -> Drawing:
-        """Draw the terrain above with what was planned, and the map planned on below.
+        """Draw the terrain with the plan above, and the planner's map below.
 
-        Where λ did not change during an episode, a third row shows it, with the whole
-        driven path.
+        If λ did not change during an episode, a third row shows it with the driven path.
         """
         return draw_trajectories(self._shown(data))
 
@@ -86,7 +86,7 @@ def draw_trajectories(recordings: Sequence[Recording]) -> Drawing:
         figsize=(width, (layers * tall + 0.2) * lines + 0.8), layout="compressed"
     )
     stacks = stack_panels(figure, len(recordings), across, layers)
-    for place, (recording, heading, stack) in enumerate(
+    for index, (recording, heading, stack) in enumerate(
         zip(recordings, _headings(recordings), stacks, strict=True)
     ):
         _draw_terrain(stack[0], recording, heading)
@@ -98,10 +98,10 @@ def draw_trajectories(recordings: Sequence[Recording]) -> Drawing:
         for panel in stack:
             maps.frame_map(panel)
             panel.tick_params(
-                labelleft=place % across == 0, labelbottom=panel is stack[-1]
+                labelleft=index % across == 0, labelbottom=panel is stack[-1]
             )
-            panel.set_ylabel("y [m]" if place % across == 0 else "")
-            # Broken where it is wider than the panel.
+            panel.set_ylabel("y [m]" if index % across == 0 else "")
+            # Titles are wrapped to the width of the panel.
             title = (
                 textwrap.fill(line, int(panel_in / _LETTER_IN))
                 for line in panel.get_title().splitlines()
@@ -115,23 +115,24 @@ def draw_trajectories(recordings: Sequence[Recording]) -> Drawing:
 
 
 def _headings(recordings: Sequence[Recording]) -> list[str]:
-    """Name each recording by what differs, and say when it is shown and how it ended."""
-    names = episode_names([own.about for own in recordings])
-    places = [
-        f", {own.about['scenario']}, map {own.about['map']}" for own in recordings
+    """Return titles: labels that differ, time shown, and outcome."""
+    names = episode_names([recording.about for recording in recordings])
+    map_names = [
+        f", {recording.about['scenario']}, map {recording.about['map']}"
+        for recording in recordings
     ]
     headings = []
-    for own, name, place in zip(recordings, names, places, strict=True):
-        shown = f"{own.outcome} after {own.end_s:g} s"
-        if not moment.has_ended(own, own.now):
-            shown = f"t = {own.now * own.dt_s:g} s; {shown}"
-        where = place if len(set(places)) > 1 else ""
+    for recording, name, map_name in zip(recordings, names, map_names, strict=True):
+        shown = f"{recording.outcome} after {recording.end_s:g} s"
+        if not moment.has_ended(recording, recording.now):
+            shown = f"t = {recording.now * recording.dt_s:g} s; {shown}"
+        where = map_name if len(set(map_names)) > 1 else ""
         headings.append(f"{name}{where}\n{shown}")
     return headings
 
 
 def _draw_terrain(panel: Axes, recording: Recording, title: str) -> None:
-    """Draw the terrain, and the path driven by that moment, coloured by the observed λ."""
+    """Draw the terrain, and the driven path so far in colours of the observed λ."""
     maps.show_map(panel, np.moveaxis(recording.rgb, 0, -1), recording.grid.extent_m)
     if recording.field is not None and recording.soft.any():
         for lines in (outline, maps.hatching):
@@ -148,9 +149,7 @@ def _draw_terrain(panel: Axes, recording: Recording, title: str) -> None:
 
 
 def _draw_predicted(panel: Axes, recording: Recording) -> None:
-    """Draw the λ̂ that the planner had by that moment, and the path in black, since the
-    map has the colours of λ.
-    """
+    """Draw the planner's current λ̂, and the path in black over the colours of λ."""
     moment.show_known(panel, recording, recording.now)
     moment.draw_plan(panel, recording, recording.now)
     words = "driven; above in the colour of the observed λ"
@@ -159,7 +158,7 @@ def _draw_predicted(panel: Axes, recording: Recording) -> None:
 
 
 def _draw_field(panel: Axes, recording: Recording) -> None:
-    """Draw the λ field, and the whole driven path over it."""
+    """Draw the λ field and the driven path."""
     moment.show_truth(panel, recording)
     maps.draw_drive(panel, moment.drive_at(recording, len(recording.traversability)))
     panel.set_title("whole path, over the λ field")

@@ -1,3 +1,1 @@
-"""The run folder: its tables, its steps, where its rows come from, and which share of a
-run it holds.
-"""
+"""The run folder: tables, steps, provenance, and shard."""

@@ -1,9 +1,8 @@
-"""Checksums of what is made of a run: reports, figures, playback, the ground of driven
-paths, and tracebacks.
+"""Checksums of files derived from a run: reports, figures, playback, map, tracebacks.
 
-They stand in `SHA256SUMS` of the run folder, which `sha256sum --check` reads too.
-`run.json`, units and steps hold digests of their own, and `run.json` that of the table
-of episodes.
+They are in `SHA256SUMS` of the run folder, which `sha256sum --check` also reads.
+`run.json`, units and steps contain their own digests, and `run.json` the digest of the
+table of episodes.
 """
 
 import re
@@ -19,10 +18,9 @@ _LINE = re.compile(r"([0-9a-f]{64})  (.+)")
 
 
 def read_checksums(folder: Path) -> dict[str, str]:
-    """Return the SHA-256 of files of a run folder by their path in it; empty if none
-    were noted.
+    """Return the recorded SHA-256 of files of a run folder, by path in it.
 
-    A line that is no checksum has its whole text for a path, and no SHA-256.
+    A line that is no checksum is returned as a path with an empty SHA-256.
     """
     path = folder / SUMS
     text = path.read_text(errors="replace") if path.is_file() else ""
@@ -33,32 +31,29 @@ def read_checksums(folder: Path) -> dict[str, str]:
 
 
 def note_checksums(folder: Path, files: Iterable[Path]) -> None:
-    """Note the SHA-256 of files that were written into a run folder; elsewhere nothing
-    is noted.
+    """Record the SHA-256 of files in a run folder; do nothing in other folders.
 
     Args:
-        folder: where they were written.
-        files: their paths, below `folder`.
+        folder: folder of the files.
+        files: paths below `folder`.
     """
     if not (folder / RUN).is_file():
         return
-    known = read_checksums(folder)
-    known |= {
+    digests = read_checksums(folder)
+    digests |= {
         path.relative_to(folder).as_posix(): digest_of_path(path) for path in files
     }
     lines = [
-        f"{known[name]}  {name}\n"
-        for name in sorted(known)
-        if known[name] and (folder / name).is_file()
+        f"{digests[name]}  {name}\n"
+        for name in sorted(digests)
+        if digests[name] and (folder / name).is_file()
     ]
     if lines or (folder / SUMS).exists():
         write_text(folder / SUMS, "".join(lines))
 
 
 def is_as_noted(folder: Path, file: Path) -> bool:
-    """Return whether a file of a run folder has the SHA-256 that was noted, or none
-    was.
-    """
+    """Return whether a file of a run folder agrees with its recorded SHA-256, if any."""
     if not file.is_relative_to(folder):
         return True
     digest = read_checksums(folder).get(file.relative_to(folder).as_posix())

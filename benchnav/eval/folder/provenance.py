@@ -1,12 +1,12 @@
-"""Where rows come from: the code and the maps that made them, and what `run.json` says
-of machine and commands.
+"""Provenance of rows: code, maps, machine and commands.
 
-A unit of work is known by a key: the digest of its condition, seed, realisation, maps
-and code. Code is all of this package that a unit of the condition imports (see
-`package_modules`), the parts' own code and files, versions of what is installed, and
-the arithmetic of the processor.
+A unit of work is identified by a key: the digest of its condition, seed, realisation,
+maps and code. Code comprises all modules of this package that a unit of the condition
+imports (see `package_modules`), the parts' own code and files, versions of installed
+packages, and the arithmetic of the processor.
 """
 
+import itertools
 import json
 import os
 import platform
@@ -41,60 +41,52 @@ from benchnav.planning.planners.compilation import can_compile
 
 PACKAGES = ("torch", "numpy", "scipy", "gpytorch", "segmentation-models-pytorch")
 
-# Runs a unit: what it imports is what rows depend on.
+# The module that runs a unit; rows depend on its imports.
 _UNIT = "benchnav.eval.run.unit"
-_MOST_NAMED = 3
+_MAX_NAMED = 3
 
 Code = dict[str, dict[str, Any]]
-METRICS = "metrics"  # the group of code that rows with further metrics have
-# beside the groups of code: what parts touched, which is known only when they have run
+METRICS = "metrics"  # group of code of rows with further metrics
+# Next to the groups of code: what parts read, known only after they have run.
 TOUCHED = "touched"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Origin:
-    """What makes the rows of a unit, beside its condition, seed and realisation.
+    """Inputs of a unit's rows in addition to its condition, seed and realisation.
 
     Args:
         code: `environment` (versions, processor, device, time limit of planners),
-            `modules` of this package with their digests, `parts`, the digests of code
-            and files that are not of it, and, if rows have further metrics, `metrics`,
-            see `describe_metrics`.
-        maps: digest of what the split's maps mean, and that of each map.
+            `modules` of this package with their digests, `parts`, the digests of other
+            code and files, and, if rows have further metrics, `metrics`, see
+            `describe_metrics`.
+        maps: digest of the split's properties, and of each map.
     """
 
     code: Code
     maps: tuple[str, ...]
 
     def key(self, unit: Unit) -> str:
-        """The key of a unit that is made so, 16 hexadecimal digits."""
-        return text_digest(
-            [
-                unit.condition.id,
-                unit.seed,
-                unit.realisation,
-                unit.maps,
-                self.maps,
-                self.code,
-            ]
-        )[:16]
+        """Return the key of a unit with this origin, 16 hexadecimal digits."""
+        drawn = [unit.condition.id, unit.seed, unit.realisation, unit.maps]
+        return text_digest([*drawn, self.maps, self.code])[:16]
 
 
 def code_digest(code: Code) -> str:
-    """Digest of code, 12 hexadecimal digits."""
+    """Return the digest of code, 12 hexadecimal digits."""
     return text_digest(code)[:12]
 
 
 class Origins:
-    """Looks origins of units up, as they are now; what was looked up once stays.
+    """Current origins of units, cached.
 
     Args:
         planner_limit_s: time limit of each call of a planner; 0 for none.
-        device: where all is computed, "cpu" or "cuda".
+        device: device of all computation, "cpu" or "cuda".
     """
 
     def __init__(self, planner_limit_s: float, device: str) -> None:
-        """Has looked nothing up yet."""
+        """Start with an empty cache."""
         self._environment = {
             **{name: version(name) for name in PACKAGES},
             "python": platform.python_version(),
@@ -104,44 +96,42 @@ class Origins:
             "planner_limit_s": planner_limit_s,
         }
         self._codes: dict[str, Code] = {}
-        self._maps: dict[
-            tuple[Any, ...], tuple[str, ...]
-        ] = {}  # a digest of what they mean, and one of each
+        self._maps: dict[tuple[Any, ...], tuple[str, ...]] = {}  # as in `Origin.maps`
 
     def of(self, unit: Unit) -> Origin:
-        """The origin of a unit that is made now."""
+        """Return the current origin of a unit."""
         condition = unit.condition
-        known_by = f"{condition.id} {unit.metrics}"
-        if known_by not in self._codes:
+        code_key = f"{condition.id} {unit.metrics}"
+        if code_key not in self._codes:
             metrics = {METRICS: describe_metrics(unit.metrics)} if unit.metrics else {}
-            self._codes[known_by] = {
+            self._codes[code_key] = {
                 "environment": self._environment,
                 **describe_parts(condition),
                 **metrics,
             }
-        place = condition.data, condition.split, unit.maps
-        if place not in self._maps:
+        maps_key = condition.data, condition.split, unit.maps
+        if maps_key not in self._maps:
             dataset = condition.dataset
             digests = map_digests(dataset, condition.split, unit.maps)
-            self._maps[place] = (dataset.about_digest(condition.split), *digests)
-        return Origin(code=self._codes[known_by], maps=self._maps[place])
+            self._maps[maps_key] = (dataset.about_digest(condition.split), *digests)
+        return Origin(code=self._codes[code_key], maps=self._maps[maps_key])
 
 
 def describe_parts(condition: Condition) -> Code:
-    """The `modules` of this package that a condition's units import, and the digests of
-    its other `parts`.
-    """
-    modules, parts = [_UNIT], {}
+    """Return the imported `modules` of this package, and digests of other `parts`."""
+    modules = [_UNIT]
+    parts: dict[str, Any] = {}
     for kind, part in condition.parts.items():
-        name, found = f"{kind} {part.part}", part.found
+        name = f"{kind} {part.part}"
+        target = part.found
         folder = part.folder if isinstance(part, ModelPart) else None
         if folder is not None:
             parts[name] = text_digest(digests_of(folder))
-        if found.shipped:
-            modules.append(found.target.__module__)
+        if target.shipped:
+            modules.append(target.target.__module__)
         else:
             parts[f"class of {name}" if folder else name] = text_digest(
-                [found.origin, found.digest]
+                [target.origin, target.digest]
             )
         files = registry.option_files(part)
         parts |= {f"{text} of {name}": digest for text, digest in files.items()}
@@ -154,61 +144,58 @@ def describe_metrics(metrics: Iterable[Part]) -> dict[str, Any]:
     """Return part, options and digest of each metric's code and files, by its column."""
     described = {}
     for part in metrics:
-        found = part.found
-        known = (
-            package_modules([found.target.__module__])
-            if found.shipped
-            else [found.origin, found.digest]
+        target = part.found
+        sources = (
+            package_modules([target.target.__module__])
+            if target.shipped
+            else [target.origin, target.digest]
         )
         files = registry.option_files(part)
         described[part.object.column] = {
             "part": part.part,
             "options": dict(part.options),
-            "digest": text_digest([known, files]),
+            "digest": text_digest([sources, files]),
         }
     return described
 
 
-def lacks_metrics(code: Mapping[str, Any], wanted: Code) -> list[str]:
-    """Return the columns of further metrics that rows of some code do not have.
+def lacks_metrics(code: Mapping[str, Any], expected: Code) -> list[str]:
+    """Return the columns of further metrics that rows of some code lack.
 
     Args:
-        code: that made the rows.
-        wanted: of rows that have them.
+        code: code of the rows.
+        expected: code of rows that have the metrics.
     """
     return [
         column
-        for column in wanted.get(METRICS, {})
+        for column in expected.get(METRICS, {})
         if column not in code.get(METRICS, {})
     ]
 
 
 def touches(condition: Condition, metrics: Iterable[Part] = ()) -> Touches:
-    """Return what the user's own parts of a unit have touched in this process; see
-    `benchnav.core.touched`.
-    """
-    known = [part.found for part in (*metrics, *condition.parts.values())]
-    return touches_of(found.target for found in known if not found.shipped)
+    """Return what custom parts read in this process; see `benchnav.core.touched`."""
+    parts_found = [part.found for part in (*metrics, *condition.parts.values())]
+    return touches_of(found.target for found in parts_found if not found.shipped)
 
 
 def describe_datasets(conditions: Conditions) -> dict[str, Any]:
-    """The maps used: by dataset its id and, by split, a digest of each map and one of
-    what they mean.
-    """
+    """Return the id and the digests by split of each dataset's maps and properties."""
     described: dict[str, Any] = {}
     for condition, extent in conditions.values():
-        dataset, split = condition.dataset, condition.split
-        about = described.setdefault(
+        dataset = condition.dataset
+        split = condition.split
+        entry = described.setdefault(
             condition.data, {"id": dataset.id, "maps": {}, "about": {}}
         )
-        if extent.maps > len(about["maps"].get(split, ())):
-            about["maps"][split] = map_digests(dataset, split, range(extent.maps))
-            about["about"][split] = dataset.about_digest(split)
+        if extent.maps > len(entry["maps"].get(split, ())):
+            entry["maps"][split] = map_digests(dataset, split, range(extent.maps))
+            entry["about"][split] = dataset.about_digest(split)
     return described
 
 
 def map_digests(dataset: TerrainDataset, split: str, maps: Sequence[int]) -> list[str]:
-    """Digests of some maps of a split, 16 hexadecimal digits each."""
+    """Return digests of some maps of a split, 16 hexadecimal digits each."""
     return [
         digest_of([entry.tobytes()])[:16]
         for entry in dataset.entry_digests(split, maps)
@@ -216,83 +203,76 @@ def map_digests(dataset: TerrainDataset, split: str, maps: Sequence[int]) -> lis
 
 
 def code_differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """Names what two codes both have and what is not the same, with the values where
-    they are short.
+    """Describe entries that two codes both have and that differ.
 
     Args:
-        earlier: as `Origin.code`, perhaps with what parts touched as `TOUCHED`.
-        now: as well.
+        earlier: as `Origin.code`, perhaps with `TOUCHED`.
+        now: likewise.
     """
-    differing = {
-        group: [
+    differing: dict[str, list[str]] = {}
+    for group in ("modules", "environment", "parts", METRICS):
+        values = now.get(group, {})
+        differing[group] = [
             name
             for name, value in earlier.get(group, {}).items()
-            if now.get(group, {}).get(name, value) != value
+            if values.get(name, value) != value
         ]
-        for group in ("modules", "environment", "parts", METRICS)
-    }
     modules = differing["modules"]
-    more = (
-        f" and {len(modules) - _MOST_NAMED} more of its modules"
-        if len(modules) > _MOST_NAMED
-        else ""
-    )
-    return [
-        *([f"{', '.join(modules[:_MOST_NAMED])}{more}"] if modules else []),
-        *(
-            f"{n} ({earlier['environment'][n]} to {now['environment'][n]})"
-            for n in differing["environment"]
-        ),
-        *differing["parts"],
-        *(f"metric {column}" for column in differing[METRICS]),
-        *unlike(earlier.get(TOUCHED, {}), now.get(TOUCHED, {})),
-    ]
+    more = ""
+    if len(modules) > _MAX_NAMED:
+        more = f" and {len(modules) - _MAX_NAMED} more of its modules"
+    lines = []
+    if modules:
+        lines.append(f"{', '.join(modules[:_MAX_NAMED])}{more}")
+    for name in differing["environment"]:
+        before = earlier["environment"][name]
+        lines.append(f"{name} ({before} to {now['environment'][name]})")
+    lines += differing["parts"]
+    lines += [f"metric {column}" for column in differing[METRICS]]
+    lines += unlike(earlier.get(TOUCHED, {}), now.get(TOUCHED, {}))
+    return lines
 
 
 def dataset_differences(
     earlier: Mapping[str, Any], now: Mapping[str, Any]
 ) -> list[str]:
-    """Names what of the maps of two runs is not the same; what only one has is no
-    difference.
+    """Describe maps that two runs both have and that differ.
 
     Args:
         earlier: from `describe_datasets`.
-        now: as well.
+        now: likewise.
     """
     changed = []
-    for data, about in earlier.items():
-        other = now.get(data, {"maps": {}, "about": {}})
-        for split, digests in about["maps"].items():
-            pairs = zip(digests, other["maps"].get(split, digests), strict=False)
+    for data, entry in earlier.items():
+        now_entry = now.get(data, {"maps": {}, "about": {}})
+        for split, digests in entry["maps"].items():
+            pairs = zip(digests, now_entry["maps"].get(split, digests), strict=False)
             if any(before != after for before, after in pairs):
                 changed.append(f"maps of {data} {split}")
-            if (
-                other["about"].get(split, about["about"][split])
-                != about["about"][split]
-            ):
+            meaning = entry["about"][split]
+            if now_entry["about"].get(split, meaning) != meaning:
                 changed.append(f"{MEANING} of {data} {split}")
     return changed
 
 
 def describe_machine() -> dict[str, Any]:
-    """The machine, for people."""
+    """Return processor, cores and host, for readers."""
     return {"processor": _processor(), "cores": os.cpu_count(), "host": platform.node()}
 
 
 def extend_history(
     earlier: Iterable[Mapping[str, Any]], suite: Mapping[str, Any]
 ) -> list[Mapping[str, Any]]:
-    """What was asked of a run: command, suite, date, machine, version and git commit of
-    this package, an entry each.
+    """Append an entry for this command to a history, unless it is repeated.
 
-    The commit ends in `+` where files differ from it, and is empty where the package is
-    in no repository. A command that is given again at the same place adds no entry.
+    An entry has command, suite, date, machine, version and git commit of this package.
+    The commit ends in `+` if files differ from it, and is empty without a repository.
 
     Args:
-        earlier: entries that are there.
-        suite: of this process's command, as it was written.
+        earlier: existing entries.
+        suite: suite of this command, as it was written.
     """
-    asked = {
+    request = {
         "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
         "suite": dict(suite),
         **describe_machine(),
@@ -301,31 +281,28 @@ def extend_history(
     }
     now = {
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        **json.loads(json.dumps(asked)),
+        **json.loads(json.dumps(request)),
     }
-    again = any({**entry, "date": now["date"]} == now for entry in earlier)
-    return [*earlier, *([] if again else [now])]
+    is_repeated = any({**entry, "date": now["date"]} == now for entry in earlier)
+    return [*earlier, *([] if is_repeated else [now])]
 
 
 def join(*lists: Iterable[Any]) -> list[Any]:
-    """All entries of lists of plain data, each once, in order."""
-    return list(
-        {
-            json.dumps(item, sort_keys=True): item
-            for entries in lists
-            for item in entries
-        }.values()
-    )
+    """Concatenate lists of plain data, without repetitions."""
+    unique = {}
+    for item in itertools.chain.from_iterable(lists):
+        unique[json.dumps(item, sort_keys=True)] = item
+    return list(unique.values())
 
 
-def command_lines(about: Mapping[str, Any]) -> list[str]:
-    """The commands that made a run, of its `run.json`, each once."""
-    return list(dict.fromkeys(entry["command"] for entry in about["history"]))
+def command_lines(manifest: Mapping[str, Any]) -> list[str]:
+    """Return the commands of a run from its `run.json`, without repetitions."""
+    return list(dict.fromkeys(entry["command"] for entry in manifest["history"]))
 
 
 @cache
 def _processor() -> str:
-    """The processor's name, which Python itself does not know on Linux."""
+    """Return the processor's name, which Python does not provide on Linux."""
     cpuinfo = Path("/proc/cpuinfo")
     text = cpuinfo.read_text(errors="replace") if cpuinfo.is_file() else ""
     named = re.search(r"^model name\s*: (.+)$", text, re.MULTILINE)
@@ -341,11 +318,9 @@ def _commit() -> str:
         ).stdout.strip()
 
     try:
-        git(
-            "ls-files", "--error-unmatch", "__init__.py"
-        )  # else the repository is another project's
-        return git("rev-parse", "HEAD") + (
-            "+" if git("status", "--porcelain", "--", ".") else ""
-        )
+        # Fails if the repository is another project's.
+        git("ls-files", "--error-unmatch", "__init__.py")
+        changed = git("status", "--porcelain", "--", ".")
+        return git("rev-parse", "HEAD") + ("+" if changed else "")
     except (OSError, subprocess.SubprocessError):
         return ""

@@ -1,8 +1,7 @@
-"""The rows of a run: of a finished one its sealed table, of one that is not the units
-that are finished by now.
+"""Rows of a run: its table if it is finished, else its finished units.
 
-Nothing is locked and nothing is written, so that a run can be read while another
-process works on it: each unit is one file that is there as a whole or not at all.
+Nothing is locked or written, so that a run can be read while another process works on
+it: each unit is one file, written atomically.
 """
 
 from collections.abc import Mapping
@@ -31,11 +30,10 @@ _NAMED = 3
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Results:
-    """What a run holds.
+    """Rows of a run, and how many of its units are finished.
 
     Args:
-        run: the run; of one that is not finished `about` has the `codes` of the units
-            that are.
+        run: the run; if it is not finished, `about` has the `codes` of finished units.
         episodes: a row an episode.
         finished: number of units with rows.
         units: number of units of the run.
@@ -52,43 +50,34 @@ class Results:
 
     @property
     def mark(self) -> str:
-        """What each table and figure of a run that is not finished says; empty for one
-        that is.
-        """
-        return (
-            f"partial: {self.finished} of {self.units} units" if self.is_partial else ""
-        )
+        """Mark of tables and figures of a run that is not finished; else empty."""
+        if not self.is_partial:
+            return ""
+        return f"partial: {self.finished} of {self.units} units"
 
     @property
     def conditions(self) -> dict[str, Any]:
-        """What `run.json` knows of the conditions that have rows, by id, in the order
-        of the run.
-        """
+        """Entries of `run.json` of conditions that have rows, by id, in its order."""
         shown = set(self.episodes["condition"])
         return {
             i: entry for i, entry in self.run.about["conditions"].items() if i in shown
         }
 
     def notes(self) -> list[str]:
-        """What readers of partial results should know, a line each; none where they are
-        whole.
-        """
+        """Return notes for readers of partial results; empty if the run is finished."""
         if not self.is_partial:
             return []
         planned = sum(extent.episodes for _, extent in self.run.conditions.values())
         lines = [
             f"{self.mark}, {len(self.episodes)} of {planned} episodes. Conditions may "
             "have different episodes: rates "
-            "do not compare them. Intervals and p-values hold for a run that is "
-            "whole, not for one that is looked at "
-            "as it grows"
+            "do not compare them. Intervals and p-values hold for a finished run, not "
+            "for one that is read repeatedly as it grows"
         ]
         if self.without:
-            more = (
-                f" and {len(self.without) - _NAMED} more"
-                if len(self.without) > _NAMED
-                else ""
-            )
+            more = ""
+            if len(self.without) > _NAMED:
+                more = f" and {len(self.without) - _NAMED} more"
             lines.append(
                 f"{self.mark}, no episode yet: {'; '.join(self.without[:_NAMED])}{more}"
             )
@@ -102,11 +91,11 @@ class Results:
 
 
 def read_results(folder: Path, partial: bool = False) -> Results:
-    """Reads the rows of a run.
+    """Read the rows of a run.
 
     Args:
         folder: a run folder.
-        partial: also of a run that is not finished, or of a shard.
+        partial: whether to accept a run that is not finished, or a shard.
 
     Raises:
         ConfigError: If the folder is no run folder, its run is not finished and
@@ -115,17 +104,20 @@ def read_results(folder: Path, partial: bool = False) -> Results:
     run = open_run(folder)
     if (folder / EPISODES).exists() or not partial:
         return Results(run=run, episodes=read_table(folder, EPISODES))
-    every = newest_units(run)
-    known = [(unit, one) for unit, one in every if one is not None]
-    there = [one for _, one in known]
-    if not there:
+    all_units = newest_units(run)
+    finished_units = [
+        (unit, making) for unit, making in all_units if making is not None
+    ]
+    finished = [making for _, making in finished_units]
+    if not finished:
         raise ConfigError(
             f"Expected a run with a finished unit, got {folder} with none of "
-            f"{len(every)}. Wait for the first, or give "
+            f"{len(all_units)}. Wait for the first, or give "
             "its `benchnav-eval run` command."
         )
     episodes = pd.concat(
-        [labelled_rows(unit, one) for unit, one in known], ignore_index=True
+        [labelled_rows(unit, making) for unit, making in finished_units],
+        ignore_index=True,
     )
     shown = set(episodes["condition"])
     names = condition_names([condition for condition, _ in run.conditions.values()])
@@ -133,36 +125,40 @@ def read_results(folder: Path, partial: bool = False) -> Results:
         name for i, name in zip(run.conditions, names, strict=True) if i not in shown
     ]
     return Results(
-        run=replace(run, about={**run.about, "codes": _codes(there), "reused": ""}),
+        run=replace(run, about={**run.about, "codes": _codes(finished), "reused": ""}),
         episodes=episodes,
-        finished=len(there),
-        units=len(every),
+        finished=len(finished),
+        units=len(all_units),
         without=tuple(without),
         is_partial=True,
     )
 
 
 def newest_units(run: Run) -> list[tuple[Unit, Finished | None]]:
-    """The units of a run in the order of its table, each with its newest making; None
-    where it is not finished.
-    """
-    every = in_table_order(units(run.conditions), run.conditions)
-    return [(unit, next(iter(find_units(run.folder, unit)), None)) for unit in every]
+    """Return the units of a run in the order of its table, with their newest making."""
+    all_units = in_table_order(units(run.conditions), run.conditions)
+    return [
+        (unit, next(iter(find_units(run.folder, unit)), None)) for unit in all_units
+    ]
 
 
 def code_of(run: Run, digest: str) -> Mapping[str, Any]:
-    """The code that made rows, by what the column `code` says.
+    """Return the code of rows by its digest in the column `code`.
 
     Args:
-        run: finished or not.
-        digest: of the code.
+        run: a run, finished or not.
+        digest: digest of the code.
     """
     codes = run.about.get("codes", {})
     if digest not in codes:  # of a unit that no table has yet
-        codes = _codes([one for _, one in newest_units(run) if one is not None])
+        codes = _codes(
+            [making for _, making in newest_units(run) if making is not None]
+        )
     code: Mapping[str, Any] = codes[digest]
     return code
 
 
 def _codes(finished: list[Finished]) -> dict[str, Any]:
-    return {code_digest(one.about["code"]): one.about["code"] for one in finished}
+    return {
+        code_digest(making.about["code"]): making.about["code"] for making in finished
+    }

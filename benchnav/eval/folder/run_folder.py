@@ -1,11 +1,11 @@
-"""Run folders, format version 6: what lies where, and how it is read.
+"""Run folders, format version 6: layout, reading and writing.
 
-A run folder holds `run.json` (conditions, and where everything came from), `units/`
-(what is finished: one Parquet file a unit, by condition and key, with rows and, in its
-metadata, what else is known of it), `steps/`, `playback/`, and, when all is done,
-`episodes.parquet`, `errors.txt` where a planner, model, sensor or belief failed, and
-the report. Every file is written under another name first. `run.json` is sealed, and
-holds the digests of the run's tables, so that an edit of either is found.
+A run folder contains `run.json` (conditions and provenance), `units/` (one Parquet file
+for each finished unit, by condition and key, with rows and metadata), `steps/`,
+`playback/` and, when the run is finished, `episodes.parquet`, `errors.txt` if a
+planner, model, sensor or belief failed, and the report. All files are written
+atomically. `run.json` contains its own digest and those of the run's tables, so that an
+edit of either is detected.
 """
 
 import json
@@ -43,20 +43,23 @@ from benchnav.eval.folder.sealed import (
     with_metadata,
 )
 
-FORMAT, FORMAT_VERSION = "benchnav-run", 6
-RUN, EPISODES, ERRORS = "run.json", "episodes.parquet", "errors.txt"
+FORMAT = "benchnav-run"
+FORMAT_VERSION = 6
+RUN = "run.json"
+EPISODES = "episodes.parquet"
+ERRORS = "errors.txt"
 KEYS = ["condition", *DRAW]  # of a row
 
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """A run folder that was found.
+    """An opened run folder.
 
     Args:
-        folder: where.
-        about: all of `run.json`.
-        conditions: by id, with how often each is run.
-        shard: which shard of the run the folder holds; None where it holds all.
+        folder: path of the folder.
+        about: contents of `run.json`.
+        conditions: conditions by id, each with its extent.
+        shard: shard of the run that the folder contains; None for a whole run.
     """
 
     folder: Path
@@ -66,10 +69,10 @@ class Run:
 
 
 def open_run(folder: Path) -> Run:
-    """Reads what a run folder is about.
+    """Open a run folder.
 
     Raises:
-        ConfigError: the folder is no run folder, or of another format version.
+        ConfigError: If the folder is no run folder, or has another format version.
     """
     if not (folder / RUN).is_file():
         raise ConfigError(
@@ -82,16 +85,15 @@ def open_run(folder: Path) -> Run:
         text = (folder / RUN).read_text()
         version = _format_version(json.loads(text))
         if version == FORMAT_VERSION:
-            about = unseal(text)
-            conditions = {
-                i: (
-                    condition_from(entry),
-                    Extent(draws=tuple(tuple(draw) for draw in entry["draws"])),
-                )
-                for i, entry in about["conditions"].items()
-            }
-            shard = Shard(**about["shard"]) if "shard" in about else None
-            return Run(folder=folder, about=about, conditions=conditions, shard=shard)
+            manifest = unseal(text)
+            conditions = {}
+            for i, entry in manifest["conditions"].items():
+                draws = tuple(tuple(draw) for draw in entry["draws"])
+                conditions[i] = condition_from(entry), Extent(draws=draws)
+            shard = Shard(**manifest["shard"]) if "shard" in manifest else None
+            return Run(
+                folder=folder, about=manifest, conditions=conditions, shard=shard
+            )
     remedy = "Read it with a newer benchnav: pip install --upgrade benchnav"
     if version < FORMAT_VERSION:
         remedy = "Run its suite again, or read it with benchnav 1.3"
@@ -101,37 +103,39 @@ def open_run(folder: Path) -> Run:
     )
 
 
-def _format_version(about: Any) -> int:
+def _format_version(manifest: Any) -> int:
     """Return the format version of `run.json`."""
-    if not isinstance(about, dict) or about.get("format") != FORMAT:
+    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise DamageError("it does not say that it is a run")
-    return int(about["format_version"])
+    return int(manifest["format_version"])
 
 
 def is_taken(folder: Path) -> bool:
-    """Whether a place holds anything, so that no new run can be begun there."""
+    """Return whether a path is not an empty folder, so that no run can begin there."""
     return folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
 
 
-def write_run(folder: Path, about: Mapping[str, Any]) -> None:
-    """Writes `run.json`."""
-    write_text(folder / RUN, seal(about))
+def write_run(folder: Path, manifest: Mapping[str, Any]) -> None:
+    """Write `run.json`."""
+    write_text(folder / RUN, seal(manifest))
 
 
-def caveats(about: Mapping[str, Any]) -> list[str]:
-    """What readers of a run's tables should know: its warnings, and the combinations
-    that it left out.
+def caveats(manifest: Mapping[str, Any]) -> list[str]:
+    """Return warnings and left-out combinations, for readers of a run's tables.
 
     Args:
-        about: of its `run.json` at least `warnings` and `dropped`.
+        manifest: contents of `run.json`, at least `warnings` and `dropped`.
     """
-    left_out = [f"left out: {_in_words(entry)}" for entry in about["dropped"]]
-    warnings = [*about["warnings"], *([about["reused"]] if about.get("reused") else [])]
+    left_out = [f"left out: {_in_words(entry)}" for entry in manifest["dropped"]]
+    warnings = [
+        *manifest["warnings"],
+        *([manifest["reused"]] if manifest.get("reused") else []),
+    ]
     return [*(f"warning: {line}" for line in warnings), *left_out]
 
 
 def dropped_labels(entry: Mapping[str, str]) -> dict[str, str]:
-    """The labels that do not go together, by column, of an entry of `dropped`."""
+    """Return the incompatible labels of an entry of `dropped`, by column."""
     return {column: label for column, label in entry.items() if column != "reason"}
 
 
@@ -145,13 +149,14 @@ def _in_words(entry: Mapping[str, str]) -> str:
 
 
 def read_table(folder: Path, name: str) -> pd.DataFrame:
-    """Reads a table of episodes of a finished run, which is checked against `run.json`.
+    """Read a table of episodes of a finished run, and check its digest.
 
     Raises:
-        ConfigError: the run is not finished, the folder holds a shard of it, or the
-            table is not the run's.
+        ConfigError: If the run is not finished, the folder contains a shard, or the
+            table was changed.
     """
-    path, run = folder / name, open_run(folder)
+    path = folder / name
+    run = open_run(folder)
     if not path.exists():
         if run.shard is not None:
             raise ConfigError(
@@ -173,22 +178,16 @@ def read_table(folder: Path, name: str) -> pd.DataFrame:
 
 @contextmanager
 def damaged(path: Path, remedy: str) -> Iterator[None]:
-    """Says in one line that a file is not what it has to be, whatever reading it
-    raised.
-    """
+    """Convert any error of reading a file into a ConfigError of one line."""
     try:
         yield
     except PermissionError:
         raise
-    except (
-        Exception
-    ) as error:  # of a table what its library raises, of a rule what refuses a suite
-        said = (
-            error if isinstance(error, DamageError | ConfigError) else one_line(error)
-        )
-        raise out_of_memory(error) or ConfigError(
-            f"{path} is damaged: {said}. {remedy}"
-        ) from error
+    except Exception as error:  # of the table's library, or of a rule for suites
+        is_ours = isinstance(error, DamageError | ConfigError)
+        reason = error if is_ours else one_line(error)
+        message = f"{path} is damaged: {reason}. {remedy}"
+        raise out_of_memory(error) or ConfigError(message) from error
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -196,12 +195,11 @@ class Finished:
     """A finished unit in a run folder.
 
     Args:
-        path: its file.
-        about: the metadata of the file: `unit` (what was run), `key`, `code`, `digests`
-            of the maps, `record`, `made` (a token of this one making of it, which
-            copies keep), `traceback`, `errors`, `touched` by the user's own parts, and
-            the digests `content` of its rows, `steps` of its steps and `recordings` of
-            its recordings by their path.
+        path: file of the unit.
+        about: metadata of the file: `unit` (identity), `key`, `code`, `digests` of the
+            maps, `record`, `made` (a random token, which copies retain), `traceback`,
+            `errors`, `touched` (what custom parts read), and the digests `content` of
+            its rows, `steps` of its steps and `recordings` of its recordings by path.
     """
 
     path: Path
@@ -214,39 +212,34 @@ class Finished:
 
     @property
     def metrics(self) -> set[str]:
-        """Columns of its rows besides those that every run has."""
+        """Columns of its rows in addition to the built-in ones."""
         return set(self.about["code"].get(METRICS, ()))
 
     def has(self, unit: Unit) -> bool:
-        """Whether it was recorded as a unit is now to be, and what was recorded is
-        still of its making.
-        """
+        """Return whether the recordings that `unit` requests exist and are its own."""
         if RECORDS.index(self.about["record"]) < RECORDS.index(unit.record):
             return False
         steps = self.folder / unit.steps_path
-        return (
-            self.about["record"] == "none"
-            or metadata(steps).get("key") == self.about["key"]
-        )
+        has_own_steps = metadata(steps).get("key") == self.about["key"]
+        return self.about["record"] == "none" or has_own_steps
 
     def damage(self) -> list[str]:
-        """Return what of the unit is not as it was written, a line each that begins
-        with the file.
+        """Return a line for each damaged file of the unit, starting with its path.
 
-        Steps and recordings count if they are of this making of the unit; a file that
-        is missing is no damage.
+        Steps and recordings count if they belong to this making of the unit; a missing
+        file is no damage.
         """
         lines = damage_of(self.path, str(self.path.relative_to(self.folder)))
         steps = steps_path(self.about["unit"][0], self.path.name.rpartition("-")[0])
-        about = metadata(self.folder / steps)
-        if about and about.get("key") != self.about["key"]:
+        steps_metadata = metadata(self.folder / steps)
+        if steps_metadata and steps_metadata.get("key") != self.about["key"]:
             return lines
         if self.about.get("steps") and (self.folder / steps).exists():
-            of_others = [f"{steps}: it holds the steps of another run"]
-            is_own = about.get(CONTENT) == self.about["steps"]
-            lines += damage_of(self.folder / steps, str(steps)) or (
-                [] if is_own else of_others
-            )
+            is_own = steps_metadata.get(CONTENT) == self.about["steps"]
+            damage = damage_of(self.folder / steps, str(steps))
+            if not damage and not is_own:
+                damage = [f"{steps}: it holds the steps of another run"]
+            lines += damage
         for name, digest in self.about.get("recordings", {}).items():
             if digest_of_path(self.folder / name) not in ("", digest):
                 lines.append(f"{name}: it was changed after benchnav wrote it")
@@ -254,20 +247,22 @@ class Finished:
 
 
 def find_units(folder: Path, unit: Unit) -> list[Finished]:
-    """Finds all makings of a unit, of whatever code and maps, the newest first."""
+    """Find all makings of a unit, of any code and maps, newest first."""
     files = sorted(
         (folder / "units" / unit.condition.id).glob(f"{unit.name}-*.parquet"),
         key=lambda path: path.stat().st_mtime,
         reverse=True,
     )
-    found = [Finished(path=path, about=metadata(path)) for path in files]
+    makings = [Finished(path=path, about=metadata(path)) for path in files]
     return [
-        finished for finished in found if finished.about.get("unit") == _identity(unit)
+        finished
+        for finished in makings
+        if finished.about.get("unit") == _identity(unit)
     ]
 
 
 def unit_path(unit: Unit, key: str) -> Path:
-    """Return where a unit that is made under a key lies in a run folder."""
+    """Return the path of a unit with a key in a run folder."""
     return Path("units", unit.condition.id, f"{unit.name}-{key}.parquet")
 
 
@@ -283,19 +278,19 @@ def write_unit(
     errors: Sequence[str],
     traceback: str,
 ) -> None:
-    """Writes a finished unit.
+    """Write a finished unit.
 
     Args:
         folder: the run folder.
-        unit: what was run.
-        origin: of its rows.
+        unit: the unit.
+        origin: origin of its rows.
         rows: a row an episode.
-        errors: what went wrong, a line each.
-        traceback: of the first of them.
+        errors: messages of faults, a line each.
+        traceback: traceback of the first fault.
     """
     key = origin.key(unit)
     recordings = [unit.recording_path(member) for member in range(len(unit.maps))]
-    about = {
+    unit_metadata = {
         "unit": _identity(unit),
         "key": key,
         "code": origin.code,
@@ -316,11 +311,11 @@ def write_unit(
         rows.assign(code=code_digest(origin.code)), preserve_index=False
     )
     with replacing(folder / unit_path(unit, key)) as partial:
-        pq.write_table(with_metadata(table, about), partial)
+        pq.write_table(with_metadata(table, unit_metadata), partial)
 
 
 def clear_unit(folder: Path, unit: Unit) -> None:
-    """Removes steps and recordings of an earlier making of a unit; its rows stay."""
+    """Remove steps and recordings of an earlier making of a unit, but not its rows."""
     (folder / unit.steps_path).unlink(missing_ok=True)
     for member in range(len(unit.maps)):
         for suffix in (".npz", ".rrd"):
@@ -330,18 +325,17 @@ def clear_unit(folder: Path, unit: Unit) -> None:
 def finish_run(
     folder: Path, finished: Sequence[tuple[Unit, Finished]], reused: str = ""
 ) -> None:
-    """Writes `episodes.parquet` of all units, its digest and codes into `run.json`, and
-    `errors.txt`.
+    """Write `episodes.parquet` and `errors.txt`, and update `run.json`.
 
     Args:
         folder: the run folder.
         finished: all units of the run, in the order of the table.
-        reused: a line on units that other code has made; empty where there are none.
+        reused: a line on units of other code; empty without such units.
     """
-    about = open_run(folder).about
+    manifest = open_run(folder).about
     write_errors(folder, finished)
     rows = pd.concat(
-        [labelled_rows(unit, one) for unit, one in finished], ignore_index=True
+        [labelled_rows(unit, making) for unit, making in finished], ignore_index=True
     )
     table = pa.Table.from_pandas(rows, preserve_index=False).replace_schema_metadata(
         None
@@ -349,23 +343,25 @@ def finish_run(
     with replacing(folder / EPISODES) as partial:
         pq.write_table(table, partial)
     codes: dict[str, Any] = {}
-    for _, one in finished:
+    for _, making in finished:
         code = codes.setdefault(
-            code_digest(one.about["code"]), {**one.about["code"], TOUCHED: {}}
+            code_digest(making.about["code"]), {**making.about["code"], TOUCHED: {}}
         )
-        code[TOUCHED] |= one.about.get(TOUCHED, {})
-    known = {
+        code[TOUCHED] |= making.about.get(TOUCHED, {})
+    results = {
         "codes": codes,
         "reused": reused,
         "tables": {EPISODES: digest_of_path(folder / EPISODES)},
     }
-    if {name: about.get(name) for name in known} != known:
-        write_run(folder, {**about, **known})
+    if {name: manifest.get(name) for name in results} != results:
+        write_run(folder, {**manifest, **results})
 
 
 def write_errors(folder: Path, finished: Iterable[tuple[Unit, Finished]]) -> None:
-    """Writes `errors.txt` of all units, or removes it where nothing failed."""
-    traces = [text for unit, one in finished if (text := _trace(unit, one, folder))]
+    """Write `errors.txt` of all units, or remove it if nothing failed."""
+    traces = [
+        text for unit, making in finished if (text := _trace(unit, making, folder))
+    ]
     if traces:
         write_text(folder / ERRORS, "\n".join(traces))
     else:
@@ -385,45 +381,42 @@ def unit_rows(finished: Finished) -> pd.DataFrame:
 
 
 def labelled_rows(unit: Unit, finished: Finished) -> pd.DataFrame:
-    """Reads the rows of a finished unit, under the labels that its condition has now;
-    see `unit_rows`.
-    """
+    """Read the rows of a finished unit, with the current labels of its condition."""
     return unit_rows(finished).assign(**unit.condition.labels)
 
 
 def differences(
     first: pd.DataFrame, second: pd.DataFrame
 ) -> tuple[pd.DataFrame, pd.Index]:
-    """What differs between two tables of episodes, bit for bit, in columns of results
-    that both have.
+    """Compare two tables of episodes bit for bit, in result columns that both have.
 
     Args:
         first: rows of episodes, in any order.
-        second: as well.
+        second: likewise.
 
     Returns:
         The cells that differ, in the order of the first: `first`, `second`, by `KEYS`
-        and the column's name. And the keys of episodes that one of the tables lacks.
+        and column; and the keys of episodes that are in only one table.
     """
-    common = _results(first) & _results(second)
-    one, other = (
-        rows.set_index(KEYS)[sorted(common, key=list(first).index)]
-        for rows in (first, second)
+    columns = sorted(_results(first) & _results(second), key=list(first).index)
+    first_rows = first.set_index(KEYS)[columns]
+    second_rows = second.set_index(KEYS)[columns]
+    common = first_rows.index.intersection(second_rows.index, sort=False)
+    cells = first_rows.loc[common].compare(
+        second_rows.loc[common], result_names=("first", "second")
     )
-    both = one.index.intersection(other.index, sort=False)
-    cells = one.loc[both].compare(other.loc[both], result_names=("first", "second"))
-    lacking = one.index.symmetric_difference(other.index, sort=False)
+    lacking = first_rows.index.symmetric_difference(second_rows.index, sort=False)
     cells = cells.stack(level=0, future_stack=True).dropna(how="all")
     return cells.reindex(columns=["first", "second"]), lacking
 
 
 def differing_columns(first: pd.DataFrame, second: pd.DataFrame) -> list[str]:
-    """Columns of results that only one of two tables has."""
+    """Return result columns that are in only one of two tables."""
     return sorted(_results(first) ^ _results(second))
 
 
 def _results(rows: pd.DataFrame) -> set[str]:
-    """Columns of results: no wall times, and not the digest of the code."""
+    """Return columns of results, without wall times and the digest of the code."""
     others = (*KEYS, "code", "learning_ms")
     return {
         name for name in rows if name not in others and not name.startswith("planning_")
@@ -431,13 +424,13 @@ def _results(rows: pd.DataFrame) -> set[str]:
 
 
 def _trace(unit: Unit, finished: Finished, folder: Path) -> str:
-    about = finished.about
-    if not about["traceback"] and not about["errors"]:
+    unit_metadata = finished.about
+    if not unit_metadata["traceback"] and not unit_metadata["errors"]:
         return ""
     maps = f"maps {unit.maps[0]}–{unit.maps[-1]}"
-    place = finished.path.relative_to(folder)
+    path = finished.path.relative_to(folder)
     heading = (
         f"{unit.condition.description}, seed {unit.seed}, realisation "
-        f"{unit.realisation}, {maps} ({place})"
+        f"{unit.realisation}, {maps} ({path})"
     )
-    return "\n".join([heading, *about["errors"], about["traceback"]])
+    return "\n".join([heading, *unit_metadata["errors"], unit_metadata["traceback"]])

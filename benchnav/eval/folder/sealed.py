@@ -1,9 +1,7 @@
-"""Parquet files of a run that hold digests of what they hold, so that a changed bit is
-found.
+"""Parquet files of a run with digests of their contents, so that changes are detected.
 
 The metadata of a file is JSON text sealed as `run.json` is
-(`benchnav.core.store.seal`). It holds, beside what the file
-says of itself, `content`: the digest of the table.
+(`benchnav.core.store.seal`). It includes `content`, the digest of the table.
 """
 
 import hashlib
@@ -19,54 +17,51 @@ import pyarrow.parquet as pq
 from benchnav.core.errors import ConfigError
 from benchnav.core.store import seal, unseal
 
-METADATA = b"benchnav"  # key of ours in a Parquet file's metadata
+METADATA = b"benchnav"  # our key in a Parquet file's metadata
 CONTENT = "content"
 
 
 class DamageError(ValueError):
-    """A file of a run does not hold what was written to it."""
+    """A file of a run differs from what was written."""
 
 
 def content_digest(table: pa.Table) -> str:
     """Return the SHA-256 of a table's columns: names, types and values.
 
-    The order of columns does not count, and neither do columns in which every value is
-    missing, since files of steps get such columns when a run is extended by another
-    robot.
+    The order of columns does not matter. Columns without any value are ignored, since
+    files of steps receive such columns when a run is extended by another robot.
 
     Args:
-        table: any table of numbers, Booleans and text.
+        table: a table of numbers, Booleans and text.
     """
     digest = hashlib.sha256()
     for name in sorted(table.column_names):
         column = table[name].combine_chunks()
         if pa.types.is_string(column.type) or pa.types.is_large_string(column.type):
-            kind, values = "text", json.dumps(column.to_pylist()).encode()
+            kind = "text"
+            values = json.dumps(column.to_pylist()).encode()
             is_missing = column.null_count == len(column)
         else:
             array = column.to_numpy(zero_copy_only=False)
-            kind, values = str(array.dtype), array.tobytes()
+            kind = str(array.dtype)
+            values = array.tobytes()
             is_missing = array.dtype.kind in "fO" and bool(np.all(array != array))
         if not is_missing:
             digest.update(json.dumps([name, kind, len(values)]).encode() + values)
     return digest.hexdigest()
 
 
-def with_metadata(table: pa.Table, about: Mapping[str, Any]) -> pa.Table:
-    """Return a table whose metadata says what it is, with the digest of its content;
-    see `metadata`.
-    """
-    text = seal({**about, CONTENT: content_digest(table)})
+def with_metadata(table: pa.Table, file_metadata: Mapping[str, Any]) -> pa.Table:
+    """Return a table with metadata and the digest of its content; see `metadata`."""
+    text = seal({**file_metadata, CONTENT: content_digest(table)})
     return table.replace_schema_metadata({METADATA: text.encode()})
 
 
 def metadata(path: Path) -> dict[str, Any]:
-    """Return what a file says of itself; empty if it is missing, damaged, or not a file
-    of a run.
-    """
+    """Return a file's metadata; empty if it is missing, damaged, or not of a run."""
     try:
         return _unsealed((pq.read_schema(path).metadata or {}).get(METADATA, b"{}"))
-    except Exception:  # what a flipped bit makes Arrow raise is not of one kind
+    except Exception:  # a flipped bit may make Arrow raise anything
         return {}
 
 
@@ -84,15 +79,14 @@ def read_sealed(path: Path) -> pa.Table:
         path: a unit or a file of steps.
 
     Returns:
-        The table, without metadata, on which no digest depends.
+        The table without metadata.
 
     Raises:
-        DamageError: If it cannot be read, or holds something else than was written to
-            it.
+        DamageError: If the file cannot be read, or differs from what was written.
     """
     try:
         table = pq.read_table(path, partitioning=None)
-        about = _unsealed((table.schema.metadata or {}).get(METADATA, b"{}"))
+        file_metadata = _unsealed((table.schema.metadata or {}).get(METADATA, b"{}"))
         content = content_digest(table)
     except FileNotFoundError:
         raise DamageError("it is missing") from None
@@ -102,15 +96,13 @@ def read_sealed(path: Path) -> pa.Table:
         raise
     except Exception as error:
         raise DamageError(f"it cannot be read ({type(error).__name__})") from error
-    if not about or about.get(CONTENT) != content:
+    if not file_metadata or file_metadata.get(CONTENT) != content:
         raise DamageError("it was changed after benchnav wrote it")
     return table.replace_schema_metadata(None)
 
 
 def damage_of(path: Path, name: str) -> list[str]:
-    """Return a line that begins with the name of a file and says what is wrong with it;
-    none where it is as written.
-    """
+    """Return a line with a file's name and damage; empty if it is intact."""
     try:
         read_sealed(path)
     except DamageError as error:

@@ -26,12 +26,11 @@ from benchnav.eval.folder.sealed import metadata, read_sealed, with_metadata
 STEPS = "steps"
 
 LAST_COLUMN = "traversability"
-# RMSE of E[λ] and mean log score of what is believed of the ground ahead of a robot.
+# RMSE of E[λ] and mean log score of the belief about the terrain ahead of a robot.
 AHEAD_COLUMNS = ("ahead_rmse", "ahead_log_score")
-AHEAD_M, AHEAD_DEG = (
-    5.0,
-    45.0,
-)  # how far, and how far to either side, ground is ahead of a robot
+# Range and half-angle of the terrain ahead of a robot.
+AHEAD_M = 5.0
+AHEAD_DEG = 45.0
 _ORDER = ["condition", *DRAW, "step"]
 _REMEDY = (
     "Remove the steps, which the report can do without, or run it again with "
@@ -40,26 +39,26 @@ _REMEDY = (
 
 
 def write_steps(folder: Path, unit: Unit, key: str, table: pa.Table) -> None:
-    """Writes the steps of a unit, whole or not at all.
+    """Write the steps of a unit atomically.
 
     Args:
         folder: the run folder.
-        unit: what was run.
-        key: of the unit.
+        unit: the unit.
+        key: key of the unit.
         table: from `step_table`.
     """
     _write(folder / unit.steps_path, table, {"key": key})
 
 
-def _write(path: Path, table: pa.Table, about: Mapping[str, Any]) -> None:
+def _write(path: Path, table: pa.Table, file_metadata: Mapping[str, Any]) -> None:
     with replacing(path) as partial:
-        pq.write_table(with_metadata(table, about), partial, compression="zstd")
+        pq.write_table(with_metadata(table, file_metadata), partial, compression="zstd")
 
 
 def align_steps(folder: Path, finished: Iterable[Unit]) -> None:
-    """Gives all files of steps the same columns, whatever actions their robots have.
+    """Give all files of steps the same columns, also if robots have different actions.
 
-    Readers of many files take the columns of the first.
+    Readers of many files use the columns of the first.
 
     Args:
         folder: the run folder.
@@ -67,42 +66,45 @@ def align_steps(folder: Path, finished: Iterable[Unit]) -> None:
     """
     paths = [path for unit in finished if (path := folder / unit.steps_path).exists()]
     with damaged(folder / STEPS, _REMEDY):
-        held = {path: pq.read_schema(path).names for path in paths}
-        every = dict.fromkeys(
-            name for names in held.values() for name in names if name != LAST_COLUMN
+        names_by_path = {path: pq.read_schema(path).names for path in paths}
+        all_names = dict.fromkeys(
+            name
+            for names in names_by_path.values()
+            for name in names
+            if name != LAST_COLUMN
         )
-        for path, names in held.items():
-            if names == [*every, LAST_COLUMN]:
+        for path, names in names_by_path.items():
+            if names == [*all_names, LAST_COLUMN]:
                 continue
             table = read_sealed(path)
-            none = pa.array(np.full(len(table), np.nan, np.float32))
-            full = {
-                name: table[name] if name in names else none
-                for name in [*every, LAST_COLUMN]
+            missing = pa.array(np.full(len(table), np.nan, np.float32))
+            columns = {
+                name: table[name] if name in names else missing
+                for name in [*all_names, LAST_COLUMN]
             }
-            _write(path, pa.table(full), metadata(path))
+            _write(path, pa.table(columns), metadata(path))
 
 
 def has_steps(folder: Path) -> bool:
-    """Return whether steps of a run were kept."""
+    """Return whether a run has steps."""
     return any((folder / STEPS).glob("*/*.parquet"))
 
 
 def step_files(
     folder: Path, conditions: Collection[str] | None = None
 ) -> Iterator[pd.DataFrame]:
-    """Yield the steps of a run, a file at a time, whose digest is of all that it holds.
+    """Yield the steps of a run, one file at a time, after checking its digest.
 
     Args:
         folder: the run folder.
-        conditions: ids of those that are read; None for all.
+        conditions: ids of conditions; None for all.
 
     Yields:
-        Columns as of `step_table`, and `condition`. Files of a run that is not finished
+        Columns as in `step_table`, and `condition`. Files of a run that is not finished
         may differ in their columns.
 
     Raises:
-        ConfigError: a file is damaged.
+        ConfigError: If a file is damaged.
     """
     for path in sorted((folder / STEPS).glob("*/*.parquet")):
         condition = path.parent.name.removeprefix("condition=")
@@ -113,20 +115,19 @@ def step_files(
 
 
 def read_steps(folder: Path, **filters: Any) -> pd.DataFrame:
-    """Reads steps of a run.
+    """Read steps of a run.
 
     Args:
         folder: a run folder.
-        **filters: which; `condition` by its id or by its labels (`planner="mppi"`,
-            `risk="mean"`, …), and `seed`, `realisation`, `map`, `step`. A list takes
-            any of several.
+        **filters: `condition` by its id or by labels (`planner="mppi"`, `risk="mean"`,
+            …), and `seed`, `realisation`, `map`, `step`. A list selects several values.
 
     Returns:
         A row a state, in the order of condition, seed, realisation, map and step;
-        columns as of `step_table`, and `condition`.
+        columns as in `step_table`, and `condition`.
 
     Raises:
-        ConfigError: the run has no steps, or nothing by that filter's name.
+        ConfigError: If the run has no steps, or a filter is unknown.
     """
     run = open_run(folder)
     if not has_steps(folder):
@@ -144,11 +145,9 @@ def read_steps(folder: Path, **filters: Any) -> pd.DataFrame:
             else [value]
         )
         if name in LABELS:
-            conditions &= {
-                i
-                for i, (known, _) in run.conditions.items()
-                if known.labels[name] in values
-            }
+            for i, (condition, _) in run.conditions.items():
+                if condition.labels[name] not in values:
+                    conditions.discard(i)
         elif name == "condition":
             conditions &= set(values)
         else:

@@ -1,4 +1,4 @@
-"""Checking all files of a run folder against the digests that they, and the run, hold."""
+"""Comparison of all files of a run folder with their digests."""
 
 from pathlib import Path
 
@@ -25,13 +25,13 @@ def verify_run(folder: Path) -> tuple[list[str], list[str]]:
         folder: a run folder, finished or not; nothing is written.
 
     Returns:
-        Lines on what is damaged, each beginning with the file, and lines on what is not
-        damaged but should be known.
+        Lines on damage, each starting with the file, and further notes.
 
     Raises:
         ConfigError: If the folder has no `run.json`.
     """
-    damage, notes = [], []
+    damage = []
+    notes = []
     try:
         run = open_run(folder)
     except BenchnavError as error:
@@ -61,15 +61,15 @@ def verify_run(folder: Path) -> tuple[list[str], list[str]]:
             removed.append(name)
         elif digest_of_path(folder / name) != digest:
             damage.append(f"{name}: it was changed after benchnav wrote it")
-    every = units(run.conditions)
-    own = [
+    all_units = units(run.conditions)
+    shard_units = [
         unit
-        for unit in every
+        for unit in all_units
         if run.shard is None or unit.shard(run.shard.of) == run.shard
     ]
-    missing = sum(not find_units(folder, unit) for unit in own)
+    missing = sum(not find_units(folder, unit) for unit in shard_units)
     if missing:
-        notes.append(f"{missing} of {len(own)} units are not finished")
+        notes.append(f"{missing} of {len(shard_units)} units are not finished")
     if removed:
         notes.append(
             f"{len(removed)} of {len(checksums)} files in {SUMS} are missing, the "

@@ -25,34 +25,35 @@ from benchnav.stats.tables import (
 
 
 def comparison_table(table: pd.DataFrame, difference: float, by: str) -> Table:
-    """Write a comparison: success in percentage points, times in seconds, p after
-    Holm's correction.
+    """Format a comparison: success in percentage points, times in seconds, corrected p.
 
     Args:
         table: from `comparison.compare`.
-        difference: of success, that `maps_needed` is for.
-        by: in what the conditions of a pair differ.
+        difference: difference of success that `maps_needed` is for.
+        by: column in which the conditions of a pair differ.
     """
-    scale, stored, unit = (
-        (100, "share", "% of T") if "time_difference_share" in table else (1, "s", "s")
-    )
-    share = (
-        "; in shares of each condition's own T, since T differs"
-        if stored == "share"
-        else ""
-    )
-    points, times, arrivals = (
-        "Δ [points], 95 %",
-        f"Δ T_total [{unit}], 95 %",
-        "Δ T if both arrive [s], 95 %, on maps",
-    )
+    in_fractions = "time_difference_share" in table
+    scale = 100 if in_fractions else 1
+    suffix = "share" if in_fractions else "s"
+    unit = "% of T" if in_fractions else "s"
+    fraction_note = ""
+    if in_fractions:
+        fraction_note = "; in fractions of each condition's own T, since T differs"
+    points = "Δ [points], 95 %"
+    times = f"Δ T_total [{unit}], 95 %"
+    arrivals = "Δ T if both arrive [s], 95 %, on maps"
+
+    def success_rates(row: Row) -> str:
+        rates = [short(100 * row[f"success_{side}"]) for side in ("one", "other")]
+        return " : ".join(rates)
+
+    def detectable(value: float) -> str:
+        return f"{100 * value:.0f}" if value <= 1 else NOT_USED
+
     columns = [
         Column(
             "Succ. [%]",
-            lambda row: (
-                f"{short(100 * row['success_one'])} : "
-                f"{short(100 * row['success_other'])}"
-            ),
+            success_rates,
             "success rates of the two conditions.",
         ),
         *_difference_columns(
@@ -65,44 +66,38 @@ def comparison_table(table: pd.DataFrame, difference: float, by: str) -> Table:
         Column(
             "p",
             cell_of("success_p_holm", p_value),
-            "sign-flip test by map (McNemar's exact test with one episode a map), "
+            "sign-flip test per map (McNemar's exact test with one episode a map), "
             "Holm's correction.",
         ),
         _significance("success_p_holm"),
         Column(
             "detectable",
-            cell_of(
-                "success_detectable",
-                lambda value: f"{100 * value:.0f}" if value <= 1 else NOT_USED,
-            ),
-            "minimum detectable difference of success [points] with 80 % power, for "
-            "which the maps needed are counted "
-            "too; a dash where the maps are too few.",
+            cell_of("success_detectable", detectable),
+            "minimum detectable difference of success [points] with 80 % power, the "
+            "power of the number of maps needed too; a dash if there are too few maps.",
         ),
         *_difference_columns(
             times,
             "time",
-            f"_{stored}",
+            f"_{suffix}",
             scale,
             "difference of the mean time, a failure counted as the time budget "
-            f"T{share}; a dash for an interval of "
-            f"fewer than {LEAST_MAPS} maps.",
+            f"T{fraction_note}; a dash for an interval of fewer than {LEAST_MAPS} "
+            "maps.",
         ),
         Column(
             "p (ranks)",
             cell_of("time_p_holm", p_value),
             "Wilcoxon's signed-rank test of T_total, Holm's correction. It compares "
-            "ranks and the interval is of the "
-            "mean, so that the two can disagree.",
+            "ranks, while the interval is of the mean, so that the two can disagree.",
         ),
         *_difference_columns(
             arrivals,
             "arrival_time",
             "_s",
             1,
-            "difference of time over the episodes in which both arrived. It is not "
-            "tested: both conditions decide "
-            "which episodes these are.",
+            "difference of time over the episodes in which both reached the goal. It "
+            "is not tested, since both conditions select these episodes.",
         ),
         Column("on maps", cell_of("arrival_time_n_maps", str)),
     ]
@@ -112,35 +107,32 @@ def comparison_table(table: pd.DataFrame, difference: float, by: str) -> Table:
 
 
 def metric_table(table: pd.DataFrame, quantity: Quantity, by: str) -> Table:
-    """Write a comparison by one metric.
+    """Format a comparison by one metric.
 
     Args:
         table: from `comparison.compare_by`.
-        quantity: what is compared.
-        by: in what the conditions of a pair differ.
+        quantity: the quantity compared.
+        by: column in which the conditions of a pair differ.
     """
     unit = f" [{quantity.unit}]" if quantity.unit else ""
     pairs, grouped = _pairs_and_unit(table)
     better = f"; {quantity.better} is better" if quantity.better != "neither" else ""
-    over = (
-        " Over the episodes in which both reached the goal."
-        if quantity.of_arrivals
-        else ""
-    )
+    over = ""
+    if quantity.of_arrivals:
+        over = " Over the episodes in which both reached the goal."
 
     def values(row: Row) -> str:
-        return (
-            f"{row['mean_one']:.4g} : {row['mean_other']:.4g}"
-            if row["n_episodes"]
-            else NOT_USED
-        )
+        if not row["n_episodes"]:
+            return NOT_USED
+        return f"{row['mean_one']:.4g} : {row['mean_other']:.4g}"
 
     def interval(row: Row) -> str:
-        return (
-            NOT_USED
-            if np.isnan(row["low"])
-            else f"{row['low']:+.3g} to {row['high']:+.3g}"
-        )
+        if np.isnan(row["low"]):
+            return NOT_USED
+        return f"{row['low']:+.3g} to {row['high']:+.3g}"
+
+    def difference(row: Row) -> str:
+        return f"{row['difference']:+.3g}" if row["n_episodes"] else NOT_USED
 
     columns = [
         Column(
@@ -150,7 +142,7 @@ def metric_table(table: pd.DataFrame, quantity: Quantity, by: str) -> Table:
         ),
         Column(
             f"Δ{unit}",
-            lambda row: f"{row['difference']:+.3g}" if row["n_episodes"] else NOT_USED,
+            difference,
             "difference of the means, with its 95 % interval.",
             f"Δ{unit}, 95 %",
         ),
@@ -158,7 +150,7 @@ def metric_table(table: pd.DataFrame, quantity: Quantity, by: str) -> Table:
         Column(
             "p",
             cell_of("p_holm", p_value),
-            f"sign-flip test by {grouped}, Holm's correction.",
+            f"sign-flip test per {grouped}, Holm's correction.",
         ),
         _significance("p_holm"),
     ]
@@ -178,9 +170,7 @@ def _pair_table(
     columns: Sequence[Column],
     notes: tuple[str, ...],
 ) -> Table:
-    """Write columns after those that name a pair: labels that differ, the two that are
-    compared, and counts.
-    """
+    """Format columns, preceded by labels that differ, the pair, and counts."""
     labels = [
         name for name in (*LABELS, "run") if name in table and differ(table[name])
     ]
@@ -199,9 +189,7 @@ def _pair_table(
 
 
 def _significance(p: str) -> Column:
-    """Return the column that says whether a p-value is significant, by the name of that
-    value.
-    """
+    """Return the column that shows whether the p-value of a column is significant."""
     return Column(
         "significant",
         cell_of(p, lambda value: "yes" if value < ALPHA else "no"),
@@ -210,7 +198,7 @@ def _significance(p: str) -> Column:
 
 
 def _pairs_and_unit(table: pd.DataFrame) -> tuple[str, str]:
-    """Return how many pairs were compared, in words, and the unit of the statistics."""
+    """Return the number of pairs in words, and the statistical unit."""
     pairs = "1 pair" if len(table) == 1 else f"{len(table)} pairs"
     return pairs, "group" if (table["n_groups"] < table["n_maps"]).any() else "map"
 
@@ -218,12 +206,11 @@ def _pairs_and_unit(table: pd.DataFrame) -> tuple[str, str]:
 def _difference_columns(
     title: str, name: str, unit: str, scale: float, meaning: str
 ) -> list[Column]:
-    """Return the columns of a difference and of its interval, of one meaning."""
+    """Return the columns of a difference and of its interval."""
 
     def ends(row: Row) -> str:
-        return signed_interval(
-            scale * row[f"{name}_low{unit}"], scale * row[f"{name}_high{unit}"]
-        )
+        low = scale * row[f"{name}_low{unit}"]
+        return signed_interval(low, scale * row[f"{name}_high{unit}"])
 
     shown = cell_of(f"{name}_difference{unit}", lambda value: signed(scale * value))
     return [
@@ -240,7 +227,7 @@ def _comparison_notes(table: pd.DataFrame, difference: float) -> tuple[str, ...]
     if np.isinf(table["success_detectable"]).any():
         needed = (
             f"These {unit}s are too few for any difference to be significant, "
-            "and to tell how many it needs."
+            "and to estimate how many it needs."
         )
     return (
         f"Tests by {unit}: signs of the difference (success) and ranks (T_total), p "

@@ -1,6 +1,4 @@
-"""What a run says, in sentences made from its numbers; whether one setting beats
-another is for the tests to say.
-"""
+"""Findings of a run in sentences; tests decide whether one setting is better."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -20,53 +18,56 @@ from benchnav.eval.words import (
 from benchnav.stats.best import FEWEST_MAPS
 from benchnav.stats.holm import ALPHA
 
-_MOST_NAMED = 6
+_MAX_NAMED = 6
 
 
 def findings(
     summary: pd.DataFrame, failures: pd.DataFrame, predicted: Mapping[str, np.ndarray]
 ) -> dict[str, list[str]]:
-    """Says of each block which setting is best, by how much, how sure that is, and how
-    the failures failed.
+    """Describe the best setting of each block, its margin, significance and failures.
 
     Args:
         summary: from `summary.summarise`, joined with `best.against_best`.
         failures: from `failures.failures_table`.
-        predicted: by condition the λ̂ where its failed episodes ended, where that is
-            known.
+        predicted: λ̂ where failed episodes ended, by condition.
 
     Returns:
-        By the title of a block its sentences.
+        Sentences by the title of a block.
     """
-    every = blocks(with_names(summary))
-    apart = [_apart(block, summary) for _, block in every]
+    all_blocks = blocks(with_names(summary))
+    other_blocks = [_pairing_by_label(block, summary) for _, block in all_blocks]
     return {
         title: list(_sentences(block, failures, predicted, unlike))
-        for (title, block), unlike in zip(every, apart, strict=True)
+        for (title, block), unlike in zip(all_blocks, other_blocks, strict=True)
     }
 
 
-def _apart(rows: pd.DataFrame, summary: pd.DataFrame) -> dict[str, bool]:
-    """By which labels settings on the same maps are in other blocks, and whether
-    `compare` pairs them by that label.
+def _pairing_by_label(rows: pd.DataFrame, summary: pd.DataFrame) -> dict[str, bool]:
+    """Return labels that put settings on the same maps into other blocks.
+
+    The value is whether `compare` pairs the settings by that label.
     """
-    own, kept = rows.iloc[0], [name for name in LABELS if name not in BLOCK]
+    first = rows.iloc[0]
+    setting_columns = [name for name in LABELS if name not in BLOCK]
     same_maps = summary[
-        (summary["data"] == own["data"]) & (summary["scenario"] == own["scenario"])
+        (summary["data"] == first["data"]) & (summary["scenario"] == first["scenario"])
     ]
-    settings, found = set(rows[kept].itertuples(index=False, name=None)), {}
+    settings = set(rows[setting_columns].itertuples(index=False, name=None))
+    is_paired_by = {}
     for name in ("robot", "objective", "world"):
-        rest = [label for label in BLOCK if label != name]
+        fixed = [label for label in BLOCK if label != name]
         others = same_maps[
-            (same_maps[rest] == own[rest]).all(axis=1) & (same_maps[name] != own[name])
+            (same_maps[fixed] == first[fixed]).all(axis=1)
+            & (same_maps[name] != first[name])
         ]
         if not others.empty:
             # Worlds may draw unlike λ, and are then not paired.
             paired = name != "world" and bool(
-                settings & set(others[kept].itertuples(index=False, name=None))
+                settings
+                & set(others[setting_columns].itertuples(index=False, name=None))
             )
-            found[name] = paired
-    return found
+            is_paired_by[name] = paired
+    return is_paired_by
 
 
 def _sentences(
@@ -77,10 +78,10 @@ def _sentences(
 ) -> Iterable[str]:
     rivals = rows[competing(rows)]
     best = rivals[rivals["condition"] == rivals["best"].iloc[0]].to_dict("records")[0]
-    others = rivals[rivals["condition"] != best["condition"]].sort_values(
+    rivals_of_best = rivals[rivals["condition"] != best["condition"]].sort_values(
         "best_difference", kind="stable"
     )
-    shared = int((others["success_rate"] == best["success_rate"]).sum())
+    shared = int((rivals_of_best["success_rate"] == best["success_rate"]).sum())
     named = (
         f"{best['name']} and {shared} more have" if shared else f"{best['name']} has"
     )
@@ -90,27 +91,26 @@ def _sentences(
         f"{100 * best['success_low']:.0f} to {100 * best['success_high']:.0f} %)."
     )
     common = int(best["best_episodes"])
-    if not others.empty and (rivals["n_episodes"] > common).any():
+    if not rivals_of_best.empty and (rivals["n_episodes"] > common).any():
         yield f"The comparison uses the {common} episodes that all settings have."
-    yield from _rank(best, others, apart)
+    yield from _rank(best, rivals_of_best, apart)
     yield from _why(best, failures, predicted)
     count = int(rivals["n_episodes"].sum())
     failed = rivals[list(FAILURE_COUNTS)].to_numpy().sum()
     if failed and len(rivals) > 1:
-        every = "Both" if len(rivals) == 2 else f"All {len(rivals)}"
+        all_settings = "Both" if len(rivals) == 2 else f"All {len(rivals)}"
         yield (
-            f"{every} compared settings together failed in {failed} of {count} "
-            f"episodes: {_shares(rivals)}."
+            f"{all_settings} compared settings together failed in {failed} of {count} "
+            f"episodes: {_failure_percentages(rivals)}."
         )
     references = rows[~competing(rows)].sort_values("success_rate", kind="stable")
     for part in reversed(PRIVILEGED):
-        for most in (
-            references[references["privileged"] == part].tail(1).to_dict("records")
-        ):
+        strongest = references[references["privileged"] == part].tail(1)
+        for reference in strongest.to_dict("records"):
             yield (
-                f"For reference, {most['name']} reached {rate_in_words(most)} % with "
-                "the privileged model "
-                f"{most['model']}."
+                f"For reference, {reference['name']} reached "
+                f"{rate_in_words(reference)} % with the privileged model "
+                f"{reference['model']}."
             )
 
 
@@ -123,7 +123,8 @@ def _rank(
         for name in (name for name, paired in apart.items() if paired):
             yield f"benchnav-eval compare --by {name} compares the {name}s of the run."
         return
-    alike, worse = others[others["best_alike"]], others[~others["best_alike"]]
+    alike = others[others["best_alike"]]
+    worse = others[~others["best_alike"]]
     unit = "group" if best["n_groups"] < best["n_maps"] else "map"
     test = f"max-T bootstrap test by {unit} over {len(others) + 1} settings"
     if best["best_maps"] < FEWEST_MAPS:
@@ -133,7 +134,8 @@ def _rank(
         )
         return
     if worse.empty:
-        shown, p = others["best_shown"].max(), others["best_p"].min()
+        shown = others["best_shown"].max()
+        p = others["best_p"].min()
         maps = f"{int(best['best_maps'])} {unit}s"
         power = (
             f"; {maps} detect differences of {100 * shown:.0f} points or more "
@@ -146,39 +148,32 @@ def _rank(
         )
         return
     if alike.empty:
-        other = (
-            "The other setting is"
-            if len(worse) == 1
-            else f"All {len(worse)} other settings are"
-        )
-        yield f"{other} significantly worse."
+        subject = "The other setting is"
+        if len(worse) != 1:
+            subject = f"All {len(worse)} other settings are"
+        yield f"{subject} significantly worse."
     else:
         listed = list(alike["name"])
-        more = (
-            f" and {len(listed) - _MOST_NAMED} more"
-            if len(listed) > _MOST_NAMED
-            else ""
-        )
-        verb = (
-            "1 other setting is"
-            if len(listed) == 1
-            else f"{len(listed)} other settings are"
-        )
+        remainder = ""
+        if len(listed) > _MAX_NAMED:
+            remainder = f" and {len(listed) - _MAX_NAMED} more"
+        verb = "1 other setting is"
+        if len(listed) != 1:
+            verb = f"{len(listed)} other settings are"
         yield (
             f"{verb} not significantly worse (p ≥ {ALPHA}): "
-            f"{'; '.join(listed[:_MOST_NAMED])}{more}."
+            f"{'; '.join(listed[:_MAX_NAMED])}{remainder}."
         )
     following = worse.iloc[0]
-    low, high = 100 * following["best_low"], 100 * following["best_high"]
-    verb = (
-        "is significantly worse"
-        if len(worse) == 1
-        else "is the best of those that are significantly worse"
-    )
+    low = 100 * following["best_low"]
+    high = 100 * following["best_high"]
+    verb = "is the best of those that are significantly worse"
+    if len(worse) == 1:
+        verb = "is significantly worse"
     yield (
         f"{following['name']} {verb}: {rate_in_words(following)} %, "
         f"{100 * following['best_difference']:.1f} points "
-        f"less (95 % interval of this pair alone {low:.1f} to {high:.1f}), "
+        f"less (95 % interval of this pair only {low:.1f} to {high:.1f}), "
         f"{p_in_words(following['best_p'])} ({test})."
     )
 
@@ -186,23 +181,23 @@ def _rank(
 def _why(
     best: Mapping[Any, Any], failures: pd.DataFrame, predicted: Mapping[str, np.ndarray]
 ) -> Iterable[str]:
-    """How the best setting's failures failed, and on what ground."""
+    """Yield how the best setting's episodes failed, and λ where they ended."""
     failed = sum(best[column] for column in FAILURE_COUNTS)
     if not failed:
         yield f"{best['name']} never failed."
         return
     yield (
         f"{best['name']} failed in {failed} of {best['n_episodes']} episodes: "
-        f"{_shares(pd.DataFrame([best]))}."
+        f"{_failure_percentages(pd.DataFrame([best]))}."
     )
     observed = failures.loc[
         failures["condition"] == best["condition"], "last_traversability"
     ].median()
     # An end outside the map has no λ̂.
-    given = pd.Series(predicted.get(best["condition"]), dtype=float).median()
-    if not np.isnan(observed) and not np.isnan(given):
+    predicted_median = pd.Series(predicted.get(best["condition"]), dtype=float).median()
+    if not np.isnan(observed) and not np.isnan(predicted_median):
         yield (
-            f"Where they ended, the predicted λ̂ was {given:.2f}; the robot observed "
+            f"Where they ended, the predicted λ̂ was {predicted_median:.2f}; the robot observed "
             f"λ = {observed:.2f} in the last 2 s "
             "(medians)."
         )
@@ -210,15 +205,13 @@ def _why(
         yield f"The robot observed λ = {observed:.2f} in their last 2 s (median)."
 
 
-def _shares(rows: pd.DataFrame) -> str:
-    """Counts of how conditions failed with their shares of all failures, the most
-    frequent first.
-    """
+def _failure_percentages(rows: pd.DataFrame) -> str:
+    """Return counts and percentages of outcomes of failures, frequent ones first."""
     counts = rows[list(FAILURE_COUNTS)].sum().rename(FAILURE_COUNTS)
+    ordered = counts[counts > 0].sort_values(ascending=False, kind="stable")
     words = []
-    for name, count in (
-        counts[counts > 0].sort_values(ascending=False, kind="stable").items()
-    ):
-        share = 100 * count / counts.sum()
-        words.append(f"{count} {name} ({f'{share:.0f}' if share >= 0.5 else '< 1'} %)")
+    for name, count in ordered.items():
+        percentage = 100 * count / counts.sum()
+        rounded = f"{percentage:.0f}" if percentage >= 0.5 else "< 1"
+        words.append(f"{count} {name} ({rounded} %)")
     return ", ".join(words)

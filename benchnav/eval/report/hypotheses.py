@@ -1,6 +1,4 @@
-"""What a run says of the hypotheses that were fixed before it: sentences, and their
-table.
-"""
+"""Results of the hypotheses that were fixed before a run: sentences and a table."""
 
 from collections.abc import Mapping
 from dataclasses import fields, replace
@@ -34,40 +32,42 @@ _OF_MARGINS = {
 
 
 def hypothesis_findings(
-    tests: pd.DataFrame, about: Mapping[str, Any], unit: str
+    tests: pd.DataFrame, manifest: Mapping[str, Any], unit: str
 ) -> dict[str, list[str]]:
-    """Says of each hypothesis how its test came out.
+    """Describe the result of each hypothesis.
 
     Args:
         tests: from `hypotheses.test_hypotheses`.
-        about: all of `run.json`.
-        unit: of the statistics, from `words.unit_of_statistics`.
+        manifest: contents of `run.json`.
+        unit: statistical unit, from `words.unit_of_statistics`.
 
     Returns:
-        Sentences by the title over them.
+        Sentences by their title.
     """
-    known = quantities(further_quantities(about))
-    said = [
-        f"{number}. {_capital(_claim(row, known))}: {_verdict(row)} "
+    all_quantities = quantities(further_quantities(manifest))
+    sentences = [
+        f"{number}. {_capital(_claim(row, all_quantities))}: {_verdict(row)} "
         f"({_numbers(row, unit)})."
         for number, row in enumerate(tests.to_dict("records"), start=1)
     ]
     title = (
         "Hypotheses, fixed before the first unit was run (digest "
-        f"{about['hypotheses']['digest']})"
+        f"{manifest['hypotheses']['digest']})"
     )
-    return {title: [*said, *_extended(about)]}
+    return {title: [*sentences, *_extended(manifest)]}
 
 
 def hypothesis_table(
-    tests: pd.DataFrame, unit: str, known: Mapping[str, Quantity] = QUANTITIES
+    tests: pd.DataFrame,
+    unit: str,
+    quantities_by_name: Mapping[str, Quantity] = QUANTITIES,
 ) -> Table:
-    """Formats the tests, a row a hypothesis; bold where it is supported.
+    """Format the tests, a row a hypothesis; a supported one is bold.
 
     Args:
         tests: from `hypotheses.test_hypotheses`.
-        unit: of the statistics, from `words.unit_of_statistics`.
-        known: what conditions are compared by, by name.
+        unit: statistical unit, from `words.unit_of_statistics`.
+        quantities_by_name: quantities that conditions are compared by.
     """
     used = "; ".join(
         words for kind, words in _TESTS.items() if (tests["kind"] == kind).any()
@@ -85,7 +85,7 @@ def hypothesis_table(
     ]
     columns = [
         Column("", lambda row: str(row["number"])),
-        Column("hypothesis", lambda row: _claim(row, known)),
+        Column("hypothesis", lambda row: _claim(row, quantities_by_name)),
         Column(f"{unit}s", lambda row: str(row["n_maps"])),
         Column(
             "values",
@@ -97,8 +97,8 @@ def hypothesis_table(
             "interval",
             _interval,
             "95 % for a difference; 90 % for a margin, where the end beyond the "
-            "margin decides the test before the "
-            f"correction. Under {LEAST_MAPS} {unit}s success alone has an interval.",
+            "margin decides the test before the correction. Below "
+            f"{LEAST_MAPS} {unit}s only success has an interval.",
         ),
         Column(
             "p",
@@ -118,42 +118,38 @@ def hypothesis_table(
     )
     explained = []
     if ((tests["metric"] == TOTAL_TIME.name) & (tests["kind"] == "difference")).any():
-        explained.append(
-            (
-                "T_total",
-                "the interval allows for rare failures that no episode showed, and p "
-                "does not. So p can be small where "
-                "the interval holds 0.",
-            )
+        text = (
+            "the interval allows for rare failures that no episode showed, and p "
+            "does not. So p can be small where the interval contains 0."
         )
-    for quantity in known.values():
+        explained.append(("T_total", text))
+    for quantity in quantities_by_name.values():
         if quantity.of_arrivals and (tests["metric"] == quantity.name).any():
             explained.append(
-                (quantity.words, "over the episodes in which both arrived.")
+                (quantity.words, "over the episodes in which both reached the goal.")
             )
     return replace(table, explained=(*table.explained, *explained))
 
 
-def _claim(row: Mapping[Any, Any], known: Mapping[str, Quantity]) -> str:
-    """The hypothesis with the names that tables and figures have for the two
-    conditions.
-    """
+def _claim(row: Mapping[Any, Any], quantities_by_name: Mapping[str, Quantity]) -> str:
+    """Return the hypothesis, with conditions named as in tables and figures."""
     test = Hypothesis(**{name.name: row[name.name] for name in fields(Hypothesis)})
-    one, other = map(reading_names, row["names"])
-    return test.claim(one, other, known[test.metric])
+    first, second = map(reading_names, row["names"])
+    return test.claim(first, second, quantities_by_name[test.metric])
 
 
 def _verdict(row: Mapping[Any, Any]) -> str:
     if np.isnan(row["p_holm"]):
         return f"partial: {NOT_YET}"
-    kind, direction = row["kind"], row["direction"]
+    kind = row["kind"]
+    direction = row["direction"]
     if kind in _OF_MARGINS:
         return _OF_MARGINS[kind] if row["supported"] else f"{kind} not shown"
     if row["supported"]:
         return f"significantly {direction or 'different'}"
-    return (
-        f"not significantly {direction}" if direction else "no significant difference"
-    )
+    if direction:
+        return f"not significantly {direction}"
+    return "no significant difference"
 
 
 def _numbers(row: Mapping[Any, Any], unit: str) -> str:
@@ -164,11 +160,13 @@ def _numbers(row: Mapping[Any, Any], unit: str) -> str:
     return ", ".join([*words, *p, f"{row['n_maps']} {unit}s"])
 
 
-def _extended(about: Mapping[str, Any]) -> list[str]:
-    """Tells where a run was extended after its hypotheses were fixed."""
-    planned = about["hypotheses"]["episodes"]
+def _extended(manifest: Mapping[str, Any]) -> list[str]:
+    """Return a note if a run was extended after its hypotheses were fixed."""
+    planned = manifest["hypotheses"]["episodes"]
     now = {
-        condition: sum(count for _, _, count in about["conditions"][condition]["draws"])
+        condition: sum(
+            count for _, _, count in manifest["conditions"][condition]["draws"]
+        )
         for condition in planned
     }
     if now == planned:
@@ -184,10 +182,11 @@ def _extended(about: Mapping[str, Any]) -> list[str]:
 def _interval(row: Mapping[Any, Any]) -> str:
     # The interval whose end decides a test at 5 %, before a correction.
     suffix, words = ("_90", "90 %") if row["kind"] in _OF_MARGINS else ("", "95 %")
-    low, high = row[f"low{suffix}"], row[f"high{suffix}"]
-    return (
-        NOT_USED if np.isnan(low) else (f"{_signed(low)} to {_signed(high)} ({words})")
-    )
+    low = row[f"low{suffix}"]
+    high = row[f"high{suffix}"]
+    if np.isnan(low):
+        return NOT_USED
+    return f"{_signed(low)} to {_signed(high)} ({words})"
 
 
 def _with_unit(row: Mapping[Any, Any]) -> str:

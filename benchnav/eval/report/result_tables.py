@@ -1,5 +1,4 @@
-"""The tables of a run: a row a condition, and, for a paper, settings down and scenarios
-across.
+"""Tables of a run: a row a condition; for a paper, a column a scenario.
 
 Source: Endo, Honda and Ishigami (2024), Table I.
 """
@@ -35,25 +34,26 @@ from benchnav.stats.bootstrap import LEAST_MAPS
 from benchnav.stats.holm import ALPHA
 from benchnav.stats.tables import Column, Row, cell_of, table_of
 
-# What `follows` is where a planner follows the user's objective alone.
+# Values of `follows` of planners that follow only the user's objective.
 _USERS_OWN = ("", "J")
 _ALWAYS = ("scenario", "planner", "risk")
 _SUCCESS = shipped.SUCCESS.quantity
 _TOTAL_TIME = shipped.TOTAL_TIME.quantity
-_MET = shipped.TRAVERSABILITY.quantity
-ALONE, IN_BATCH = "one robot [ms]", "per episode of a batch [ms]"
+_TRAVERSABILITY = shipped.TRAVERSABILITY.quantity
+ALONE = "one robot [ms]"
+IN_BATCH = "per episode of a batch [ms]"
 LATENCIES = ("median_ms", "p95_ms", "max_ms")
 _MEANINGS = {
     "data": "dataset.",
-    "scenario": "kind of ground: a test split of the dataset.",
+    "scenario": "kind of terrain: a test split of the dataset.",
     "world": "behaviour of λ during an episode, and rules of the task.",
     "robot": "motion model of the robot.",
     "objective": "cost J that planners minimise.",
     "model": "predictor of λ; the privileged models ideal, oracle and clairvoyant are "
     "given part of the truth.",
-    "sensor": "what a robot sees of its map.",
-    "ground": "what a robot senses of λ on its way.",
-    "belief": "what is made of what is sensed.",
+    "sensor": "appearance sensor: the observed part of the map.",
+    "ground": "traversability sensor: the measured λ.",
+    "belief": "update of the prediction by measurements.",
     "planner": "motion planner.",
     "risk": "risk setting, which turns the predicted distribution of λ into λ̂, the "
     "one number a planner is given.",
@@ -61,8 +61,8 @@ _MEANINGS = {
     "maps": "number of maps.",
     "episodes": "number of episodes.",
 }
-_PAPER = (_SUCCESS.heading, _TOTAL_TIME.heading, _MET.heading)
-_MOST_ACROSS = 3
+_PAPER = (_SUCCESS.heading, _TOTAL_TIME.heading, _TRAVERSABILITY.heading)
+_MAX_ACROSS = 3
 _SUPERSCRIPTS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
@@ -78,23 +78,21 @@ def _total_time(row: Row) -> str:
     return f"{mean} ({row['total_time_low_s']:.1f}–{row['total_time_high_s']:.1f})"
 
 
-def _met(row: Row) -> str:
-    met = mean_and_std(
+def _traversability(row: Row) -> str:
+    text = mean_and_std(
         100 * row["traversability_mean"], 100 * row["traversability_std"]
     )
-    # An episode that ended at once met nothing: its λ̄ is of fewer episodes than the
+    # An episode that ended at once observed no λ, so fewer episodes have λ̄ than the
     # row.
     some = 0 < row["traversability_n"] < row["n_episodes"]
-    return f"{met} (n = {row['traversability_n']})" if some else met
+    return f"{text} (n = {row['traversability_n']})" if some else text
 
 
 def _planning_time(row: Row) -> str:
-    compiled = (
-        "¶"
-        if row["compiled_share"] > 0 and not np.isnan(row["planning_ms_median"])
-        else ""
-    )
-    return _times(row["planning_ms_median"], row["planning_ms_p95_median"]) + compiled
+    median = row["planning_ms_median"]
+    is_compiled = row["compiled_share"] > 0 and not np.isnan(median)
+    times = _times(median, row["planning_ms_p95_median"])
+    return f"{times}¶" if is_compiled else times
 
 
 _RESULTS = (
@@ -108,7 +106,7 @@ _RESULTS = (
         _TOTAL_TIME.heading,
         _total_time,
         f"mean {_TOTAL_TIME.meaning}, with its 95 % interval in brackets; no interval "
-        f"under {LEAST_MAPS} maps.",
+        f"below {LEAST_MAPS} maps.",
     ),
     Column(
         "T if success [s]",
@@ -116,17 +114,18 @@ _RESULTS = (
         "time of the episodes that reached the goal, mean ± standard deviation.",
     ),
     Column(
-        _MET.heading, _met, f"{_MET.meaning}, mean ± standard deviation over episodes."
+        _TRAVERSABILITY.heading,
+        _traversability,
+        f"{_TRAVERSABILITY.meaning}, mean ± standard deviation over episodes.",
     ),
 )
-# Of the columns that not every run has, that of the summary which says so.
+# Optional columns, by the column of the summary that they require.
 _TIMES = {
     "latency_median_ms": Column(
         ALONE,
         lambda row: _times(*(row[f"latency_{name}"] for name in LATENCIES)),
-        "planning time of a step of one robot alone, on one thread: median (95th "
-        "percentile, maximum) over at most "
-        "100 steps.",
+        "planning time of a step of one robot without a batch, on one thread: median "
+        "(95th percentile, maximum) over at most 100 steps.",
     ),
     "planning_ms_median": Column(
         IN_BATCH,
@@ -144,18 +143,16 @@ def result_table(
     conditions: Mapping[str, Mapping[str, Any]],
     further: Sequence[Quantity] = (),
 ) -> Table:
-    """Formats a summary: rates and λ̄ in per cent; bold what is not significantly worse
-    than the best.
+    """Format a summary; rates not significantly below the best are bold.
 
-    Columns of labels that are the same for all conditions are left out, but for
-    scenario, planner and risk; so are the numbers of maps and episodes.
+    Labels that are the same for all conditions are left out, except scenario, planner
+    and risk; so are equal numbers of maps and episodes.
 
     Args:
-        summary: from `summary.summarise`, joined with `best.against_best` and perhaps
-            with latencies.
-        conditions: by id what `run.json` knows of them: `follows` and `remarks` become
-            notes.
-        further: quantities that the run has besides those of every run, a column each.
+        summary: from `summary.summarise`, joined with `best.against_best`, and with
+            latencies if there are any.
+        conditions: entries of `run.json` by id; `follows` and `remarks` become notes.
+        further: quantities in addition to the built-in ones, a column each.
     """
     marks, notes = _notes(summary, conditions)
     labels = _label_columns(summary, _ALWAYS)
@@ -183,12 +180,10 @@ def result_table(
         notes.append("¶ The planner ran as compiled code.")
     if (summary["best_rivals"] > 0).any() and not summary["best_marked"].any():
         few = summary["best_maps"].max() < FEWEST_MAPS
-        why = (
-            f"with fewer than {FEWEST_MAPS} {unit_of_statistics(summary)}s none can "
-            "be called"
-            if few
-            else "no setting is significantly"
-        )
+        why = "no setting is significantly"
+        if few:
+            unit = unit_of_statistics(summary)
+            why = f"with fewer than {FEWEST_MAPS} {unit}s none can be called"
         notes.append(f"No rate is bold: {why} worse than the best.")
     return table_of(
         rows,
@@ -200,9 +195,7 @@ def result_table(
 
 
 def _label_columns(summary: pd.DataFrame, always: Collection[str]) -> list[Column]:
-    """Return the columns of labels that differ and of those that always stand there; a
-    planner has its mark.
-    """
+    """Return the columns of labels that differ or are always shown."""
     return [
         Column(name, partial(_label, name), _MEANINGS[name])
         for name in LABELS
@@ -218,14 +211,14 @@ def _label(name: str, row: Row) -> str:
 def _further_column(quantity: Quantity) -> Column:
     meaning = (
         f"{quantity.meaning}: mean over episodes, with its 95 % interval in brackets; "
-        f"no interval under {LEAST_MAPS} "
-        "maps; n is the number of episodes that have it, if not all have."
+        f"no interval below {LEAST_MAPS} maps; n is the number of episodes that have "
+        "it, if not all have."
     )
     return Column(quantity.heading, partial(_mean_in_words, quantity), meaning)
 
 
 def _mean_in_words(quantity: Quantity, row: Row) -> str:
-    """The mean of a further quantity with its interval, in the quantity's unit."""
+    """Return the mean of a further quantity with its interval, in its unit."""
     mean, low, high = (
         quantity.scale * row[quantity.summary_column(name)]
         for name in ("mean", "low", "high")
@@ -238,7 +231,7 @@ def _mean_in_words(quantity: Quantity, row: Row) -> str:
 
 
 def learning_table(summary: pd.DataFrame) -> Table | None:
-    """What the robots of each condition learnt on their way; None where none learnt.
+    """Return the table of learning during episodes; None if no robot learnt.
 
     Args:
         summary: from `summary.summarise`.
@@ -247,7 +240,7 @@ def learning_table(summary: pd.DataFrame) -> Table | None:
         return None
     rows = summary[summary["revisions_mean"].notna()].to_dict("records")
     full = {
-        _but_sensor(row): row
+        _without_sensor(row): row
         for row in summary.to_dict("records")
         if row["sensor"] == "full"
     }
@@ -266,23 +259,21 @@ def learning_table(summary: pd.DataFrame) -> Table | None:
             "time of a step for planning, likewise: median over steps.",
         ),
     ]
-    if any(row["sensor"] != "full" and _but_sensor(row) in full for row in rows):
+    if any(row["sensor"] != "full" and _without_sensor(row) in full for row in rows):
         columns += [
             Column(
                 "Succ. to full [points]",
-                lambda row: _lost(row, full, "success_rate", 100),
-                "success less that of the same condition with the sensor `full`; "
+                lambda row: _difference_to_full(row, full, "success_rate", 100),
+                "success minus that of the same condition with the sensor `full`; "
                 "`compare --by sensor --against full` has the interval and the test.",
             ),
             Column(
                 "T_total to full [s]",
-                lambda row: _lost(row, full, "total_time_mean_s", 1),
-                "mean T_total less that of the same condition with the sensor `full`.",
+                lambda row: _difference_to_full(row, full, "total_time_mean_s", 1),
+                "mean T_total minus that of the same condition with the sensor `full`.",
             ),
         ]
-    return table_of(
-        rows, columns, labels=len(labels), title="What robots learnt on their way"
-    )
+    return table_of(rows, columns, labels=len(labels), title="Learning during episodes")
 
 
 def _mean_column(metric: Metric, write: Callable[[Any], str]) -> Column:
@@ -292,33 +283,33 @@ def _mean_column(metric: Metric, write: Callable[[Any], str]) -> Column:
     )
 
 
-def _but_sensor(row: Row) -> tuple[str, ...]:
-    """What a condition is beside its sensor of appearance."""
+def _without_sensor(row: Row) -> tuple[str, ...]:
+    """Return the labels of a condition except its appearance sensor."""
     return tuple(str(row[name]) for name in LABELS if name != "sensor")
 
 
-def _lost(
+def _difference_to_full(
     row: Row, full: Mapping[tuple[str, ...], Row], name: str, scale: float
 ) -> str:
-    """A value less that of a robot that sees all."""
-    reference = full.get(_but_sensor(row))
+    """Return a value minus that of a robot that observes the whole map."""
+    reference = full.get(_without_sensor(row))
     if reference is None or row["sensor"] == "full":
         return NOT_USED
     return f"{scale * (row[name] - reference[name]):+.1f}"
 
 
 def paper_table(summary: pd.DataFrame, label: str, mark: str = "") -> str:
-    """Writes a complete LaTeX table, settings down and blocks across, each with
-    success, T_total and λ̄.
+    """Return a complete LaTeX table: a row a setting, and columns for each block.
 
-    More than three blocks stand in several tabulars under each other.
+    The columns are success, T_total and λ̄. More than three blocks are split over
+    several tabulars.
 
     Args:
         summary: from `summary.summarise`, joined with `best.against_best`.
-        label: what the table is referred to by.
+        label: LaTeX label of the table.
         mark: words that the caption begins with.
     """
-    known = blocks(summary)
+    all_blocks = blocks(summary)
     count = maps_in_words(
         *(count_range(summary[name]) for name in ("n_maps", "n_groups"))
     )
@@ -332,25 +323,24 @@ def paper_table(summary: pd.DataFrame, label: str, mark: str = "") -> str:
     )
     several = naming_labels(summary)
     tables = [
-        _across(known[i : i + _MOST_ACROSS], several)
-        for i in range(0, len(known), _MOST_ACROSS)
+        _across(all_blocks[i : i + _MAX_ACROSS], several)
+        for i in range(0, len(all_blocks), _MAX_ACROSS)
     ]
-    return to_latex(tables, caption, label, wide=len(known) > 1, size="footnotesize")
+    return to_latex(
+        tables, caption, label, wide=len(all_blocks) > 1, size="footnotesize"
+    )
 
 
-def _across(known: Sequence[tuple[str, pd.DataFrame]], several: Sequence[str]) -> Table:
-    """The table of some blocks, side by side; a label that is the same as over it is
-    left out.
-    """
+def _across(
+    shown_blocks: Sequence[tuple[str, pd.DataFrame]], several: Sequence[str]
+) -> Table:
+    """Return the table of some blocks, side by side, without repeated labels."""
     labels = ["planner", *several, "risk"]
     side_by_side = []
-    for _, rows in known:
+    for _, rows in shown_blocks:
         settings = pd.MultiIndex.from_frame(rows[labels])
-        side_by_side.append(
-            pd.DataFrame(
-                map(_in_paper, rows.to_dict("records")), settings, dtype=object
-            )
-        )
+        cells = map(_in_paper, rows.to_dict("records"))
+        side_by_side.append(pd.DataFrame(cells, settings, dtype=object))
     table = pd.concat(side_by_side, axis=1).fillna(NOT_USED)
     names = table.index.to_frame(index=False)
     names = names.iloc[names["planner"].factorize()[0].argsort(kind="stable")]
@@ -361,11 +351,12 @@ def _across(known: Sequence[tuple[str, pd.DataFrame]], several: Sequence[str]) -
     return Table(
         headings=(
             *(name.capitalize() for name in labels),
-            *(_SUCCESS.heading, _TOTAL_TIME.heading, _MET.heading) * len(known),
+            *(_SUCCESS.heading, _TOTAL_TIME.heading, _TRAVERSABILITY.heading)
+            * len(shown_blocks),
         ),
         labels=len(labels),
         rows=tuple(map(tuple, np.hstack([names.mask(as_above, ""), cells]))),
-        groups=tuple(title for title, _ in known),
+        groups=tuple(title for title, _ in shown_blocks),
         rules=frozenset(np.flatnonzero(~as_above["planner"])[1:].tolist()),
     )
 
@@ -380,7 +371,7 @@ def _in_paper(row: Row) -> list[str]:
 
 
 def bold_note(summary: pd.DataFrame) -> str:
-    """Says what bold means in a table of a run; nothing where nothing is bold.
+    """Return the meaning of bold in a table of a run; empty if nothing is bold.
 
     Args:
         summary: as in `result_table`.
@@ -394,16 +385,13 @@ def bold_note(summary: pd.DataFrame) -> str:
         f"{unit_of_statistics(summary)}, p ≥ {ALPHA})"
     )
     left_out = pd.concat([rows[~competing(rows)] for _, rows in blocks(summary)])
-    models = dict.fromkeys(
-        model
-        for part in PRIVILEGED
-        for model in left_out.loc[left_out["privileged"] == part, "model"]
-    )
-    return (
-        f"{words}. Privileged models ({', '.join(models)}) do not compete."
-        if models
-        else f"{words}."
-    )
+    models: dict[str, None] = {}
+    for part in PRIVILEGED:
+        of_part = left_out.loc[left_out["privileged"] == part, "model"]
+        models |= dict.fromkeys(of_part)
+    if not models:
+        return f"{words}."
+    return f"{words}. Privileged models ({', '.join(models)}) do not compete."
 
 
 def _number(value: float) -> str:
@@ -411,7 +399,7 @@ def _number(value: float) -> str:
 
 
 def _times(*values: float) -> str:
-    """Milliseconds by two digits that count, all but the first in brackets."""
+    """Format milliseconds with two significant digits, all but the first in brackets."""
     if np.isnan(values[0]):
         return NOT_USED
     first, *rest = (
@@ -424,22 +412,18 @@ def _times(*values: float) -> str:
 def _notes(
     summary: pd.DataFrame, conditions: Mapping[str, Mapping[str, Any]]
 ) -> tuple[list[str], list[str]]:
-    """Raised numbers of each condition, and the notes that they refer to; equal texts
-    share a number.
-    """
+    """Return each condition's note numbers, and the notes; equal notes have one number."""
     numbers: dict[str, str] = {}
     marks = []
     for condition in summary["condition"]:
-        about = conditions[condition]
-        follows = about["follows"]
-        texts = (
-            []
-            if follows in _USERS_OWN
-            else [f"Cost minimised in place of J: {follows}."]
-        )
-        own = [
+        entry = conditions[condition]
+        follows = entry["follows"]
+        texts = []
+        if follows not in _USERS_OWN:
+            texts.append(f"Cost minimised in place of J: {follows}.")
+        numbers_of_condition = [
             numbers.setdefault(text, str(len(numbers) + 1).translate(_SUPERSCRIPTS))
-            for text in (*texts, *about["remarks"])
+            for text in (*texts, *entry["remarks"])
         ]
-        marks.append(",".join(own))
+        marks.append(",".join(numbers_of_condition))
     return marks, [f"{number} {text}" for text, number in numbers.items()]

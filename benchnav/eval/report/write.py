@@ -1,15 +1,10 @@
-"""The report of a run: what it says, its table, where its rows come from, and its
-figures.
-"""
+"""The report of a run: findings, table, provenance and figures."""
 
 import base64
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
@@ -19,17 +14,16 @@ from benchnav.core.errors import ConfigError
 from benchnav.core.settings import one_line
 from benchnav.core.store import write_text
 from benchnav.core.tables import Table, markdown, print_table, to_latex, to_markdown
-from benchnav.eval.experiment.condition import KNOWLEDGE
 from benchnav.eval.experiment.metrics import further_quantities, quantities
 from benchnav.eval.failures import RecordDriven, collect_sheets, failures_table
 from benchnav.eval.figures.data import RunData
 from benchnav.eval.figures.shipped import SHIPPED, figures_of
 from benchnav.eval.folder.checksums import note_checksums
-from benchnav.eval.folder.provenance import METRICS, command_lines
+from benchnav.eval.folder.provenance import command_lines
 from benchnav.eval.folder.results import read_results
 from benchnav.eval.folder.run_folder import ERRORS, caveats
-from benchnav.eval.recording import MAP
 from benchnav.eval.report.findings import findings
+from benchnav.eval.report.header import header_lines, provenance_lines
 from benchnav.eval.report.hypotheses import hypothesis_findings, hypothesis_table
 from benchnav.eval.report.result_tables import (
     LATENCIES,
@@ -39,12 +33,12 @@ from benchnav.eval.report.result_tables import (
 )
 from benchnav.eval.stats.best import against_best, privileged_models
 from benchnav.eval.stats.hypotheses import test_hypotheses
-from benchnav.eval.stats.regret import best_possible, split_regret
-from benchnav.eval.stats.summary import summarise, time_budgets
-from benchnav.eval.words import NOT_USED, joined, maps_in_words, unit_of_statistics
+from benchnav.eval.stats.regret import split_regret
+from benchnav.eval.stats.summary import summarise
+from benchnav.eval.words import unit_of_statistics
 from benchnav.planning.world.outcome import ERROR_OUTCOMES
 from benchnav.viz.figure import Figure
-from benchnav.viz.style import planner_name, save_twice
+from benchnav.viz.style import save_twice
 
 PAGE = "report.html"
 PARTIAL = "partial"  # folder of the report of a run that is not finished
@@ -52,16 +46,16 @@ PARTIAL = "partial"  # folder of the report of a run that is not finished
 
 @dataclass(frozen=True, kw_only=True)
 class Report(RunData):
-    """What is reported of a run, and the data behind it.
+    """The report of a run, and the data that it is based on.
 
     Args:
-        name: of the run.
-        header: lines on where the rows come from.
-        findings: what the run says, sentences by the title over them.
-        table: a row a condition.
-        warnings: lines on what went wrong, or could not be shown.
-        mark: what says that the run is not finished; empty where it is.
-        faults: of the warnings those on figures of the user that could not be drawn.
+        name: name of the run.
+        header: lines on the settings of the run.
+        findings: sentences by their title.
+        table: table of results, a row a condition.
+        warnings: lines on faults, and on what could not be shown.
+        mark: mark of a run that is not finished; empty if it is.
+        faults: warnings on custom figures that could not be drawn.
     """
 
     name: str
@@ -74,42 +68,42 @@ class Report(RunData):
 
     @property
     def learning(self) -> Table | None:
-        """What robots learnt on their way; None where none learnt."""
+        """The table of learning during episodes; None if no robot learnt."""
         table = learning_table(self.summary)
         return table and self.marked(table)
 
     @property
     def hypotheses(self) -> Table:
-        """The table of `tests`."""
-        known = quantities(further_quantities(self.about))
+        """The formatted `tests`."""
+        all_quantities = quantities(further_quantities(self.about))
         return self.marked(
-            hypothesis_table(self.tests, unit_of_statistics(self.summary), known)
+            hypothesis_table(
+                self.tests, unit_of_statistics(self.summary), all_quantities
+            )
         )
 
     def marked(self, table: Table) -> Table:
-        """A table that says so where the run is not finished."""
-        return replace(
-            table, notes=(*([_capital(self.mark)] if self.mark else []), *table.notes)
-        )
+        """Return a table with a note if the run is not finished."""
+        if not self.mark:
+            return table
+        return replace(table, notes=(_capital(self.mark), *table.notes))
 
     def says(self, text: str) -> str:
-        """A text that begins with the mark of a run that is not finished."""
+        """Return a text, preceded by the mark of a run that is not finished."""
         return f"{_capital(self.mark)}. {text}" if self.mark else text
 
     def csv(self, table: pd.DataFrame, digits: int = 6) -> str:
-        """A table as CSV; of a run that is not finished it has a column `partial`."""
-        marked = (
-            table.assign(partial=self.mark.removeprefix("partial: "))
-            if self.mark
-            else table
-        )
+        """Return a table as CSV, with a column `partial` if the run is not finished."""
+        marked = table
+        if self.mark:
+            marked = table.assign(partial=self.mark.removeprefix("partial: "))
         return marked.to_csv(index=False, float_format=f"%.{digits}g")
 
 
 def read_report(
     folder: Path, record_driven: RecordDriven | None = None, partial: bool = False
 ) -> Report:
-    """Makes the report of a run, and writes nothing.
+    """Create the report of a run without writing it.
 
     Args:
         folder: a finished run.
@@ -121,50 +115,52 @@ def read_report(
         ConfigError: the folder is no run folder, or its run is not finished.
     """
     results = read_results(folder, partial)
-    about, episodes = results.run.about, results.episodes
+    manifest = results.run.about
+    episodes = results.episodes
     worlds = {
         condition: entry["value"]["world"]
-        for condition, entry in about["conditions"].items()
+        for condition, entry in manifest["conditions"].items()
     }
-    further = further_quantities(about)
+    further = further_quantities(manifest)
     summary = summarise(episodes, worlds, further)
-    tests = (
-        test_hypotheses(
-            about["hypotheses"],
+    tests = pd.DataFrame()
+    if "hypotheses" in manifest:
+        tests = test_hypotheses(
+            manifest["hypotheses"],
             episodes,
             worlds,
             not results.is_partial,
             quantities(further),
         )
-        if "hypotheses" in about
-        else pd.DataFrame()
-    )
-    best = against_best(episodes, summary, privileged_models(about["conditions"]))
+    best = against_best(episodes, summary, privileged_models(manifest["conditions"]))
     summary = summary.merge(best, on="condition", how="left", validate="1:1")
-    # How long a step of one robot takes, where the run measured it.
-    known = [
-        about["conditions"][condition].get("latency", {})
+    # Planning time of a step of one robot, if the run measured it.
+    latencies = [
+        manifest["conditions"][condition].get("latency", {})
         for condition in summary["condition"]
     ]
     summary = summary.join(
-        pd.DataFrame(known, columns=LATENCIES, dtype=float).add_prefix("latency_")
+        pd.DataFrame(latencies, columns=LATENCIES, dtype=float).add_prefix("latency_")
     )
     failures = failures_table(folder, episodes)
     sheets = collect_sheets(summary, failures, record_driven)
-    said = findings(summary, failures, sheets.predicted)
+    findings_by_title = findings(summary, failures, sheets.predicted)
     if not tests.empty:
-        # Beside hypotheses that were fixed before the run all else is exploratory.
+        # If hypotheses were fixed before the run, all other findings are exploratory.
         explored = {
-            f"Exploratory: {title}": sentences for title, sentences in said.items()
+            f"Exploratory: {title}": sentences
+            for title, sentences in findings_by_title.items()
         }
-        said = hypothesis_findings(tests, about, unit_of_statistics(summary)) | explored
+        findings_by_title = (
+            hypothesis_findings(tests, manifest, unit_of_statistics(summary)) | explored
+        )
     if results.mark:
-        said = {
+        findings_by_title = {
             f"{_capital(results.mark)}. {title}": sentences
-            for title, sentences in said.items()
+            for title, sentences in findings_by_title.items()
         }
-    warnings = [*results.notes(), *caveats(about)]
-    about = {**about, "conditions": results.conditions}
+    warnings = [*results.notes(), *caveats(manifest)]
+    manifest = {**manifest, "conditions": results.conditions}
     if count := summary[[f"{name}_count" for name in ERROR_OUTCOMES]].to_numpy().sum():
         episodes_in_words = "1 episode" if count == 1 else f"{count} episodes"
         warnings.append(
@@ -175,21 +171,17 @@ def read_report(
         warnings.append(f"note: {sheets.left_out}")
     report = Report(
         name=folder.resolve().name,
-        header=(
-            *_header(summary, about),
-            *_rejected_draws(episodes, about["conditions"]),
-            *_bracket(episodes, about["conditions"], worlds),
-        ),
-        findings=said,
-        table=result_table(summary, about["conditions"], further),
+        header=header_lines(summary, episodes, manifest, worlds),
+        findings=findings_by_title,
+        table=result_table(summary, manifest["conditions"], further),
         warnings=tuple(warnings),
         summary=summary,
         tests=tests,
-        regret=split_regret(about["conditions"], episodes, worlds),
+        regret=split_regret(manifest["conditions"], episodes, worlds),
         episodes=episodes,
         failures=failures,
         sheets=sheets,
-        about=about,
+        about=manifest,
         folder=folder,
         record_driven=record_driven,
         mark=results.mark,
@@ -204,21 +196,20 @@ def write_report(
     partial: bool = False,
     figures: Sequence[Figure] = (),
 ) -> Report:
-    """Writes `report.html`, `summary.{csv,md,tex}`, `failures.csv` and `figures/` of a
-    run.
+    """Write `report.html`, `summary.{csv,md,tex}`, `failures.csv` and `figures/`.
 
     Args:
         folder: a finished run.
-        record_driven: records driven episodes again, as `run.recordings.record_driven`
-            does of the folder; without it no failure is shown on a map.
-        out: where to. If not given, the run folder, and its folder `PARTIAL` for a run
-            that is not finished.
-        partial: also of a run that is not finished, of what is there.
-        figures: of the user, drawn after the shipped ones and those that the suite
-            names. One that raises is left out, and a line of `Report.faults` says why.
+        record_driven: records driven episodes again, such as
+            `run.recordings.record_driven`; if None, no failure is shown on a map.
+        out: folder of the report; by default the run folder, or its folder `PARTIAL`
+            for a run that is not finished.
+        partial: whether to accept a run that is not finished.
+        figures: custom figures, drawn after the shipped ones and those of the suite.
+            One that raises is left out, and a line of `Report.faults` says why.
 
     Returns:
-        The report as it was written.
+        The report as written.
     """
     report = read_report(folder, record_driven, partial)
     out = out or (folder / PARTIAL if report.mark else folder)
@@ -260,21 +251,17 @@ def write_report(
 
 
 def print_report(report: Report) -> None:
-    """Prints what a run says and its table, as wide as the terminal, or unbroken where
-    none is.
-    """
-    print(
-        "\n".join([*([_capital(report.mark)] if report.mark else []), *report.header])
-    )
+    """Print findings and table, as wide as the terminal, or without line breaks."""
+    if report.mark:
+        print(_capital(report.mark))
+    print("\n".join(report.header))
     print_table(report.table)
     if report.learning:
         print_table(report.learning)
-    said = [
-        line
-        for title, lines in report.findings.items()
-        for line in (f"{title}:", *lines)
-    ]
-    print("\n".join([*report.warnings, *said]))
+    lines = list(report.warnings)
+    for title, sentences in report.findings.items():
+        lines += [f"{title}:", *sentences]
+    print("\n".join(lines))
 
 
 def _capital(text: str) -> str:
@@ -284,23 +271,21 @@ def _capital(text: str) -> str:
 def _draw_figures(
     report: Report, figures: Sequence[Figure], folder: Path
 ) -> tuple[dict[Path, str], tuple[str, ...]]:
-    """Write the figures of a run, those of the user last.
+    """Write the figures of a run, custom ones last.
 
     Returns:
-        By the path of its PNG what each shows; and a line for each figure of the user
-        that could not be drawn.
+        Captions by path of the PNG, and a line for each custom figure that could not be
+        drawn.
     """
     captions: dict[Path, str] = {}
     _save_figures(report, figures_of(report), folder, captions)
     faults = []
-    for given in (*report.about.get("suite", {}).get("figures", ()), *figures):
-        name = (
-            given["part"]
-            if isinstance(given, Mapping)
-            else getattr(given, "name", given)
-        )
+    for spec in (*report.about.get("suite", {}).get("figures", ()), *figures):
+        name = getattr(spec, "name", spec)
+        if isinstance(spec, Mapping):
+            name = spec["part"]
         try:
-            figure = registry.take("figure", given)
+            figure = registry.take("figure", spec)
             if type(figure) not in SHIPPED:
                 _save_figures(report, figure.variants(report), folder, captions)
         except Exception as error:
@@ -315,119 +300,22 @@ def _save_figures(
         path = folder / f"{figure.name}.png"
         if path in captions or path.parent != folder or not figure.name:
             raise ConfigError(
-                "Expected the name of a figure that no other has, got "
-                f"{figure.name!r}. Rename it."
+                f"Expected a figure with a unique name, got {figure.name!r}. Rename it."
             )
         caption = report.says(figure.caption(report))
         save_twice(figure(report), path, trim=figure.trim, mark=_capital(report.mark))
         captions[path] = caption
 
 
-def _header(summary: pd.DataFrame, about: Mapping[str, Any]) -> list[str]:
-    conditions = [about["conditions"][condition] for condition in summary["condition"]]
-    worlds = {
-        condition["labels"]["world"]: _world(condition["value"])
-        for condition in conditions
-    }
-    lines = [f"World {label}: {text}." for label, text in worlds.items()]
-    seeds = dict.fromkeys(
-        seed for condition in conditions for seed in condition["seeds"]
-    )
-    data, models = (
-        joined(summary[name].unique()) or NOT_USED for name in ("data", "model")
-    )
-    lines.append(f"Data: {data}. Models: {models}. Seeds: {joined(map(str, seeds))}.")
-    if summary["revisions_mean"].notna().any():
-        known = (
-            f"{kind} {joined(summary[kind].unique()) or NOT_USED}" for kind in KNOWLEDGE
-        )
-        lines.append(f"What robots know by: {'; '.join(known)}.")
-    if len(summary[["n_episodes", "n_maps", "n_groups"]].drop_duplicates()) == 1:
-        maps = maps_in_words(summary["n_maps"][0], summary["n_groups"][0])
-        lines.append(f"Each condition: {summary['n_episodes'][0]} episodes on {maps}.")
-    options = dict.fromkeys(
-        f"{condition['labels']['planner']} {change}"
-        for condition in conditions
-        for change in condition["changed"]
-    )
-    return [*lines, f"Planner options: {', '.join(options)}."] if options else lines
-
-
-def _rejected_draws(episodes: pd.DataFrame, conditions: Mapping[str, Any]) -> list[str]:
-    """The share of draws of frozen λ that were rejected."""
-    frozen = [
-        name
-        for name, about in conditions.items()
-        if about["value"]["world"]["noise"] == "frozen"
-    ]
-    episodes = episodes[episodes["condition"].isin(frozen)]
-    if not episodes["rejected_draws"].any():
-        return []
-    # All conditions met the same; where a model failed nothing was drawn.
-    again = episodes.groupby(MAP)["rejected_draws"].max()
-    share = again.sum() / (again + 1).sum()
-    return [
-        f"{100 * share:.1f} % of the draws of λ had no feasible path from start to "
-        "goal and were rejected."
-    ]
-
-
-def _bracket(
-    episodes: pd.DataFrame,
-    conditions: Mapping[str, Any],
-    worlds: Mapping[str, Mapping[str, Any]],
-) -> list[str]:
-    """Both ends between which the least time lies, of each condition whose planner is
-    given λ.
-    """
-    found = []
-    for name, rows in episodes.groupby("condition", sort=False):
-        rows = rows.assign(time_budget_s=time_budgets(rows, worlds[str(name)]))
-        best = best_possible(rows)
-        if np.isnan(best["time_bound"]):
-            continue
-        reached, time_s = rows["success"].mean(), rows["total_time_s"].mean()
-        labels = conditions[str(name)]["labels"]
-        found.append(
-            f"The best that any planner can do ({labels['scenario']}, "
-            f"{labels['world']}) lies between a lower bound "
-            f"and what {planner_name(labels['planner'])} drives: T_total "
-            f"{best['time_bound']:.1f} to {time_s:.1f} s, "
-            f"success {100 * reached:.1f} to {100 * best['success_bound']:.1f} %."
-        )
-    return found
-
-
-def _world(value: Mapping[str, Any]) -> str:
-    world, free = value["world"], value["rules"]["free_space"]
-    words = [f"λ {world['noise']}"]
-    if "correlation_m" in world:
-        words[0] += f", correlated over {world['correlation_m']:g} m"
-        words[0] += " (Matérn-3/2)" if world.get("kernel") == "matern32" else ""
-    if "immobile" in world:
-        held = world["immobile"]
-        words.append(
-            f"λ below {held['below']:g} for {held['for_s']:g} s immobilises the robot"
-        )
-    if "time_budget_ratio" in world:
-        words.append(
-            f"time budget T = {world['time_budget_ratio']:g} × the reference time at "
-            "the top speed"
-        )
-    else:
-        words.append(f"time budget T = {world['time_budget_s']:g} s")
-    by = "mean λ" if free["by"] == "mean" else "λ̂"
-    return "; ".join([*words, f"free ground has {by} above {free['above']:g}"])
-
-
 def render(file: str, report: Report, figures: Mapping[Path, str]) -> str:
-    """Fills the template of a file; in HTML all text is escaped, and the page needs no
-    other file and no network.
+    """Return the text of a file from its template.
+
+    In HTML all text is escaped, and the page needs no other file and no network.
 
     Args:
         file: `report.html` or `summary.md`.
-        report: what is said.
-        figures: by the path of its PNG what each shows.
+        report: the report.
+        figures: captions by path of the PNG.
     """
     environment = Environment(
         loader=PackageLoader("benchnav.eval.report", "templates"),
@@ -451,49 +339,10 @@ def render(file: str, report: Report, figures: Mapping[Path, str]) -> str:
     )
 
 
-def provenance_lines(about: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Says where a run came from, (what, value).
-
-    Args:
-        about: all of `run.json`.
-    """
-    machine, codes, last = (
-        about["machine"],
-        about["codes"].values(),
-        about["history"][-1],
-    )
-    lines = [
-        ("commit of benchnav", last["commit"]),
-        ("version of benchnav", last["benchnav"]),
-    ]
-    for environment in {
-        json.dumps(code["environment"]): code["environment"] for code in codes
-    }.values():
-        lines += [(name, str(value)) for name, value in environment.items()]
-    lines.append(("machine", f"{machine['processor']}, {machine['cores']} cores"))
-    for data, known in about["datasets"].items():
-        maps = ", ".join(
-            f"{split} {len(digests)}" for split, digests in known["maps"].items()
-        )
-        lines.append((f"dataset {data}", f"{known['id']}; maps: {maps}"))
-    lines += dict.fromkeys(part for code in codes for part in code["parts"].items())
-    metrics = [entry for code in codes for entry in code.get(METRICS, {}).items()]
-    lines += dict.fromkeys(
-        (f"metric {column}", own["digest"]) for column, own in metrics
-    )
-    seeds = dict.fromkeys(
-        seed
-        for condition in about["conditions"].values()
-        for seed in condition["seeds"]
-    )
-    lines.append(("seeds", ", ".join(map(str, seeds))))
-    return [(name, value) for name, value in lines if value]
-
-
 def _inline(path: Path) -> str:
     return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()
 
 
 def _pixels(path: Path) -> int:
-    """The width of a PNG, which its header holds."""
+    """Return the width of a PNG from its header."""
     return int.from_bytes(path.read_bytes()[16:20])

@@ -1,6 +1,4 @@
-"""What a command asks of a run, and the `run.json` that a run begins with or is
-extended by.
-"""
+"""Requests of a command, and the `run.json` that a run starts or is extended with."""
 
 import json
 import os
@@ -42,14 +40,14 @@ from benchnav.eval.run.unit import Settings
 
 @dataclass(frozen=True, kw_only=True)
 class Work(Checked):
-    """What a command asks of a run, beside what of a suite is to be run.
+    """A checked suite with the further options of a command.
 
     Args:
-        suite: as it was written, for `run.json`.
-        record: what is kept of episodes beside their rows.
-        settings: how units are run.
-        shard: which shard of the units is run; None for all.
-        reuse_code: whether finished units of other code count.
+        suite: the suite as it was written, for `run.json`.
+        record: what is stored of episodes in addition to rows.
+        settings: settings of units.
+        shard: shard of the units that is run; None for all.
+        reuse_code: whether to accept finished units of other code.
     """
 
     suite: Mapping[str, Any]
@@ -62,15 +60,15 @@ class Work(Checked):
 def begin(
     work: Work, folder: Path, say: Say
 ) -> tuple[Conditions, Conditions, tuple[Part, ...]]:
-    """Writes `run.json`, or extends the one that is there.
+    """Write `run.json`, or extend an existing one.
 
     Returns:
-        What the command asks for, all conditions of the run, and the metrics that its
-        rows have besides those that every run has.
+        The requested conditions, all conditions of the run, and the run's metrics in
+        addition to the built-in ones.
 
     Raises:
-        ConfigError: the folder holds something else, or a run that this one cannot
-            extend.
+        ConfigError: If the folder contains something else, or a run that cannot be
+            extended by this one.
     """
     if not (folder / RUN).exists():
         if is_taken(folder):
@@ -98,7 +96,8 @@ def begin(
             f"{'metric' if len(new_names) == 1 else 'metrics'} {', '.join(new_names)}"
         )
         (folder / EPISODES).unlink(missing_ok=True)
-    conditions, asked = dict(earlier.conditions), {}
+    conditions = dict(earlier.conditions)
+    requested = {}
     # What differs from an earlier condition only in what is not used is run as that
     # one.
     rows_ids = {
@@ -110,38 +109,39 @@ def begin(
             if condition_id in conditions
             else rows_ids.get(condition.rows_id, condition_id)
         )
-        known, known_extent = conditions.get(name, (condition, extent))
-        merged = merge(condition if condition.id == name else known, (known, condition))
-        asked[name] = merged, extent
-        conditions[name] = merged, known_extent.union(extent)
+        earlier_condition, earlier_extent = conditions.get(name, (condition, extent))
+        merged = merge(
+            condition if condition.id == name else earlier_condition,
+            (earlier_condition, condition),
+        )
+        requested[name] = merged, extent
+        conditions[name] = merged, earlier_extent.union(extent)
     if conditions != earlier.conditions:
         new = len(conditions.keys() - earlier.conditions.keys())
         more = {0: "by more episodes", 1: "by 1 new condition"}.get(
             new, f"by {new} new conditions"
         )
         say(f"{folder} is extended {more}")
-        (folder / EPISODES).unlink(
-            missing_ok=True
-        )  # until all that is asked for is there
+        # The table is written again when all requested units are finished.
+        (folder / EPISODES).unlink(missing_ok=True)
     now = _about(earlier.about, work, conditions)
     if now != earlier.about:
         write_run(folder, now)
-    return asked, conditions, tuple(metric.part for metric in metrics)
+    return requested, conditions, tuple(metric.part for metric in metrics)
 
 
 def drop(folder: Path) -> None:
-    """Empties a run folder, which stays what it is: a link, another file system, the
-    folder that the user is in.
+    """Empty a run folder, but keep the folder itself.
+
+    It may be a link, another file system or the working folder.
     """
     if is_taken(folder):
-        open_run(folder)  # Only what is a run folder may be dropped.
-        place = folder.resolve()
-        with TemporaryDirectory(
-            dir=place.parent, prefix=f".{place.name}.dropped-"
-        ) as dropped:
-            # `run.json` last, so that a kill leaves a run that can be dropped or gone
-            # on with.
-            for path in sorted(place.iterdir(), key=lambda path: path.name == RUN):
+        open_run(folder)  # Only a run folder may be emptied.
+        target = folder.resolve()
+        prefix = f".{target.name}.dropped-"
+        with TemporaryDirectory(dir=target.parent, prefix=prefix) as dropped:
+            # `run.json` last, so that an interrupted call can be repeated.
+            for path in sorted(target.iterdir(), key=lambda path: path.name == RUN):
                 os.replace(path, Path(dropped, path.name))
 
 
@@ -154,7 +154,7 @@ def _check_extends(work: Work, earlier: Run) -> None:
             f"{_in_words(earlier.shard)}. Choose another `out`."
         )
     check_resumable(earlier)
-    # Others would be written after what they are tested by.
+    # Other hypotheses would be written after the results that they are tested on.
     fixed = earlier.about.get("hypotheses", {}).get("digest", "none")
     if work.hypotheses and work.hypotheses["digest"] != fixed:
         raise ConfigError(
@@ -165,8 +165,8 @@ def _check_extends(work: Work, earlier: Run) -> None:
         )
     check_labels(
         condition
-        for known in (earlier, work)
-        for condition, _ in known.conditions.values()
+        for conditions_of in (earlier, work)
+        for condition, _ in conditions_of.conditions.values()
     )
 
 
@@ -201,44 +201,35 @@ def _in_words(shard: Shard | None) -> str:
 def _about(
     earlier: Mapping[str, Any], work: Work, conditions: Conditions
 ) -> dict[str, Any]:
-    """What `run.json` is to hold, of which the folder may hold an earlier state."""
-    known = earlier.get("conditions", {})
-    entries = {
-        condition_id: {
-            **{
-                "value": condition.value,
-                "labels": condition.labels,
-                **_notes(condition),
-            },
-            **({"stands_for": condition.stands_for} if condition.stands_for else {}),
-            **{"seeds": extent.seeds, "draws": extent.draws},
-            **{
-                name: value
-                for name, value in known.get(condition_id, {}).items()
-                if name == "latency"
-            },
+    """Return the contents of `run.json`, from an earlier state of it."""
+    earlier_entries = earlier.get("conditions", {})
+    entries = {}
+    for condition_id, (condition, extent) in conditions.items():
+        entry = {
+            "value": condition.value,
+            "labels": condition.labels,
+            **_notes(condition),
         }
-        for condition_id, (condition, extent) in conditions.items()
-    }
-    about = {
+        if condition.stands_for:
+            entry["stands_for"] = condition.stands_for
+        entry["seeds"] = extent.seeds
+        entry["draws"] = extent.draws
+        earlier_entry = earlier_entries.get(condition_id, {})
+        if "latency" in earlier_entry:
+            entry["latency"] = earlier_entry["latency"]
+        entries[condition_id] = entry
+    hypotheses = earlier.get("hypotheses", work.hypotheses)
+    dropped = [*earlier.get("dropped", ()), *work.dropped]
+    metrics = [metric.entry for metric in work.metrics]
+    manifest = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
         **({"shard": asdict(work.shard)} if work.shard else {}),
         "suite": dict(work.suite),
-        **(
-            {"hypotheses": fixed}
-            if (fixed := earlier.get("hypotheses", work.hypotheses))
-            else {}
-        ),
-        **(
-            {"metrics": [metric.about for metric in work.metrics]}
-            if work.metrics
-            else {}
-        ),
+        **({"hypotheses": hypotheses} if hypotheses else {}),
+        **({"metrics": metrics} if metrics else {}),
         "conditions": entries,
-        "dropped": _still_dropped(
-            [*earlier.get("dropped", ()), *work.dropped], conditions
-        ),
+        "dropped": _still_dropped(dropped, conditions),
         "warnings": provenance.join(earlier.get("warnings", ()), work.warnings),
         **asdict(work.settings),
         "gpu": gpu_name(work.settings.device),
@@ -251,28 +242,33 @@ def _about(
             if name in earlier
         },
     }
-    return json.loads(json.dumps(about))
+    return json.loads(json.dumps(manifest))
 
 
 def _still_dropped(
     dropped: Iterable[dict[str, str]], conditions: Conditions
 ) -> list[dict[str, str]]:
-    """What was left out and is in no condition, as its parts may have been changed
-    since; each once.
+    """Return the combinations left out that are in no condition, each once.
+
+    A combination may have become a condition after a change of its parts.
     """
-    known = [set(condition.labels.items()) for condition, _ in conditions.values()]
+    condition_labels = [
+        set(condition.labels.items()) for condition, _ in conditions.values()
+    ]
     return provenance.join(
         entry
         for entry in dropped
-        if not any(set(dropped_labels(entry).items()) <= labels for labels in known)
+        if not any(
+            set(dropped_labels(entry).items()) <= labels for labels in condition_labels
+        )
     )
 
 
 def _notes(condition: Condition) -> dict[str, Any]:
-    """What tables say of a condition's planner."""
+    """Return what tables say about a condition's planner."""
     planner = condition.planner.object
     task = condition.task
-    merged = [
+    merged_notes = [
         f"One row for {kind} {', '.join(labels)}, which the planner does not use here"
         for kind, labels in condition.stands_for.items()
     ]
@@ -282,20 +278,18 @@ def _notes(condition: Condition) -> dict[str, Any]:
     ]
     return {
         "follows": planner.follows(task),
-        "remarks": [*planner.remarks(task), *merged, *unreproducible],
+        "remarks": [*planner.remarks(task), *merged_notes, *unreproducible],
         **({"unreproducible": condition.unreproducible} if unreproducible else {}),
         "changed": changed_options(condition.planner),
     }
 
 
 def changed_options(planner: Part) -> list[str]:
-    """Options of a planner that differ from their defaults, as `name = value`, nested
-    ones with dots.
-    """
+    """Return options that differ from their defaults, as `name = value` with dots."""
     options = registry.options_of("planner", planner.found.target)
     required = {
-        n: planner.options[n]
-        for n, option in options.items()
+        name: planner.options[name]
+        for name, option in options.items()
         if option.default is NO_DEFAULT
     }
     defaults = registry.complete("planner", replace(planner, options=required)).options

@@ -1,9 +1,8 @@
-"""Before a run: its conditions are built and tried, so that what cannot be run is
-rejected before anything is run.
+"""Checks before a run: conditions are built, and those that cannot be run are rejected.
 
 Nothing is predicted and nothing is planned. A suite is a product, and some of its
-combinations make no sense: a planner that cannot steer a robot, `single-class` with a
-    model that knows no classes. They are left out, each with its reason.
+combinations are invalid: a planner that cannot steer a robot, or `single-class` with a
+model without classes. They are left out, each with its reason.
 """
 
 import json
@@ -15,12 +14,9 @@ import numpy as np
 import torch
 
 from benchnav.core.errors import ConfigError
-from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.quantity import Quantity
-from benchnav.core.registry import Part
-from benchnav.core.settings import call, hint
+from benchnav.core.settings import hint
 from benchnav.core.store import text_digest
-from benchnav.core.terrain import Grid, Observation
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import shipped_recipes, shipped_sizes
 from benchnav.eval.experiment.condition import (
@@ -35,31 +31,25 @@ from benchnav.eval.experiment.suite import Suite, check_size
 from benchnav.eval.experiment.sweep import read_parts
 from benchnav.eval.experiment.unit import BLOCK_MAPS, Conditions, Extent
 from benchnav.eval.folder.run_folder import caveats
+from benchnav.eval.run.combinations import LeftOut, find_left_out
 from benchnav.eval.run.unit import read_maps
-from benchnav.models.base import PrivilegedModel
 from benchnav.models.checkpoint import load_checkpoint
 from benchnav.models.predictor import class_mismatch
-from benchnav.planning.planners.planner import check_steers
-from benchnav.planning.problem import Prediction, pose_problem
-from benchnav.planning.sensing.belief import CovarianceModel, Fields, Static
 from benchnav.planning.world.realisation import check_known, draw_frozen
 
 Say = Callable[[str], None]
-LeftOut = dict[
-    str, str
-]  # the labels that do not go together, by column, and the `reason`
 
 
 @dataclass(frozen=True, kw_only=True)
 class Checked:
-    """What of a suite is to be run.
+    """The part of a suite that can be run.
 
     Args:
-        conditions: by id, with how often each is to be run.
+        conditions: conditions by id, each with its extent.
         dropped: combinations that cannot be run.
-        warnings: what readers of the results should know.
-        hypotheses: from `fix_hypotheses`.
-        metrics: that rows have besides those that every run has.
+        warnings: warnings for readers of the results.
+        hypotheses: hypotheses from `fix_hypotheses`.
+        metrics: metrics in addition to the built-in ones.
     """
 
     conditions: dict[str, tuple[Condition, Extent]]
@@ -70,7 +60,7 @@ class Checked:
 
     @property
     def caveats(self) -> list[str]:
-        """What readers of the run's tables should know, a line each."""
+        """Warnings for readers of the run's tables, a line each."""
         return caveats(vars(self))
 
 
@@ -78,13 +68,13 @@ def check_suite(suite: Suite, elsewhere: bool) -> Checked:
     """Build the conditions of a suite, and reject what cannot be run.
 
     Args:
-        suite: what is evaluated.
+        suite: the suite.
         elsewhere: whether parts are created in other processes.
 
     Raises:
         ConfigError: If a part, scenario or map is missing, no combination can be run,
             or a hypothesis names one that cannot.
-        DatasetError: If there is no such dataset.
+        DatasetError: If the dataset is missing.
     """
     conditions = conditions_of(suite)
     if not conditions:
@@ -103,37 +93,35 @@ def check_suite(suite: Suite, elsewhere: bool) -> Checked:
         BLOCK_MAPS,
     )
     left_out = find_left_out(conditions)
-    kept = [condition for condition in conditions if condition.id not in left_out]
-    if not kept:
+    runnable = [condition for condition in conditions if condition.id not in left_out]
+    if not runnable:
         raise ConfigError(next(iter(left_out.values()))["reason"])
     for figure in suite.figures:
         for part in read_parts("figure", figure):
             _ = part.object  # which may reject its options
-    metrics = read_metrics(
-        suite.metrics, {one.robot.label: one.task.robot for one in kept}.values()
-    )
-    known = quantities(metric.quantity for metric in metrics)
+    robots = {condition.robot.label: condition.task.robot for condition in runnable}
+    metrics = read_metrics(suite.metrics, robots.values())
+    all_quantities = quantities(metric.quantity for metric in metrics)
     if elsewhere:
-        check_everywhere(kept, metrics)
-    every = {
-        one.id: (
-            one,
-            Extent(draws=tuple((*draw, maps[one.id]) for draw in suite.draws)),
-        )
-        for one in conditions
-    }
-    hypotheses = _fix_hypotheses(suite, every, left_out, known)
-    warnings = build_each(kept, suite.maps)
-    lone = [part for condition in kept for part in condition.unreproducible]
+        check_everywhere(runnable, metrics)
+    conditions_by_id = {}
+    for condition in conditions:
+        n_maps = maps[condition.id]
+        extent = Extent(draws=tuple((*draw, n_maps) for draw in suite.draws))
+        conditions_by_id[condition.id] = condition, extent
+    hypotheses = _fix_hypotheses(suite, conditions_by_id, left_out, all_quantities)
+    warnings = build_each(runnable, suite.maps)
+    lone = [part for condition in runnable for part in condition.unreproducible]
     lone += [f"metric {metric.quantity.name}" for metric in metrics if metric.is_object]
     warnings += [
         f"not reproducible: {part} is an object of one process" for part in lone
     ]
+    dropped = {json.dumps(entry): entry for entry in left_out.values()}
     return Checked(
-        conditions={condition.id: every[condition.id] for condition in kept},
-        dropped=tuple(
-            {json.dumps(entry): entry for entry in left_out.values()}.values()
-        ),
+        conditions={
+            condition.id: conditions_by_id[condition.id] for condition in runnable
+        },
+        dropped=tuple(dropped.values()),
         warnings=tuple(dict.fromkeys(warnings)),
         hypotheses=hypotheses,
         metrics=metrics,
@@ -144,7 +132,7 @@ def _fix_hypotheses(
     suite: Suite,
     conditions: Conditions,
     left_out: Mapping[str, LeftOut],
-    known: Mapping[str, Quantity],
+    all_quantities: Mapping[str, Quantity],
 ) -> dict[str, Any]:
     """Fix the hypotheses of a suite on the conditions that are run.
 
@@ -153,37 +141,37 @@ def _fix_hypotheses(
             left out, or is invalid.
     """
     try:
-        tests = fix_hypotheses(suite.hypotheses, conditions, known).get("tests", ())
+        fixed = fix_hypotheses(suite.hypotheses, conditions, all_quantities)
+        tests = fixed.get("tests", ())
     except ConfigError:  # perhaps of a combination that is left out
         tests = ()
     for test in tests:
-        lost = [
-            left_out[test[side]] for side in ("one", "other") if test[side] in left_out
-        ]
+        sides = (test["one"], test["other"])
+        lost = [left_out[side] for side in sides if side in left_out]
         if len(lost) == 1:
             raise ConfigError(
                 "Expected hypotheses on conditions that can be run, got "
                 f"{test['claim']!r}, which names one that "
                 f"cannot: {lost[0]['reason']}"
             )
-    kept = {i: entry for i, entry in conditions.items() if i not in left_out}
-    return fix_hypotheses(suite.hypotheses, kept, known)
+    runnable = {i: entry for i, entry in conditions.items() if i not in left_out}
+    return fix_hypotheses(suite.hypotheses, runnable, all_quantities)
 
 
 def check_split(condition: Condition, maps: int) -> int:
-    """Return how many maps of a condition's split are run; reject a missing scenario,
-    and more maps than there are.
+    """Return the number of maps that are run; reject a missing scenario or map.
 
     Args:
-        condition: its data and scenario.
-        maps: how many are asked for; 0 for all.
+        condition: condition with its data and scenario.
+        maps: requested number of maps; 0 for all.
     """
-    dataset, known = condition.dataset, scenarios_of(condition.data)
-    if condition.scenario not in known:
+    dataset = condition.dataset
+    scenarios = scenarios_of(condition.data)
+    if condition.scenario not in scenarios:
         raise ConfigError(
-            f"Expected `scenarios` among {known} of {dataset.path}, got "
+            f"Expected `scenarios` among {scenarios} of {dataset.path}, got "
             f"{condition.scenario!r}."
-            f"{hint(condition.scenario, known)}{_remedy(dataset, condition.split, 1)}"
+            f"{hint(condition.scenario, scenarios)}{_remedy(dataset, condition.split, 1)}"
         )
     count = dataset.map_count(condition.split)
     if maps > count:
@@ -196,7 +184,7 @@ def check_split(condition: Condition, maps: int) -> int:
 
 
 def _remedy(dataset: TerrainDataset, split: str, maps: int) -> str:
-    """Return how to make the maps that a file lacks, if its shipped recipe has them."""
+    """Return how to create missing maps, if a shipped recipe has them."""
     if (
         dataset.id not in shipped_recipes()
         or shipped_sizes(dataset.id).get(split, 0) < maps
@@ -214,7 +202,7 @@ def check_everywhere(
     """Reject parts that other processes would not find.
 
     Raises:
-        ConfigError: If there are such.
+        ConfigError: If there are such parts.
     """
     parts = [part for condition in conditions for part in condition.parts.values()]
     for part in (*parts, *(metric.part for metric in metrics)):
@@ -228,20 +216,15 @@ def check_everywhere(
             )
 
 
-# --- each condition on one map
-# ------------------------------------------------------------------------
-
-
 def build_each(conditions: Sequence[Condition], maps: int) -> list[str]:
-    """Build conditions on the first map of their splits, without a prediction or a
-    plan.
+    """Build conditions on the first map of their splits, without prediction or plan.
 
     Args:
-        conditions: what is built; what several share is built once.
+        conditions: conditions; parts that several have in common are built once.
         maps: number of maps of each split; 0 for all.
 
     Returns:
-        What readers of the results should know.
+        Warnings for readers of the results.
 
     Raises:
         BenchnavError: If a condition cannot be run.
@@ -253,9 +236,8 @@ def build_each(conditions: Sequence[Condition], maps: int) -> list[str]:
         warnings += _check_world(condition, condition.dataset, maps)
     for condition in _distinct(conditions, "data", "scenario", "model", *KNOWLEDGE):
         _ = condition.statistics  # which may be missing
-    for condition in _distinct(
-        [one for one in conditions if not one.blind], "data", "model"
-    ):
+    seeing = [condition for condition in conditions if not condition.blind]
+    for condition in _distinct(seeing, "data", "model"):
         warnings += _check_model(condition)
     for condition in conditions:
         warnings += _doubts(condition, condition.dataset)
@@ -275,41 +257,38 @@ def _distinct(conditions: Sequence[Condition], *names: str) -> list[Condition]:
 
 def _check_model(condition: Condition) -> list[str]:
     """Load the model, which may reject its options, and warn of another class table."""
-    model, name = condition.model.object, f"model {condition.model.label}"
+    model = condition.model.object
+    name = f"model {condition.model.label}"
     folder = condition.model.folder
     # A checkpoint has a class table, whether or not its model predicts classes.
-    known = load_checkpoint(folder) if folder else model
-    line = class_mismatch(known, condition.dataset.recipe, name)
+    owner = load_checkpoint(folder) if folder else model
+    line = class_mismatch(owner, condition.dataset.recipe, name)
     return [line] if line else []
 
 
 def _check_world(condition: Condition, dataset: TerrainDataset, maps: int) -> list[str]:
-    """Draw λ of the first map, and warn of goals that top speed does not reach within
-    T.
-    """
-    task, world, split = condition.task, condition.world, condition.split
+    """Draw λ of the first map, and warn of goals that cannot be reached within T."""
+    task = condition.task
+    world = condition.world
+    split = condition.split
     chosen = range(maps or dataset.map_count(split))
     read = dataset.read(split, chosen, ["start_m", "goal_m", "reference_time_s"])
     top_speed = task.robot.top_speed_mps
     budget = world.budget_s(torch.from_numpy(read["reference_time_s"]), top_speed)
     world.steps(budget, task.robot.dt_s)
-    # Only imported maps have cells of which λ is missing.
+    # Only imported maps have cells without λ.
     is_imported = any("source" in part for part in dataset.splits[split]["parts"])
     for start in chosen[::BLOCK_MAPS] if is_imported else chosen[:1]:
-        block = read_maps(
-            dataset, split, chosen[start : start + BLOCK_MAPS] if is_imported else [0]
-        )
+        block_maps = chosen[start : start + BLOCK_MAPS] if is_imported else [0]
+        block = read_maps(dataset, split, block_maps)
         check_known(block.terrain, world)
         if world.noise == "frozen" and start == 0:
-            first = (
-                block.terrain.select(torch.tensor([0])),
-                block.places.select(torch.tensor([0])),
-            )
-            draw_frozen(first[0], world, first[1], key=0, maps=[0])
-    distance_m = (
-        np.linalg.norm(read["goal_m"] - read["start_m"], axis=1)
-        - task.rules.goal_radius_m
-    )
+            index = torch.tensor([0])
+            terrain = block.terrain.select(index)
+            places = block.places.select(index)
+            draw_frozen(terrain, world, places, key=0, maps=[0])
+    centre_distance_m = np.linalg.norm(read["goal_m"] - read["start_m"], axis=1)
+    distance_m = centre_distance_m - task.rules.goal_radius_m
     late = distance_m / top_speed > budget.numpy()
     if not late.any():
         return []
@@ -321,7 +300,7 @@ def _check_world(condition: Condition, dataset: TerrainDataset, maps: int) -> li
 
 
 def _doubts(condition: Condition, dataset: TerrainDataset) -> Iterator[str]:
-    """Yield what of the maps does not fit the rules of the task."""
+    """Yield differences between the maps' recipe and the rules of the task."""
     threshold = dataset.recipe.stuck_threshold
     if condition.rules.free_space.above != threshold:
         yield (
@@ -334,173 +313,5 @@ def _doubts(condition: Condition, dataset: TerrainDataset) -> Iterator[str]:
         yield (
             f"maps of {dataset.id} {condition.split} may have no feasible path to the "
             "goal (no `solvable: true`), "
-            "so that a planner may fail on them for that alone"
+            "so that a planner may fail on them for this reason"
         )
-
-
-# --- combinations that cannot be run
-# ------------------------------------------------------------------
-
-
-def find_left_out(conditions: Iterable[Condition]) -> dict[str, LeftOut]:
-    """Find the conditions whose parts do not go together.
-
-    Args:
-        conditions: of a suite.
-
-    Returns:
-        Why each of them is not run, by its id, in the order of the conditions.
-
-    Raises:
-        ConfigError: If a shipped planner rejects its settings in each combination that
-            the suite has of it.
-    """
-    reasons: dict[tuple[Any, ...], str] = {}
-    left_out: dict[str, LeftOut] = {}
-    refusals: dict[
-        str, str
-    ] = {}  # by planner; empty if it can be prepared for some condition
-    for condition in conditions:
-        for columns, rule in _RULES.items():
-            labels = {column: condition.labels[column] for column in columns}
-            # With the part, since all parts that are not used have one label.
-            key = rule, condition.risk.part, *labels.values()
-            if key not in reasons:
-                reasons[key] = rule(condition)
-            if rule is _unprepared:
-                planner = condition.planner.label
-                refusals[planner] = reasons[key] and refusals.get(planner, reasons[key])
-            if reasons[key]:
-                left_out[condition.id] = {**labels, "reason": reasons[key]}
-                break
-    for reason in filter(None, refusals.values()):
-        raise ConfigError(reason)  # of the planner's own settings
-    return left_out
-
-
-def _unsteered(condition: Condition) -> str:
-    try:
-        check_steers(
-            condition.planner.object, condition.task.robot, condition.planner.label
-        )
-    except ConfigError as error:
-        return str(error)
-    return ""
-
-
-def _plans_once(condition: Condition) -> str:
-    if (
-        condition.blind
-        or not condition.planner.object.plans_once
-        or not condition.learns
-    ):
-        return ""
-    return (
-        "Expected belief 'static' and sensor 'full' for planner "
-        f"{condition.planner.label!r}, which plans once, got "
-        f"{condition.belief.label!r} and {condition.sensor.label!r}."
-    )
-
-
-def _given_truth(condition: Condition) -> str:
-    is_given = not condition.blind and condition.planner.object.given_truth
-    if not is_given or condition.model.part == "clairvoyant":
-        return ""
-    return (
-        f"Expected model 'clairvoyant' for planner {condition.planner.label!r}, which "
-        "is given λ itself, got "
-        f"{condition.model.label!r}."
-    )
-
-
-def _resampled(condition: Condition) -> str:
-    if condition.model.part != "clairvoyant" or condition.world.noise != "resampled":
-        return ""
-    return (
-        "Expected a world with λ that stays for the model 'clairvoyant', got "
-        f"{condition.world_label!r}, which "
-        "resamples λ at each step. Take the world stakes, or `world.noise` frozen or "
-        "stored."
-    )
-
-
-def _learns_no_class(condition: Condition) -> str:
-    if not _is_single_class(condition) or not condition.belief.object.learns:
-        return ""
-    return (
-        "Expected a belief that does not learn for the risk setting 'single-class', "
-        "got "
-        f"{condition.belief.label!r}: what is learnt of λ is of no class. Take the "
-        "belief static."
-    )
-
-
-def _without_classes(condition: Condition) -> str:
-    if not _is_single_class(condition):
-        return ""
-    model = condition.model.object
-    if model.class_names or isinstance(model, PrivilegedModel):
-        return ""
-    return (
-        "Expected a model that predicts classes for the risk setting 'single-class', "
-        f"got {condition.model.label!r}, "
-        "which has no `class_names`."
-    )
-
-
-def _is_single_class(condition: Condition) -> bool:
-    return not condition.blind and condition.risk.part == "single-class"
-
-
-def _unprepared(condition: Condition) -> str:
-    """Return why a shipped planner rejects what only its preparation can tell, such as
-    its bounds.
-    """
-    planner: Part = condition.planner
-    if not planner.found.shipped:
-        return ""
-    ground = torch.full((1, 4, 4), 0.9)
-    grid = Grid(4, 4, condition.dataset.grid.resolution_m)
-    seen = Observation(
-        torch.zeros(1, 3, 4, 4, dtype=torch.uint8), 0 * ground, 0 * ground, grid
-    )
-    ones = torch.ones_like(ground).unsqueeze(1)
-    mixture = TraversabilityMixture(ones, 0.9 * ones, 0 * ones)
-    start, goal = (
-        torch.full((1, 2), cells * grid.resolution_m) for cells in (0.5, 3.5)
-    )
-
-    def prepare() -> None:
-        fields = Fields(
-            Static(),
-            Static().init(mixture, CovarianceModel(grid=grid, correlation_m=0.0)),
-            (0,),
-        )
-        prediction = Prediction(seen, mixture, ground, fields=fields)
-        problem = pose_problem(
-            condition.task, prediction, start, goal, 1.0, condition.world.immobile
-        )
-        planner.object.init(problem, torch.Generator())
-
-    labels = condition.labels
-    what = (
-        f"Planner {labels['planner']!r} for robot {labels['robot']!r} and "
-        f"objective {labels['objective']!r}"
-    )
-    try:
-        call(what, prepare, {})
-    except ConfigError as error:
-        return str(error)
-    return ""
-
-
-# By the columns whose labels decide it; what takes longest comes last.
-_RULES: Mapping[tuple[str, ...], Callable[[Condition], str]] = {
-    ("planner", "robot"): _unsteered,
-    ("planner", "sensor", "belief"): _plans_once,
-    ("planner", "model"): _given_truth,
-    ("model", "world"): _resampled,
-    ("risk", "belief"): _learns_no_class,
-    ("planner", "robot", "objective", "world", "data"): _unprepared,
-    ("model", "risk"): _without_classes,
-}

@@ -1,8 +1,8 @@
 """Units on the workers of a Dask cluster.
 
-Workers write nothing that lasts: the files that a unit makes come back as bytes, and
-the command that asked for them writes them. So workers share no disk with it, and a
-unit that was begun twice, since a worker died, is there once.
+Workers write nothing permanent: they return a unit's files as bytes, and the command
+writes them. So workers need no disk in common with it, and a unit that is run twice
+because a worker died is stored once.
 """
 
 import multiprocessing
@@ -23,27 +23,26 @@ from benchnav.eval.run.unit import Settings, run_unit
 
 
 def run_on_worker(
-    here: Path, unit: Unit, origin: Origin, settings: Settings
+    working_folder: Path, unit: Unit, origin: Origin, settings: Settings
 ) -> tuple[Unit, dict[str, bytes]]:
-    """Runs a unit on a worker of a cluster; gives what it wrote, by its place in a run
-    folder.
+    """Run a unit on a worker of a cluster, and return its files by path in a run folder.
 
     Args:
-        here: where names of files begin, if the worker's machine has that place.
-        unit: what is run.
-        origin: of the unit as the run was begun.
-        settings: how it is run.
+        working_folder: folder that relative paths start from, if the worker has it.
+        unit: the unit.
+        origin: origin of the unit when the run was begun.
+        settings: settings of the run.
 
     Raises:
-        ConfigError: the worker is not fit for the run, or its code or maps are others;
-            the message names it.
+        ConfigError: If the worker is unfit for the run, or has other code or maps; the
+            message names the worker.
     """
     from distributed import get_worker
 
     worker = get_worker()
     check_worker(worker, settings)
     with (
-        chdir(here) if here.is_dir() else nullcontext(),
+        chdir(working_folder) if working_folder.is_dir() else nullcontext(),
         TemporaryDirectory(dir=worker.local_directory) as scratch,
     ):
         try:
@@ -57,14 +56,14 @@ def run_on_worker(
 
 
 def check_worker(worker: Any, settings: Settings) -> None:
-    """Refuses a worker whose rows would not be those of the command's own process.
+    """Reject a worker whose rows would differ from those of the command's process.
 
     Args:
-        worker: Dask's.
-        settings: how units are run.
+        worker: Dask worker.
+        settings: settings of the run.
 
     Raises:
-        ConfigError: the worker is not fit.
+        ConfigError: If the worker is unfit.
     """
     threads = worker.state.nthreads
     if threads != 1:
@@ -89,9 +88,7 @@ def check_worker(worker: Any, settings: Settings) -> None:
 
 
 def store_files(folder: Path, unit: Unit, files: Mapping[str, bytes]) -> None:
-    """Writes what a unit made into a run folder, its rows last, since they say that it
-    is finished.
-    """
+    """Write a unit's files into a run folder, its rows last: they mark it as finished."""
     clear_unit(folder, unit)
     for name in sorted(files, key=lambda name: name.startswith("units/")):
         with replacing(folder / name) as partial:

@@ -1,6 +1,4 @@
-"""Whether rows come out the same when they are made again: in fresh processes, in
-another order of units and maps.
-"""
+"""Whether rows are identical if repeated in fresh processes and in another order."""
 
 import random
 from collections.abc import Callable, Sequence
@@ -23,7 +21,7 @@ from benchnav.eval.run.check import Say, check_suite
 from benchnav.eval.run.unit import Settings, run_unit
 
 # Rows of a unit, and the global generators that were drawn from while it ran.
-_Made = tuple[pd.DataFrame, tuple[str, ...]]
+_Rows = tuple[pd.DataFrame, tuple[str, ...]]
 
 _GENERATORS: dict[str, Callable[[], bytes]] = {
     "random": lambda: repr(random.getstate()).encode(),
@@ -35,23 +33,22 @@ _GENERATORS: dict[str, Callable[[], bytes]] = {
 def check_determinism(
     suite: Suite, say: Say, planner_limit_s: float = 0.0, device: str = "cpu"
 ) -> tuple[int, list[str]]:
-    """Run the first unit of each condition in two processes and compare the rows bit
-    for bit, but for planning times.
+    """Run the first unit of each condition in two processes and compare the rows.
 
-    The second process runs all units in the reverse order, and the maps of each, and
-    does so twice: its second rows count, so that state which parts keep has had time to
-    grow. If rows differ, a third process does what the first did, which distinguishes
-    state that is kept from what comes from outside.
+    Rows are compared bit for bit, except planning times. The second process runs units
+    and maps in reverse order, twice, and its second rows count, so that state which
+    parts keep has had time to grow. If rows differ, a third process repeats the first,
+    which distinguishes kept state from external input.
 
     Args:
-        suite: what is to be evaluated.
-        say: is told what is done, a line at a time.
+        suite: the suite.
+        say: receives progress, a line at a time.
         planner_limit_s: time limit of each call of a planner; 0 for none.
         device: "cpu", "cuda" or "auto".
 
     Returns:
-        The number of conditions, and for each that differs a line with what differs and
-        why.
+        The number of conditions, and a line for each that differs: the columns and the
+        cause.
 
     Raises:
         BenchnavError: If the suite cannot be run.
@@ -61,10 +58,9 @@ def check_determinism(
     )
     checked = check_suite(suite, elsewhere=True)
     metrics = [metric.part for metric in checked.metrics]
-    chosen = [
-        units({name: known}, metrics=metrics)[0]
-        for name, known in checked.conditions.items()
-    ]
+    chosen = []
+    for name, condition in checked.conditions.items():
+        chosen.append(units({name: condition}, metrics=metrics)[0])
     say(
         f"checking that {len(chosen)} conditions repeat, each by its unit of "
         f"{len(chosen[0].maps)} maps"
@@ -72,66 +68,60 @@ def check_determinism(
     first = _run_fresh(chosen, settings)
     backwards = [replace(unit, maps=unit.maps[::-1]) for unit in chosen[::-1]]
     second = _run_fresh([*backwards, *backwards], settings)[len(chosen) :][::-1]
-    columns = [
-        _differing(one, other)
-        for (one, _), (other, _) in zip(first, second, strict=True)
-    ]
+    columns = [_differing(a, b) for (a, _), (b, _) in zip(first, second, strict=True)]
     third = _run_fresh(chosen, settings) if any(columns) else first
-    lines = [
-        f"{unit.condition.description}: {', '.join(names)} differ; {_cause(*made)}"
-        for unit, names, *made in zip(
-            chosen, columns, first, second, third, strict=True
-        )
-        if names
-    ]
+    lines = []
+    for unit, names, *runs in zip(chosen, columns, first, second, third, strict=True):
+        if names:
+            columns_text = ", ".join(names)
+            line = f"{unit.condition.description}: {columns_text} differ"
+            lines.append(f"{line}; {_cause(*runs)}")
     return len(chosen), lines
 
 
-def _cause(one: _Made, other: _Made, again: _Made) -> str:
-    """Say why rows of a unit differ between one process and another; `again` did what
-    the first did.
-    """
-    generators = sorted({*one[1], *other[1], *again[1]})
+def _cause(first: _Rows, second: _Rows, third: _Rows) -> str:
+    """Return why rows of a unit differ between two runs; `third` repeats `first`."""
+    generators = sorted({*first[1], *second[1], *third[1]})
     if generators:
         return f"a part draws from the global generator of {' and '.join(generators)}"
-    if _differing(one[0], again[0]):
+    if _differing(first[0], third[0]):
         return (
             "a part depends on something outside, such as a clock, entropy or the "
             "order of threads"
         )
     return (
-        "a part keeps state between episodes or units, so that rows depend on "
-        "what "
+        "a part keeps state between episodes or units, so that rows depend on what "
         "ran before"
     )
 
 
-def _differing(one: pd.DataFrame, other: pd.DataFrame) -> list[str]:
-    cells, missing = differences(one, other)
-    return list(dict.fromkeys(cells.index.get_level_values(-1))) + (
-        ["episodes"] if len(missing) else []
-    )
+def _differing(a: pd.DataFrame, b: pd.DataFrame) -> list[str]:
+    cells, missing = differences(a, b)
+    columns = list(dict.fromkeys(cells.index.get_level_values(-1)))
+    return [*columns, "episodes"] if len(missing) else columns
 
 
-def _run_fresh(chosen: Sequence[Unit], settings: Settings) -> list[_Made]:
+def _run_fresh(chosen: Sequence[Unit], settings: Settings) -> list[_Rows]:
     """Run units one after the other in one fresh process."""
     with ProcessPoolExecutor(1) as executor:
-        return executor.submit(
-            partial(_run_units, Path.cwd(), chosen, settings)
-        ).result()
+        call = partial(_run_units, Path.cwd(), chosen, settings)
+        return executor.submit(call).result()
 
 
-def _run_units(here: Path, chosen: Sequence[Unit], settings: Settings) -> list[_Made]:
-    with chdir(here):
+def _run_units(
+    working_folder: Path, chosen: Sequence[Unit], settings: Settings
+) -> list[_Rows]:
+    with chdir(working_folder):
         return [_run_unit(unit, settings) for unit in chosen]
 
 
-def _run_unit(unit: Unit, settings: Settings) -> _Made:
+def _run_unit(unit: Unit, settings: Settings) -> _Rows:
     origin = settings.origins().of(unit)
     before = {name: state() for name, state in _GENERATORS.items()}
     with TemporaryDirectory() as folder:
         run_unit(replace(unit, record="none"), Path(folder), origin, settings)
         rows = unit_rows(find_units(Path(folder), unit)[0])
-    return rows, tuple(
+    drawn_from = [
         name for name, state in _GENERATORS.items() if state() != before[name]
-    )
+    ]
+    return rows, tuple(drawn_from)

@@ -1,8 +1,8 @@
-"""A planner in a process of its own, so that one that hangs can be stopped.
+"""A planner in a child process, so that one that hangs can be stopped.
 
-The simulation stays where it is: only the planner's calls cross, each with a time
-limit. The child makes the planner's, robot's and objective's parts by name first, so
-that what they are made of can be sent.
+The simulation stays in the parent: only the planner's calls cross, each with a time
+limit. The child first loads the parts of planner, robot and objective by name, so that
+their classes can be unpickled.
 """
 
 import multiprocessing
@@ -29,16 +29,17 @@ _CLOSE_S = 5.0
 
 
 class PlannerProcessError(BenchnavError):
-    """A planner did not answer in time, or its process ended, or it raised: its last
-    line, its traceback as a note.
+    """A planner timed out, raised, or its process ended.
+
+    If it raised, the message is the last line of its traceback, which is the note.
     """
 
 
 class IsolatedPlanner(Planner[int]):
-    """A condition's planner, run in a child process; a planner like any other.
+    """A condition's planner, run in a child process.
 
     Args:
-        condition: whose planner.
+        condition: condition that has the planner.
         limit_s: time limit of each call; `init` and the first `plan` have two minutes
             more, to compile.
     """
@@ -46,15 +47,15 @@ class IsolatedPlanner(Planner[int]):
     compiled: bool | None = None
 
     def __init__(self, condition: Condition, limit_s: float) -> None:
-        """Starts the child."""
+        """Start the child."""
         self.limit_s = limit_s
         context = multiprocessing.get_context("spawn")
-        self._here, there = context.Pipe()
+        self._connection, child_end = context.Pipe()
         self._child = context.Process(
-            target=_serve, args=(there, condition), daemon=True
+            target=_serve, args=(child_end, condition), daemon=True
         )
         self._child.start()
-        there.close()
+        child_end.close()
         try:
             self._ask(_START_S, "start")
         except BaseException:
@@ -62,19 +63,18 @@ class IsolatedPlanner(Planner[int]):
             raise
 
     def close(self) -> None:
-        """End the child, and take over what it saw its planner touch."""
+        """End the child, and merge its record of what the planner read."""
         if self._child.is_alive():
             with suppress(PlannerProcessError):
                 merge(self._ask(_CLOSE_S, "touched"))
         self._child.kill()
         self._child.join()
-        self._here.close()
+        self._connection.close()
 
     def init(self, problem: Problem, generator: torch.Generator) -> int:
-        """See `Planner`. The plan state stays in the child; here it is the number of
-        calls.
-        """
-        seed, state = generator.initial_seed(), generator.get_state()
+        """See `Planner`. The plan state stays in the child; here it counts calls."""
+        seed = generator.initial_seed()
+        state = generator.get_state()
         self._ask(self.limit_s + _START_S, "init", problem, seed, state)
         return 0
 
@@ -86,21 +86,19 @@ class IsolatedPlanner(Planner[int]):
         return action, plan_state + 1, plan
 
     def revise(self, plan_state: int, problem: Problem) -> int:
-        """See `Planner`. A planner that has to begin anew does so in the child, which
-        may take as long as `init`.
-        """
+        """See `Planner`. The child may start again, which may take as long as `init`."""
         self._ask(self.limit_s + _START_S, "revise", problem)
         return plan_state
 
     def _ask(self, limit_s: float, call: str, *arguments: Any) -> Any:
         try:
-            self._here.send_bytes(pickle.dumps((call, *arguments)))
-            if not self._here.poll(limit_s):
+            self._connection.send_bytes(pickle.dumps((call, *arguments)))
+            if not self._connection.poll(limit_s):
                 self._child.kill()
                 raise PlannerProcessError(
                     f"The planner gave no answer to `{call}` within {limit_s:g} s."
                 )
-            kind, value = pickle.loads(self._here.recv_bytes())
+            kind, value = pickle.loads(self._connection.recv_bytes())
         except (EOFError, BrokenPipeError, ConnectionResetError) as error:
             self._child.join(1)
             raise PlannerProcessError(
@@ -117,7 +115,7 @@ class IsolatedPlanner(Planner[int]):
 
 
 def _serve(connection: Connection, condition: Condition) -> None:
-    """Answers calls of the planner until nobody asks any more."""
+    """Answer calls of the planner until the connection closes."""
     torch.set_num_threads(1)
     planner: Any = None
     plan_state: Any = None
@@ -133,20 +131,20 @@ def _serve(connection: Connection, condition: Condition) -> None:
             if call == "touched":
                 answer = snapshot()
             elif call == "start":
-                # The classes of what a problem holds have to be there before one is
-                # read.
+                # A problem can be unpickled only after its classes are loaded.
                 _ = condition.task, condition.belief.object
-                planner, answer = condition.planner.create(), None
+                planner = condition.planner.create()
+                answer = None
             elif call == "init":
                 problem, seed, state = arguments
                 generator = torch.Generator().manual_seed(seed)
                 generator.set_state(state)
-                plan_state, answer = planner.init(problem, generator), None
+                plan_state = planner.init(problem, generator)
+                answer = None
             elif call == "revise":
-                plan_state, answer = (
-                    boundary.revise(planner, plan_state, arguments[0], generator),
-                    None,
-                )
+                problem = arguments[0]
+                plan_state = boundary.revise(planner, plan_state, problem, generator)
+                answer = None
             else:
                 action, plan_state, plan = planner.plan(arguments[0], plan_state)
                 answer = action, plan, planner.compiled

@@ -1,14 +1,14 @@
-"""What robots of a unit learn while they drive, and the problem that their planner is
-given of it.
+"""Knowledge of the robots of a unit during episodes, and their planner's problem.
 
-`benchnav.planning.sensing.knowledge` says what they know. Here their planner is told
-where λ̂ has changed for it, and what they know is measured against the ground ahead of
-them. Letters in shapes: B episodes, S state dimensions, H×W cells.
+`benchnav.planning.sensing.knowledge` defines the knowledge. This module passes changes
+of λ̂ to the planner, and scores the belief over the terrain ahead of the robots. Letters
+in shapes: B episodes, S state dimensions, H×W cells.
 """
 
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from benchnav.core.batch import put_if_alike
 from benchnav.eval.folder.steps import AHEAD_DEG, AHEAD_M
-from benchnav.eval.recording import KnownMap, reach_outline
+from benchnav.eval.recorded_plans import KnownMap, reach_outline
 from benchnav.planning.free_space import cells_at_goal
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import steps_in
@@ -25,20 +25,19 @@ from benchnav.planning.sensing.knowledge import Knowledge, Truth, call
 from benchnav.planning.sensing.learner import Learner
 from benchnav.planning.world.outcome import Outcome
 
-_LEAST_CHANGE = 0.02  # of λ̂ somewhere on a map, for which its planner is told
-_LEAST_LOG_SCORE = -10.0  # of λ that was held impossible
+_MIN_CHANGE = 0.02  # maximum change of λ̂ on a map from which its planner replans
+_MIN_LOG_SCORE = -10.0  # log score of λ with probability 0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Learning:
-    """How the robots of a batch learn.
+    """Sensing and belief of the robots of a batch.
 
     Args:
-        learner: how that is done.
-        start: what they know when they set out.
-        truth: of B episodes, for sensors and privileged models alone.
-        field_at: gives λ of every cell at a step, [B, H, W]; None where it stays what
-            `truth` says.
+        learner: sensors, belief and risk measure.
+        start: knowledge at the start of the episodes.
+        truth: truth of B episodes, only for sensors and privileged models.
+        field_at: returns λ of all cells at a step, [B, H, W]; None if λ does not change.
     """
 
     learner: Learner
@@ -48,27 +47,30 @@ class Learning:
 
 
 class Knowing:
-    """What the robots of a batch know, from the first step to the last.
+    """Knowledge of the robots of a batch, updated from step to step.
 
     Args:
-        how: they learn.
-        problem: what their planner was given when they set out.
+        learning: sensing and belief of the robots.
+        problem: the planner's problem at the start.
 
     Attributes:
-        revisions: how often each episode's map was changed, int64, shape [B].
-        seen_cells: how many cells each robot saw by its last update, int64, shape [B].
-        sensed_cells: of how many cells each sensed λ by then, int64, shape [B].
+        revisions: number of changes of each episode's map, int64, shape [B].
+        seen_cells: number of cells each robot saw by its last update, int64, shape [B].
+        sensed_cells: number of cells whose λ each robot measured by then, int64,
+            shape [B].
         ahead: by step, RMSE of E[λ] and mean log score of the belief over the cells
-            ahead of each robot of which λ was not sensed, shape [B, 2]; NaN where there
-            are none.
-        known: what is known, of the episodes that are left.
-        members: which these are, int64.
+            ahead of each robot whose λ was not measured, shape [B, 2]; NaN without
+            such cells.
+        known: knowledge of the remaining episodes.
+        members: indices of the remaining episodes, int64.
     """
 
-    def __init__(self, how: Learning, problem: Problem) -> None:
-        """Knows what is known at the start."""
-        self._how, self._problem, self._truth = how, problem, how.truth
-        self.known = how.start
+    def __init__(self, learning: Learning, problem: Problem) -> None:
+        """Start with the initial knowledge."""
+        self._learning = learning
+        self._problem = problem
+        self._truth = learning.truth
+        self.known = learning.start
         self._every = steps_in(problem.task.rules.replan_every_s, problem.dt_s)
         self._at_goal = cells_at_goal(
             problem.grid, problem.goal_m, problem.goal_radius_m
@@ -79,171 +81,173 @@ class Knowing:
         self.sensed_cells = torch.zeros_like(self.members)
         self.ahead: dict[int, Tensor] = {}
 
-    def keep(self, left: Tensor) -> None:
-        """Forgets all episodes but some, by their places among those that are left,
-        int64.
-        """
-        self.known = self._how.learner.select(self.known, left)
-        self._problem, self._truth = (
-            self._problem.select(left),
-            self._truth.select(left),
-        )
-        self._at_goal, self.members = self._at_goal[left], self.members[left]
+    def keep(self, indices: Tensor) -> None:
+        """Drop all episodes except some, by int64 indices into the remaining ones."""
+        self.known = self._learning.learner.select(self.known, indices)
+        self._problem = self._problem.select(indices)
+        self._truth = self._truth.select(indices)
+        self._at_goal = self._at_goal[indices]
+        self.members = self.members[indices]
 
     def is_due(self, step: int) -> bool:
-        """Whether what is known is updated in a step."""
+        """Return whether knowledge is updated in a step."""
         return step % self._every == 0
 
     def learn(self, step: int, robot_state: Tensor, running: Tensor) -> Problem | None:
-        """Senses, and updates what is known where that is due.
+        """Sense, and update the knowledge if that is due.
 
         Args:
             step: steps taken so far.
-            robot_state: where the robots are that are left, a copy, shape [B, S].
-            running: which of these episodes go on, bool, shape [B].
+            robot_state: a copy of the states of the remaining robots, shape [B, S].
+            running: mask of these episodes that continue, bool, shape [B].
 
         Returns:
-            The problem as it now is, which starts where the robots are; None where the
-            planner need not be told.
+            The current problem, which starts at the robots' states; None if the planner
+            need not replan.
 
         Raises:
-            KnowledgeError: a sensor, the belief, the model or the risk measure raised,
-                or gave what is none.
+            KnowledgeError: If a sensor, the belief, the model or the risk measure fails.
         """
-        how = self._how
+        learning = self._learning
         due = self.is_due(step)
-        # To draw λ of all cells takes long, and between updates only a belief that
-        # learns is told any.
-        if how.field_at is not None and (due or how.learner.belief.learns):
-            self._truth = replace(self._truth, field=how.field_at(step)[self.members])
-        # Who has ended senses nothing more, whenever it leaves the batch.
-        looks = running if due else torch.zeros_like(running)
-        self.known = how.learner.sense(
-            self.known, self._truth, robot_state, step, looks, running
+        # Drawing λ of all cells is slow, and between updates only a belief that learns
+        # receives it.
+        if learning.field_at is not None and (due or learning.learner.belief.learns):
+            self._truth = replace(
+                self._truth, field=learning.field_at(step)[self.members]
+            )
+        # An ended episode senses nothing, even while it remains in the batch.
+        observing = running if due else torch.zeros_like(running)
+        self.known = learning.learner.sense(
+            self.known, self._truth, robot_state, step, observing, running
         )
         if not due:
             return None
-        on = self.members[running]
-        self.seen_cells[on] = self.known.seen[running].flatten(1).sum(1)
-        self.sensed_cells[on] = self.known.ever_sensed[running].flatten(1).sum(1)
-        known, changed = how.learner.update(self.known, self._truth)
-        self.known = known
-        return self._told(robot_state, running) if bool(changed.any()) else None
-
-    def _told(self, robot_state: Tensor, running: Tensor) -> Problem | None:
-        """The problem with the maps of the episodes that go on and in which enough has
-        changed.
-        """
-        known, before = self.known, self._problem
-        free = known.free | self._at_goal
-        moved = ((known.risk_map - before.risk_map).abs() > _LEAST_CHANGE) | (
-            free != before.free
+        running_members = self.members[running]
+        self.seen_cells[running_members] = self.known.seen[running].flatten(1).sum(1)
+        self.sensed_cells[running_members] = (
+            self.known.ever_sensed[running].flatten(1).sum(1)
         )
-        told = moved.flatten(1).any(1) & running
-        if not bool(told.any()):
+        knowledge, changed = learning.learner.update(self.known, self._truth)
+        self.known = knowledge
+        if bool(changed.any()):
+            return self._updated_problem(robot_state, running)
+        return None
+
+    def _updated_problem(self, robot_state: Tensor, running: Tensor) -> Problem | None:
+        """Return the problem with new maps where running episodes changed enough."""
+        knowledge = self.known
+        problem = self._problem
+        free = knowledge.free | self._at_goal
+        risk_map_change = (knowledge.risk_map - problem.risk_map).abs()
+        has_changed = (risk_map_change > _MIN_CHANGE) | (free != problem.free)
+        is_updated = has_changed.flatten(1).any(1) & running
+        if not bool(is_updated.any()):
             return None
-        self.revisions[self.members[told]] += 1
-        which, places = told[:, None, None], told.nonzero()[:, 0]
-        fields = before.fields
+        self.revisions[self.members[is_updated]] += 1
+        update_mask = is_updated[:, None, None]
+        indices = is_updated.nonzero()[:, 0]
+        fields = problem.fields
         if isinstance(fields, Fields):
-            belief, believed = self._how.learner.belief, known.belief_state
-            if not bool((told | ~running).all()):
+            belief = self._learning.learner.belief
+            believed = knowledge.belief_state
+            if not bool((is_updated | ~running).all()):
                 state = fields.state
-                believed = call(
-                    Outcome.BELIEF_ERROR,
-                    lambda: belief.put(
-                        state, places, belief.select(known.belief_state, places)
-                    ),
-                )
+
+                def merge() -> Any:
+                    changed = belief.select(knowledge.belief_state, indices)
+                    return belief.put(state, indices, changed)
+
+                believed = call(Outcome.BELIEF_ERROR, merge)
             fields = replace(fields, state=believed)
         self._problem = replace(
-            before,
-            # Of other episodes the planner is told nothing, so that none depends on
-            # those beside it.
-            observation=put_if_alike(before.observation, places, known.observation),
-            distribution=put_if_alike(
-                before.distribution, places, self._how.learner.distribution(known)
+            problem,
+            # Other episodes keep their maps, so that none depends on its batch.
+            observation=put_if_alike(
+                problem.observation, indices, knowledge.observation
             ),
-            risk_map=torch.where(which, known.risk_map, before.risk_map),
-            free=torch.where(which, free, before.free),
+            distribution=put_if_alike(
+                problem.distribution,
+                indices,
+                self._learning.learner.distribution(knowledge),
+            ),
+            risk_map=torch.where(update_mask, knowledge.risk_map, problem.risk_map),
+            free=torch.where(update_mask, free, problem.free),
             start=robot_state,
             fields=fields,
         )
         return self._problem
 
     def look_ahead(self, step: int, robot_state: Tensor, running: Tensor) -> None:
-        """Measures what is believed of the ground ahead of the robots; arguments as of
-        `learn`.
-        """
-        grid, known = self._problem.grid, self.known
+        """Score the belief over the cells ahead of the robots; arguments as in `learn`."""
+        grid = self._problem.grid
+        knowledge = self.known
         row, column = (
             torch.arange(size, device=robot_state.device) for size in grid.shape
         )
         x, y = grid.centre_of(row[:, None], column[None, :])
-        away_x, away_y = (
-            x - robot_state[:, 0, None, None],
-            y - robot_state[:, 1, None, None],
-        )
+        away_x = x - robot_state[:, 0, None, None]
+        away_y = y - robot_state[:, 1, None, None]
         turn = torch.atan2(away_y, away_x) - robot_state[:, 2, None, None]
         turn = torch.atan2(turn.sin(), turn.cos())
-        near = (torch.hypot(away_x, away_y) <= AHEAD_M) & (
+        is_ahead = (torch.hypot(away_x, away_y) <= AHEAD_M) & (
             turn.abs() <= math.radians(AHEAD_DEG)
         )
-        cells = near & ~known.ever_sensed & running[:, None, None]
-        found = torch.full(
+        cells = is_ahead & ~knowledge.ever_sensed & running[:, None, None]
+        scores = torch.full(
             (len(self.revisions), 2), torch.nan, device=robot_state.device
         )
         if bool(cells.any()):
             value = self._truth.field[cells]
-            error = self._how.learner.at(known, cells).mean()[0] - value
-            score = (
-                self._how.learner.distribution(known).at(cells).log_prob(value[None])[0]
-            )
-            member = cells.nonzero()[:, 0]
-            count = torch.bincount(member, minlength=len(cells))
+            error = self._learning.learner.at(knowledge, cells).mean()[0] - value
+            distribution = self._learning.learner.distribution(knowledge).at(cells)
+            score = distribution.log_prob(value[None])[0]
+            members_of_cells = cells.nonzero()[:, 0]
+            count = torch.bincount(members_of_cells, minlength=len(cells))
             sums = torch.stack(
-                (error.square().double(), score.double().clamp(min=_LEAST_LOG_SCORE)), 1
+                (error.square().double(), score.double().clamp(min=_MIN_LOG_SCORE)), 1
             )
             means = torch.zeros(
                 len(cells), 2, dtype=torch.float64, device=sums.device
-            ).index_add_(0, member, sums)
+            ).index_add_(0, members_of_cells, sums)
             means = means / count[:, None]
-            found[self.members] = torch.stack(
+            scores[self.members] = torch.stack(
                 (means[:, 0].sqrt(), means[:, 1]), 1
             ).float()
-        self.ahead[step] = found
+        self.ahead[step] = scores
 
-    def maps_of(self, step: int, wanted: Iterable[int]) -> dict[int, KnownMap]:
-        """What is known in some episodes, by their numbers, of those that are left."""
-        places = {
-            int(member): place for place, member in enumerate(self.members.tolist())
+    def maps_of(self, step: int, members: Iterable[int]) -> dict[int, KnownMap]:
+        """Return the known maps of some of the remaining episodes, by index."""
+        indices = {
+            int(member): index for index, member in enumerate(self.members.tolist())
         }
-        learner, known = self._how.learner, self.known
+        learner = self._learning.learner
+        knowledge = self.known
         maps = {}
-        for member in wanted:
-            if member not in places:
+        for member in members:
+            if member not in indices:
                 continue
-            place = places[member]
-            cells = torch.zeros_like(known.free)
-            cells[place] = True
-            believed = learner.at(known, cells)
+            index = indices[member]
+            cells = torch.zeros_like(knowledge.free)
+            cells[index] = True
+            believed = learner.at(knowledge, cells)
 
-            def own(values: Tensor, place: int = place) -> np.ndarray:
-                return values[place].cpu().numpy()
+            def of_member(values: Tensor, index: int = index) -> np.ndarray:
+                return values[index].cpu().numpy()
 
-            def whole(values: Tensor) -> np.ndarray:
+            def on_grid(values: Tensor) -> np.ndarray:
                 return values.reshape(self._problem.grid.shape).float().cpu().numpy()
 
             maps[member] = KnownMap(
                 step=step,
-                predicted=own(known.risk_map),
-                free=own(known.free | self._at_goal),
-                mean=whole(believed.mean()),
-                spread=whole(believed.spread()),
-                seen=own(known.seen),
-                sensed=own(known.ever_sensed),
+                predicted=of_member(knowledge.risk_map),
+                free=of_member(knowledge.free | self._at_goal),
+                mean=on_grid(believed.mean()),
+                spread=on_grid(believed.spread()),
+                seen=of_member(knowledge.seen),
+                sensed=of_member(knowledge.ever_sensed),
                 outline=reach_outline(
-                    own(known.footprint), self._problem.grid.resolution_m
+                    of_member(knowledge.footprint), self._problem.grid.resolution_m
                 ),
             )
         return maps

@@ -1,8 +1,7 @@
-"""Merging the shards of a run into one run folder, which then is as any: reported,
-resumed, extended.
+"""Merging the shards of a run into one run folder.
 
-Units are files that are known by what made them, so that merging is copying them
-together and checking.
+The merged run can be reported, resumed and extended like any other. Units are files
+identified by their origin, so that merging copies and checks them.
 """
 
 import shutil
@@ -40,18 +39,17 @@ from benchnav.eval.run.recordings import keep_ground
 
 
 def merge_shards(parts: Sequence[Path], folder: Path) -> Iterator[tuple[int, int]]:
-    """Makes one run folder of shards, yielding (units copied, units in all); to be
-    iterated to the end.
+    """Merge shards into one run folder, and yield (units copied, total units).
 
-    The folder takes its name when it is whole.
+    The folder receives its name when it is complete.
 
     Args:
         parts: run folders of shards of one run, in any order.
-        folder: where the run is to be; nothing, or an empty folder.
+        folder: path of the new run, which must not exist or be empty.
 
     Raises:
-        ConfigError: a part is no shard, the parts are not of one run, or units are
-            missing; nothing is written.
+        ConfigError: If a part is no shard, the parts are of different runs, or units
+            are missing. Nothing is written then.
     """
     with sole_writer(folder, str(folder)):
         if is_taken(folder):
@@ -62,44 +60,24 @@ def merge_shards(parts: Sequence[Path], folder: Path) -> Iterator[tuple[int, int
             )
         runs = [_open_shard(part) for part in parts]
         _check_alike(runs)
-        every = in_table_order(units(runs[0].conditions), runs[0].conditions)
-        makings = [(unit, _find(unit, runs)) for unit in every]
-        _check_whole([unit for unit, finished in makings if finished is None], runs)
-        found = [(unit, finished) for unit, finished in makings if finished is not None]
-        for (_, earlier), (_, now) in pairwise(found):
-            if changed := provenance.code_differences(
-                earlier.about["code"], now.about["code"]
-            ):
-                raise ConfigError(
-                    f"Expected shards made by one code, got {earlier.path} and "
-                    f"{now.path}, which differ in "
-                    f"{'; '.join(changed)}. Give the commands of the shards again "
-                    "with one code."
-                )
-        touched: dict[str, str] = {}
-        for _, one in found:
-            if changed := unlike(touched, one.about.get(TOUCHED, {})):
-                raise ConfigError(
-                    f"Expected shards whose parts read the same, got {one.path}, "
-                    "which differs from units before it in "
-                    f"{'; '.join(changed)}. Give the commands of the shards again "
-                    "with the same files, packages and "
-                    "variables."
-                )
-            touched |= one.about.get(TOUCHED, {})
+        conditions = runs[0].conditions
+        all_units = in_table_order(units(conditions), conditions)
+        makings = [(unit, _find(unit, runs)) for unit in all_units]
+        _check_whole([unit for unit, making in makings if making is None], runs)
+        complete = [(unit, making) for unit, making in makings if making is not None]
+        _check_one_environment([making for _, making in complete])
         target = folder.resolve()
         partial = new_folder(target)
         write_run(partial, _about(runs))
-        yield 0, len(every)
+        yield 0, len(all_units)
         copied = []
-        for unit, finished in found:
+        for unit, finished in complete:
             path = partial / "units" / unit.condition.id / finished.path.name
             _copy(finished.path, path)
             copied.append((unit, replace(finished, path=path)))
-            yield len(copied), len(every)
-        for source in [
-            run.folder / kind for run in runs for kind in ("steps", "playback")
-        ]:
+            yield len(copied), len(all_units)
+        sources = [run.folder / kind for run in runs for kind in ("steps", "playback")]
+        for source in sources:
             if source.exists():
                 hidden = shutil.ignore_patterns(".*")
                 shutil.copytree(
@@ -109,11 +87,36 @@ def merge_shards(parts: Sequence[Path], folder: Path) -> Iterator[tuple[int, int
                     copy_function=_copy,
                     dirs_exist_ok=True,
                 )
-        align_steps(partial, every)
+        align_steps(partial, all_units)
         finish_run(partial, copied)
         note_checksums(partial, [partial / ERRORS])
         keep_ground(partial)
         take_place(partial, target, last=RUN)
+
+
+def _check_one_environment(makings: Sequence[Finished]) -> None:
+    """Reject units of different code, or whose parts read different files."""
+    for earlier, now in pairwise(makings):
+        changed = provenance.code_differences(earlier.about["code"], now.about["code"])
+        if changed:
+            raise ConfigError(
+                f"Expected shards made by one code, got {earlier.path} and "
+                f"{now.path}, which differ in "
+                f"{'; '.join(changed)}. Give the commands of the shards again "
+                "with one code."
+            )
+    touched: dict[str, str] = {}
+    for making in makings:
+        contents = making.about.get(TOUCHED, {})
+        if changed := unlike(touched, contents):
+            raise ConfigError(
+                f"Expected shards whose parts read the same, got {making.path}, "
+                "which differs from units before it in "
+                f"{'; '.join(changed)}. Give the commands of the shards again "
+                "with the same files, packages and "
+                "variables."
+            )
+        touched |= contents
 
 
 def _copy(source: str | Path, target: str | Path) -> None:
@@ -133,14 +136,13 @@ def _open_shard(part: Path) -> Run:
 
 
 def _check_alike(runs: Sequence[Run]) -> None:
-    """Refuses shards of different runs, with all that differs."""
+    """Reject shards of different runs, listing all differences."""
     if not runs:
         raise ConfigError("Expected one or more `parts`, folders of shards, got none.")
-    reasons = [
-        f"{run.folder}: {'; '.join(unlike)}"
-        for run in runs[1:]
-        if (unlike := _unlike(runs[0], run))
-    ]
+    reasons = []
+    for run in runs[1:]:
+        if differing := _unlike(runs[0], run):
+            reasons.append(f"{run.folder}: {'; '.join(differing)}")
     if reasons:
         raise ConfigError(
             f"Expected shards of one run, got differences to {runs[0].folder}: "
@@ -149,77 +151,65 @@ def _check_alike(runs: Sequence[Run]) -> None:
         )
 
 
-def _unlike(first: Run, other: Run) -> list[str]:
-    """Names what is not the same in two runs: the number of shards, conditions, how
-    often they are run, and maps.
-    """
+def _unlike(first: Run, second: Run) -> list[str]:
+    """List what differs between two runs: shards, conditions, extents and maps."""
     lines = []
-    if _shard(other).of != _shard(first).of:
-        lines.append(f"number of shards ({_shard(first).of} to {_shard(other).of})")
-    for lacking, having in ((other, first), (first, other)):
+    n_first = _shard(first).of
+    n_second = _shard(second).of
+    if n_second != n_first:
+        lines.append(f"number of shards ({n_first} to {n_second})")
+    for run, reference in ((second, first), (first, second)):
         names = [
             " ".join(label_words(condition.labels))
-            for i, (condition, _) in having.conditions.items()
-            if i not in lacking.conditions
+            for i, (condition, _) in reference.conditions.items()
+            if i not in run.conditions
         ]
         if names:
             more = f" and {len(names) - 3} more" if len(names) > 3 else ""
             lines.append(
-                f"conditions that {lacking.folder} lacks ({', '.join(names[:3])}{more})"
+                f"conditions that {run.folder} lacks ({', '.join(names[:3])}{more})"
             )
-    both = [
-        (run, other.conditions[i])
-        for i, run in first.conditions.items()
-        if i in other.conditions
-    ]
-    if any(one.labels != another.labels for (one, _), (another, _) in both):
+    common = [i for i in first.conditions if i in second.conditions]
+    pairs = [(first.conditions[i], second.conditions[i]) for i in common]
+    if any(a.labels != b.labels for (a, _), (b, _) in pairs):
         lines.append("labels of conditions")
-    if any(set(one.draws) != set(another.draws) for (_, one), (_, another) in both):
+    if any(set(a.draws) != set(b.draws) for (_, a), (_, b) in pairs):
         lines.append("seeds, realisations or maps")
     lines += provenance.dataset_differences(
-        first.about["datasets"], other.about["datasets"]
+        first.about["datasets"], second.about["datasets"]
     )
-    lines += [
-        name
-        for name in ("hypotheses", "metrics")
-        if other.about.get(name) != first.about.get(name)
-    ]
+    for name in ("hypotheses", "metrics"):
+        if second.about.get(name) != first.about.get(name):
+            lines.append(name)
     return lines
 
 
 def _find(unit: Unit, runs: Sequence[Run]) -> Finished | None:
-    """A finished unit of some runs, the newest of each; refuses one that came out
-    differently in two.
-    """
-    columns = {one.quantity.column for one in metrics_of_run(runs[0].about)}
-    found = [
-        makings[0]
-        for run in runs
-        if (
-            makings := [
-                one for one in find_units(run.folder, unit) if columns <= one.metrics
-            ]
-        )
-    ]
-    for making in found:
+    """Return a finished unit of some runs; reject one whose rows differ between two."""
+    columns = {metric.quantity.column for metric in metrics_of_run(runs[0].about)}
+    newest = []
+    for run in runs:
+        makings = find_units(run.folder, unit)
+        newest += [making for making in makings if columns <= making.metrics][:1]
+    for making in newest:
         if damage := making.damage():
             raise ConfigError(
                 f"{making.folder} is damaged: {damage[0]}. Give the shard's command "
                 "again, which runs the unit again."
             )
-    for other in found[1:]:
-        if len(differences(unit_rows(found[0]), unit_rows(other))[0]):
+    for making in newest[1:]:
+        if len(differences(unit_rows(newest[0]), unit_rows(making))[0]):
             raise ConfigError(
                 f"Expected the same rows of a unit in all shards, got {unit.name} "
                 f"({unit.condition.description}), "
-                f"which differs between {found[0].path} and {other.path}. Leave one "
+                f"which differs between {newest[0].path} and {making.path}. Leave one "
                 "of them out."
             )
-    return found[0] if found else None
+    return newest[0] if newest else None
 
 
 def _check_whole(missing: Sequence[Unit], runs: Sequence[Run]) -> None:
-    """Refuses a run that is not whole, and says which shards are to be run."""
+    """Reject an incomplete run, naming the shards that must be run."""
     if not missing:
         return
     of = _shard(runs[0]).of
@@ -239,35 +229,38 @@ def _check_whole(missing: Sequence[Unit], runs: Sequence[Run]) -> None:
 
 
 def _about(runs: Sequence[Run]) -> Mapping[str, Any]:
-    """`run.json` of the whole: that of the first shard, with what was measured, said
-    and commanded of all.
+    """Return `run.json` of the merged run.
+
+    It is that of the first shard, with latencies, warnings and history of all.
     """
-    about = {name: value for name, value in runs[0].about.items() if name != "shard"}
+    manifest = {name: value for name, value in runs[0].about.items() if name != "shard"}
     entries = {
         i: [run.about["conditions"][i] for run in reversed(runs)]
         for i in runs[0].conditions
     }
-    # They are alike but for latencies, which only those shards have that measured them.
-    about["conditions"] = {
-        i: {k: v for entry in own for k, v in entry.items()}
-        for i, own in entries.items()
+    # Entries differ only in latencies, which only the shards that measured them have.
+    manifest["conditions"] = {
+        i: {k: v for entry in shard_entries for k, v in entry.items()}
+        for i, shard_entries in entries.items()
     }
     for name in ("warnings", "dropped", "history"):
-        about[name] = provenance.join(*(run.about[name] for run in runs))
-    about["history"] = provenance.extend_history(about["history"], about["suite"])
+        manifest[name] = provenance.join(*(run.about[name] for run in runs))
+    manifest["history"] = provenance.extend_history(
+        manifest["history"], manifest["suite"]
+    )
     machines = provenance.join([run.about["machine"] for run in runs])
     if len(machines) > 1:
-        names = ", ".join(
-            dict.fromkeys(
-                f"{one['processor']} with {one['cores']} cores" for one in machines
-            )
-        )
+        described = [
+            f"{machine['processor']} with {machine['cores']} cores"
+            for machine in machines
+        ]
+        names = ", ".join(dict.fromkeys(described))
         line = (
             f"the shards ran on {len(machines)} machines ({names}), so that "
             "planning times do not compare planners"
         )
-        about["warnings"] = provenance.join(about["warnings"], [line])
-    return about
+        manifest["warnings"] = provenance.join(manifest["warnings"], [line])
+    return manifest
 
 
 def _shard(run: Run) -> Shard:

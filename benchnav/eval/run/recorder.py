@@ -9,16 +9,14 @@ import torch
 
 from benchnav.core.terrain import Terrain
 from benchnav.eval.experiment.unit import Unit
-from benchnav.eval.recording import (
-    MOMENT_S,
+from benchnav.eval.recorded_plans import (
     NUMBERS,
     DrawnPlan,
     KnownMap,
-    Recording,
-    drawing_interval,
     drawn_plan,
     thinned,
 )
+from benchnav.eval.recording import MOMENT_S, Recording, drawing_interval
 from benchnav.eval.run.knowledge import Knowing
 from benchnav.eval.run.rollout import Episodes, Observer
 from benchnav.planning.planners.planner import Plan
@@ -28,14 +26,14 @@ from benchnav.planning.world.simulation import Simulation
 
 
 class Recorder:
-    """Keeps what was planned for some episodes of a unit, and what was known in them.
+    """Collects plans and known maps of some episodes of a unit.
 
     Args:
-        unit: what is run.
-        problem: the unit's.
-        simulation: the unit's; of it the λ that stays what it is.
-        terrain: the unit's true maps; of them the truth of λ, which no planner is told.
-        members: which of the unit's episodes.
+        unit: the unit.
+        problem: the unit's problem.
+        simulation: the unit's simulation, with a λ field that is not resampled.
+        terrain: the unit's true maps, with the true λ, which no planner receives.
+        members: indices of the unit's episodes.
     """
 
     def __init__(
@@ -46,54 +44,53 @@ class Recorder:
         terrain: Terrain,
         members: Iterable[int],
     ) -> None:
-        """Begins with nothing."""
-        self.unit, self.problem, self.simulation, self.terrain = (
-            unit,
-            problem,
-            simulation,
-            terrain,
-        )
+        """Start without plans."""
+        self.unit = unit
+        self.problem = problem
+        self.simulation = simulation
+        self.terrain = terrain
         self._plans: dict[int, list[DrawnPlan]] = {member: [] for member in members}
         self._known: dict[int, list[KnownMap]] = {member: [] for member in self._plans}
 
     def watch(self, step: int, plan: Plan, planned: list[int]) -> None:
-        """Keeps a step's plan; those that no figure will show are thinned, since there
-        may be many.
+        """Store a step's plan, thinned after the time that figures show.
 
         Args:
-            step: its number.
-            plan: of some episodes.
-            planned: which of the unit's these are.
+            step: index of the step.
+            plan: plan of some episodes.
+            planned: indices of these episodes in the unit.
         """
-        whole = step * self.problem.dt_s <= MOMENT_S + 1e-6
-        for place, member in enumerate(planned):
+        is_drawn = step * self.problem.dt_s <= MOMENT_S + 1e-6
+        for index, member in enumerate(planned):
             if member in self._plans:
-                drawn = drawn_plan(step, plan.lines(place))
-                self._plans[member].append(drawn if whole else thinned(drawn))
+                drawn = drawn_plan(step, plan.lines(index))
+                self._plans[member].append(drawn if is_drawn else thinned(drawn))
 
     @property
     def observer(self) -> Observer:
-        """What `run_episodes` calls with plans and with what is known."""
+        """Observer that `run_episodes` calls with plans and knowledge."""
         return Observer(
             plan=self.watch,
-            every=drawing_interval(self.problem.dt_s),
+            plan_interval=drawing_interval(self.problem.dt_s),
             knowledge=self.learn,
         )
 
     def learn(self, step: int, knowing: Knowing) -> None:
-        """Keeps what is known from a step on.
+        """Store what robots know from a step on.
 
         Args:
-            step: its number.
-            knowing: what is known.
+            step: index of the step.
+            knowing: the knowledge of the batch.
         """
-        for member, known in knowing.maps_of(step, self._known).items():
-            # Half as large, and finer than what a file keeps.
-            less = {name: getattr(known, name).astype(np.float16) for name in NUMBERS}
-            self._known[member].append(replace(known, **less))
+        for member, known_map in knowing.maps_of(step, self._known).items():
+            # Half the memory, and finer than a file's resolution.
+            halved = {
+                name: getattr(known_map, name).astype(np.float16) for name in NUMBERS
+            }
+            self._known[member].append(replace(known_map, **halved))
 
     def recording(self, episodes: Episodes, member: int) -> Recording:
-        """All that is played back of one episode."""
+        """Return the recording of one episode."""
         steps = int(episodes.steps[member])
         return self.driven(
             member,
@@ -111,49 +108,58 @@ class Recorder:
         actions: np.ndarray,
         traversability: np.ndarray,
     ) -> Recording:
-        """Records an episode that was driven elsewhere, with what was planned here for
-        it.
+        """Record an episode from its driven states, with the plans collected here.
+
+        Letters in shapes are those of `Recording`.
 
         Args:
-            member: which of the unit's episodes; letters in the shapes of what follows
-                are those of `Recording`.
-            outcome: how it ended.
+            member: index of the episode in the unit.
+            outcome: name of the outcome.
             states: shape [N + 1, S].
             actions: shape [N, A].
             traversability: observed λ, shape [N].
         """
-        unit, problem, simulation = self.unit, self.problem, self.simulation
+        unit = self.unit
+        problem = self.problem
+        simulation = self.simulation
 
-        def own(values: Any) -> np.ndarray:
+        def of_member(values: Any) -> np.ndarray:
             return values[member].cpu().numpy()
 
-        truth, free = self.terrain.truth, problem.task.rules.free_space
+        truth = self.terrain.truth
+        free = problem.task.rules.free_space
+        true_mean = truth.select(torch.tensor([member])).mean()[0]
+        soft = (truth.weights[member, 1:] > 0).any(dim=0)
+        field = simulation.field
         numbers = {
             "seed": unit.seed,
             "realisation": unit.realisation,
             "map": unit.maps[member],
         }
+        # A batch may continue after the episode has ended.
+        known_maps = [
+            known_map
+            for known_map in self._known.get(member, ())
+            if known_map.step <= len(actions)
+        ]
+        identity = {
+            "condition": unit.condition.id,
+            **unit.condition.labels,
+            **{name: str(number) for name, number in numbers.items()},
+            "outcome": outcome,
+        }
         return Recording(
-            about={
-                "condition": unit.condition.id,
-                **unit.condition.labels,
-                **{name: str(number) for name, number in numbers.items()},
-                "outcome": outcome,
-            },
+            about=identity,
             resolution_m=problem.grid.resolution_m,
-            rgb=own(self.terrain.rgb),
-            field=None if simulation.field is None else own(simulation.field),
-            immobilising=own(simulation.immobilising),
-            goal_m=own(problem.goal_m),
-            elevation_m=own(self.terrain.elevation_m),
-            true_mean=truth.select(torch.tensor([member]))
-            .mean()[0]
-            .float()
-            .cpu()
-            .numpy(),
-            soft=(truth.weights[member, 1:] > 0).any(dim=0).cpu().numpy(),
-            predicted=own(problem.risk_map),
-            free=own(problem.free),
+            rgb=of_member(self.terrain.rgb),
+            field=None if field is None else of_member(field),
+            immobilising=of_member(simulation.immobilising),
+            goal_m=of_member(problem.goal_m),
+            elevation_m=of_member(self.terrain.elevation_m),
+            true_mean=true_mean.float().cpu().numpy(),
+            soft=soft.cpu().numpy(),
+            predicted=of_member(problem.risk_map),
+            free=of_member(problem.free),
             free_by=free.by,
             free_above=free.above,
             dt_s=problem.dt_s,
@@ -163,11 +169,8 @@ class Recorder:
             actions=actions,
             traversability=traversability,
             plans=self._plans.get(member, ()),
-            layers={name: own(layer) for name, layer in self.terrain.layers.items()},
-            # An ended episode may stay in a batch that goes on.
-            known=tuple(
-                known
-                for known in self._known.get(member, ())
-                if known.step <= len(actions)
-            ),
+            layers={
+                name: of_member(layer) for name, layer in self.terrain.layers.items()
+            },
+            known=tuple(known_maps),
         )

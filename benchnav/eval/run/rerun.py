@@ -1,7 +1,7 @@
-"""Repeating a run from its provenance, and telling whether every row came out the same.
+"""Repetition of a run from its provenance, and comparison of every row.
 
-What is repeated are the conditions of `run.json`, each as often as it was run, whatever
-commands they came by.
+The conditions of `run.json` are repeated with their extents, whichever commands added
+them.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -36,8 +36,8 @@ from benchnav.eval.run.check import (
     build_each,
     check_everywhere,
     check_split,
-    find_left_out,
 )
+from benchnav.eval.run.combinations import find_left_out
 from benchnav.eval.run.runner import run_work
 from benchnav.eval.run.unit import Settings
 
@@ -51,18 +51,17 @@ def rerun(
     overwrite: bool = False,
     say: Say = lambda line: None,
 ) -> Iterator[Progress]:
-    """Runs all of a finished run again, yielding its progress in units; to be iterated
-    to the end.
+    """Run all of a finished run again, and yield the progress in units.
 
     Args:
-        run_folder: what is repeated.
-        folder: where to; a rerun that is there is gone on with.
+        run_folder: the run that is repeated.
+        folder: folder of the rerun; an interrupted rerun is resumed.
         jobs: number of worker processes, or the address of a Dask cluster's scheduler.
-        overwrite: drop the run that is there.
-        say: is told what a user should know, a line at a time.
+        overwrite: whether to delete a run in `folder` first.
+        say: receives what a user should know, a line at a time.
 
     Raises:
-        ConfigError: the run is not finished, or a part of it is no longer there.
+        ConfigError: If the run is not finished, or a part of it is missing.
     """
     run = _open(run_folder)
     check_resumable(run)
@@ -77,7 +76,7 @@ def rerun(
         planner_limit_s=run.about["planner_limit_s"],
         device=device_of_run(run.about).type,
     )
-    _check_there(run)
+    _check_available(run)
     metrics = metrics_of_run(run.about)
     if jobs != 1 or settings.planner_limit_s:
         check_everywhere(
@@ -98,31 +97,32 @@ def rerun(
 
 
 def compare(run_folder: Path, folder: Path) -> tuple[bool, list[str]]:
-    """Compares a run with its rerun, row by row.
+    """Compare a run with its rerun, row by row.
 
     Args:
-        run_folder: what was repeated.
-        folder: what came out.
+        run_folder: the original run.
+        folder: the rerun.
 
     Returns:
-        Whether every row came out the same, in all columns of either table, and all
-        that is to be told.
+        Whether all rows are identical in all columns of both tables, and lines for the
+        user.
 
     Raises:
-        ConfigError: one of them is not finished.
+        ConfigError: If one of the runs is not finished.
     """
-    run, again = _open(run_folder), open_run(folder)
-    first, second = read_table(run_folder, EPISODES), read_table(folder, EPISODES)
+    run = _open(run_folder)
+    again = open_run(folder)
+    first = read_table(run_folder, EPISODES)
+    second = read_table(folder, EPISODES)
     columns = differing_columns(first, second)
-    cells, lacking = differences(first, second)
-    same = not (len(cells) or len(lacking) or columns)
+    cells, missing = differences(first, second)
+    same = not (len(cells) or len(missing) or columns)
     lines = [f"all {len(first)} rows came out the same"] if same else []
-    if len(cells) or len(lacking):
-        conditions = {
-            i: one
-            for i, (one, _) in (*again.conditions.items(), *run.conditions.items())
-        }
-        lines += _verdict(conditions, len(first), cells, lacking)
+    if len(cells) or len(missing):
+        conditions: dict[str, Condition] = {}
+        for entries in (again.conditions, run.conditions):
+            conditions |= {i: condition for i, (condition, _) in entries.items()}
+        lines += _verdict(conditions, len(first), cells, missing)
     lines += [f"column {name} is in only one of the two tables" for name in columns]
     return same, [*lines, _environment(run.about, again.about)]
 
@@ -134,38 +134,36 @@ def _open(folder: Path) -> Run:
 
 
 def _check_repeats(run: Run, folder: Path) -> None:
-    """Refuses a run that is no rerun: one of other conditions, or with units that were
-    copied from the run itself.
-    """
+    """Reject a run with other conditions, or with units copied from the original."""
     if set(open_run(folder).conditions) != set(run.conditions):
         raise ConfigError(
             f"Expected `out` to be new or an earlier rerun of {run.folder}, got "
             f"{folder} with other conditions. Choose "
             "another `out`."
         )
-    every = units(run.conditions)
-    copied = len(_makings(run.folder, every) & _makings(folder, every))
+    run_units = units(run.conditions)
+    copied = len(_makings(run.folder, run_units) & _makings(folder, run_units))
     if copied:
         raise ConfigError(
             f"Expected `out` to be new or an earlier rerun of {run.folder}, got "
             f"{folder}, where {copied} of "
-            f"{len(every)} units are copies of that run's units. Choose another "
+            f"{len(run_units)} units are copies of that run's units. Choose another "
             "`out`, or pass --overwrite."
         )
 
 
-def _makings(folder: Path, every: Sequence[Unit]) -> set[str]:
-    """Tokens of all makings of units, which copies of them share."""
+def _makings(folder: Path, run_units: Sequence[Unit]) -> set[str]:
+    """Return the tokens of all finished units; copies share a token."""
     return {
         finished.about["made"]
-        for unit in every
+        for unit in run_units
         for finished in find_units(folder, unit)
     }
 
 
-def _check_there(run: Run) -> None:
-    """Refuses a run of which something is no longer there, with all that is not."""
-    lacking: dict[str, None] = {}
+def _check_available(run: Run) -> None:
+    """Reject a run that depends on something missing, and list all that is missing."""
+    missing: dict[str, None] = {}
     parts = [metric.part for metric in metrics_of_run(run.about)]
     checks: list[Callable[[], Any]] = [partial(provenance.describe_metrics, parts)]
     for condition, extent in run.conditions.values():
@@ -175,15 +173,15 @@ def _check_there(run: Run) -> None:
         try:
             check()
         except BenchnavError as error:
-            lacking[str(error)] = None
-    if lacking:
+            missing[str(error)] = None
+    if missing:
         raise ConfigError(
             f"Expected all that {run.folder} was made with, got a lack: "
-            f"{' '.join(lacking)}"
+            f"{' '.join(missing)}"
         )
     conditions = [condition for condition, _ in run.conditions.values()]
-    for one in find_left_out(conditions).values():
-        raise ConfigError(one["reason"])
+    for entry in find_left_out(conditions).values():
+        raise ConfigError(entry["reason"])
     build_each(conditions, maps=1)
 
 
@@ -191,21 +189,19 @@ def _verdict(
     conditions: Mapping[str, Condition],
     rows: int,
     cells: pd.DataFrame,
-    lacking: pd.Index,
+    missing: pd.Index,
 ) -> list[str]:
-    """Which rows came out differently, the first of them with all that differs, and the
-    greatest differences.
-    """
+    """Describe the rows that differ: counts, the first rows, the largest differences."""
     changes = [
         f"{name} {_text(a)} → {_text(b)}" for (*_, name), a, b in cells.itertuples()
     ]
-    told = (
+    changes_by_row = (
         pd.Series(changes, index=cells.index, dtype=str)
         .groupby(level=KEYS, sort=False)
         .agg(", ".join)
     )
     differing = pd.concat(
-        [told, pd.Series("in only one of the two tables", index=lacking)]
+        [changes_by_row, pd.Series("in only one of the two tables", index=missing)]
     )
     counts = differing.groupby(level="condition", sort=False).size()
     lines = [
@@ -217,9 +213,9 @@ def _verdict(
         for condition, count in counts.items()
     ]
     lines.append("the first of them:")
-    for (condition, *place), line in differing.head(_SHOWN).items():
+    for (condition, *draw), line in differing.head(_SHOWN).items():
         where = ", ".join(
-            f"{name} {value}" for name, value in zip(KEYS[1:], place, strict=True)
+            f"{name} {value}" for name, value in zip(KEYS[1:], draw, strict=True)
         )
         lines.append(f"  {conditions[condition].description}, {where}: {line}")
     numbers = cells[cells.map(lambda value: isinstance(value, float)).all(axis=1)]
@@ -242,14 +238,20 @@ def _text(value: object) -> str:
     return f"{value:.9g}" if isinstance(value, float) else str(value)
 
 
-def _environment(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    """What differs between what two runs were made by, in words."""
-    codes = zip(before["codes"].values(), now["codes"].values(), strict=False)
+def _environment(
+    before_manifest: Mapping[str, Any], now_manifest: Mapping[str, Any]
+) -> str:
+    """Describe the differences between the environments of two runs."""
+    codes = zip(
+        before_manifest["codes"].values(), now_manifest["codes"].values(), strict=False
+    )
     changed = [line for pair in codes for line in provenance.code_differences(*pair)]
-    changed += provenance.dataset_differences(before["datasets"], now["datasets"])
+    changed += provenance.dataset_differences(
+        before_manifest["datasets"], now_manifest["datasets"]
+    )
     machines = [
-        f"{about['machine']['processor']}, {about['machine']['cores']} cores"
-        for about in (before, now)
+        f"{manifest['machine']['processor']}, {manifest['machine']['cores']} cores"
+        for manifest in (before_manifest, now_manifest)
     ]
     if machines[0] != machines[1]:
         changed.append(f"machine ({machines[0]} to {machines[1]})")

@@ -22,15 +22,14 @@ from benchnav.planning.world.world import Endpoints
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Draws:
-    """What is known of the maps of a batch and of the λ that was drawn on them.
+    """Reference values of the maps of a batch and of the λ drawn on them.
 
     Args:
-        reference_time_s: grid reference times at 1 m/s, shape [B]; NaN where there is
-            none.
-        rejected_draws: draws of λ of each episode in which no feasible path joins start
-            and goal, B of them.
-        lower_bound_s: time to the goal that no trajectory undercuts, infinite where
-            none arrives, B of them; empty if it was not computed.
+        reference_time_s: grid reference times at 1 m/s, shape [B]; NaN if missing.
+        rejected_draws: number of draws of λ of each episode without a feasible path to
+            the goal, length B.
+        lower_bound_s: lower bound of the time to the goal, infinite if no trajectory
+            reaches it, length B; empty if it was not computed.
     """
 
     reference_time_s: np.ndarray
@@ -41,44 +40,42 @@ class Draws:
 def finished_episodes(
     problem: Problem, episodes: Episodes, draws: Draws
 ) -> list[Episode]:
-    """Return each episode of a batch as metrics are given it.
+    """Return each episode of a batch as metrics receive it.
 
     Args:
-        problem: what was to be solved.
-        episodes: what happened.
-        draws: on which maps and λ.
+        problem: the problem of the batch.
+        episodes: the episodes of the batch.
+        draws: reference values of their maps and λ.
     """
-    above = torch.tensor(
-        problem.task.rules.free_space.above, dtype=episodes.traversability.dtype
-    )
+    # In the tensor's own precision, in which planners compare.
+    dtype = episodes.traversability.dtype
+    above = torch.tensor(problem.task.rules.free_space.above, dtype=dtype)
     planning_s = episodes.planning_s / episodes.planned
     finished = []
     for b in range(len(episodes.steps)):
         steps = int(episodes.steps[b])
+        lower_bound_s = draws.lower_bound_s[b] if len(draws.lower_bound_s) else np.nan
         finished.append(
             Episode(
-                states=_own(episodes.states[b, : steps + 1]),
-                actions=_own(episodes.actions[b, :steps]),
+                states=_float64(episodes.states[b, : steps + 1]),
+                actions=_float64(episodes.actions[b, :steps]),
                 action_names=problem.robot.action_names,
-                speed_mps=_own(episodes.speed_mps[b, :steps]),
-                turn_rate_radps=_own(episodes.turn_rate_radps[b, :steps]),
-                traversability=_own(episodes.traversability[b, :steps]),
+                speed_mps=_float64(episodes.speed_mps[b, :steps]),
+                turn_rate_radps=_float64(episodes.turn_rate_radps[b, :steps]),
+                traversability=_float64(episodes.traversability[b, :steps]),
                 outcome=Outcome(int(episodes.outcome[b])).name.lower(),
                 dt_s=problem.dt_s,
                 time_budget_s=float(problem.time_budget_s[b]),
                 reference_time_s=float(draws.reference_time_s[b]),
-                goal_m=_own(problem.goal_m[b]),
+                goal_m=_float64(problem.goal_m[b]),
                 goal_radius_m=problem.goal_radius_m,
-                # In the tensor's own precision, in which planners compare.
                 stuck_traversability=float(above),
                 robot=problem.robot,
-                planning_s=_own(planning_s[:steps]),
+                planning_s=_float64(planning_s[:steps]),
                 preparing_s=episodes.begin_s / len(episodes.steps),
                 learning=_learning(episodes, b),
                 rejected_draws=draws.rejected_draws[b],
-                lower_bound_s=draws.lower_bound_s[b]
-                if len(draws.lower_bound_s)
-                else np.nan,
+                lower_bound_s=lower_bound_s,
             )
         )
     return finished
@@ -87,20 +84,19 @@ def finished_episodes(
 def unbegun_episodes(
     task: Task, places: Endpoints, time_budget_s: Tensor, outcome: Outcome
 ) -> list[Episode]:
-    """Return episodes that could not begin, as when their model failed: they have no
-    step.
+    """Return episodes without a step, such as those whose model failed.
 
     Args:
-        task: of all episodes.
+        task: task of all episodes.
         places: starts and goals.
         time_budget_s: T in seconds, shape [B].
-        outcome: how they ended.
+        outcome: outcome of all episodes.
     """
     starts = task.robot.initial_state(heading_to(places.start_m, places.goal_m))
     nothing = np.empty(0)
     return [
         Episode(
-            states=_own(start[None]),
+            states=_float64(start[None]),
             actions=np.empty((0, len(task.robot.action_names))),
             action_names=task.robot.action_names,
             speed_mps=nothing,
@@ -110,7 +106,7 @@ def unbegun_episodes(
             dt_s=task.robot.dt_s,
             time_budget_s=float(budget_s),
             reference_time_s=np.nan,
-            goal_m=_own(goal_m),
+            goal_m=_float64(goal_m),
             goal_radius_m=task.rules.goal_radius_m,
             stuck_traversability=task.rules.free_space.above,
             robot=task.robot,
@@ -123,8 +119,8 @@ def unbegun_episodes(
     ]
 
 
-def _own(values: Tensor) -> np.ndarray:
-    """A copy in float64."""
+def _float64(values: Tensor) -> np.ndarray:
+    """Return a float64 copy."""
     return np.array(values.cpu().double().numpy())
 
 
@@ -140,7 +136,7 @@ def _learning(episodes: Episodes, member: int) -> LearningRecord | None:
         revisions=int(episodes.revisions[member]),
         seen_cells=int(episodes.seen_cells[member]),
         sensed_cells=int(episodes.sensed_cells[member]),
-        ahead=_own(episodes.ahead[member, : int(episodes.steps[member])]),
+        ahead=_float64(episodes.ahead[member, : int(episodes.steps[member])]),
         step_s=episodes.learning_s / planned if planned else np.nan,
     )
 
@@ -152,15 +148,14 @@ def episode_rows(
     errors: Sequence[str],
     compiled: bool,
 ) -> pd.DataFrame:
-    """Tabulates episodes, a row each.
+    """Tabulate episodes, a row each.
 
     Args:
-        unit: what was run, with the metrics that its rows have besides those of all
-            runs.
-        groups: which maps go together, shape [B].
-        finished: its episodes, B of them.
-        errors: what went wrong in each, one line; empty if nothing did.
-        compiled: the planner ran compiled.
+        unit: the unit, with its metrics in addition to the built-in ones.
+        groups: group index of each map, shape [B].
+        finished: episodes of the unit, length B.
+        errors: message of each episode's fault, one line; empty if there was none.
+        compiled: whether the planner ran compiled.
 
     Returns:
         The condition's id and labels, `seed`, `realisation`, `map`, `group`, `outcome`;
@@ -168,7 +163,7 @@ def episode_rows(
         of the unit's own metrics.
 
     Raises:
-        MetricError: If a metric fails, or returns an infinite number or none.
+        MetricError: If a metric fails, or returns no finite number.
     """
     further = [part.create() for part in unit.metrics]
     rows = []
@@ -179,17 +174,17 @@ def episode_rows(
         try:
             row |= {metric.column: measure(metric, episode) for metric in further}
         except MetricError as fault:
-            place = (
+            where = (
                 f"{unit.condition.description}, seed {unit.seed}, realisation "
                 f"{unit.realisation}, map {map_index}"
             )
-            raise MetricError(f"{fault} It was given an episode of {place}.") from fault
+            raise MetricError(f"{fault} It was given an episode of {where}.") from fault
         rows.append(row)
     return _named(unit, groups).join(pd.DataFrame(rows))
 
 
 def _named(unit: Unit, groups: np.ndarray) -> pd.DataFrame:
-    """What episodes are known by, a row each."""
+    """Return the columns that identify episodes, a row each."""
     condition = unit.condition
     draw = {
         "seed": unit.seed,
@@ -201,27 +196,28 @@ def _named(unit: Unit, groups: np.ndarray) -> pd.DataFrame:
 
 
 def step_table(unit: Unit, problem: Problem, episodes: Episodes) -> pa.Table:
-    """Tabulates driven paths, a row a state: one a step and one for the last state.
+    """Tabulate driven paths, a row for each step and one for the last state.
 
     Args:
-        unit: what was run.
-        problem: what was to be solved.
-        episodes: what happened.
+        unit: the unit.
+        problem: the unit's problem.
+        episodes: the unit's episodes.
 
     Returns:
         `seed`, `realisation`, `map`, `step`, `time_s`, `x_m`, `y_m`, `heading_rad`,
-        each action by its name, where robots learn `AHEAD_COLUMNS` (NaN but where what
-        is known was updated), and `traversability` as met; actions and `traversability`
+        each action by its name, if robots learn `AHEAD_COLUMNS` (NaN except at
+        updates), and observed `traversability`; actions and `traversability`
         are NaN at the last state.
     """
-    every, steps = np.arange(episodes.states.shape[1]), episodes.steps.numpy()[:, None]
-    inside = every <= steps
-    step = np.broadcast_to(every, inside.shape)[inside]
+    steps_axis = np.arange(episodes.states.shape[1])
+    steps = episodes.steps.numpy()[:, None]
+    inside = steps_axis <= steps
+    step = np.broadcast_to(steps_axis, inside.shape)[inside]
 
     def of_steps(values: Tensor) -> np.ndarray:
-        """One value a row, NaN at the last state of each episode."""
+        """Return one value a row, NaN at the last state of each episode."""
         padded = np.pad(values.numpy().astype(np.float32), ((0, 0), (0, 1)))
-        return np.where(every < steps, padded, np.float32(np.nan))[inside]
+        return np.where(steps_axis < steps, padded, np.float32(np.nan))[inside]
 
     columns: dict[str, Any] = {
         "seed": np.full(len(step), unit.seed),

@@ -1,10 +1,8 @@
-"""Running a suite into a run folder: check, cut into units, run what is missing, make
-the table of their rows.
+"""Running a suite: check it, split it into units, run missing ones, write the table.
 
-A run folder is a store of finished units, each known by what made it (`Origin.key`).
-Running fills it: a run is resumed or extended by giving the same command or another. A
-row does not depend on the number of workers, on the order of units, or on
-interruptions.
+A run folder stores finished units, each identified by its origin (`Origin.key`). A run
+is resumed or extended by repeating its command or giving another. A row does not depend
+on the number of workers, the order of units, or interruptions.
 """
 
 from collections import Counter, defaultdict
@@ -65,26 +63,25 @@ def run_suite(
     shard: Shard | None = None,
     reuse_code: bool = False,
 ) -> Iterator[Progress]:
-    """Run the units of a suite that are not finished, and yield the progress in units;
-    iterate to the end.
+    """Run the unfinished units of a suite, and yield the progress in units.
 
-    Units of a run that the suite does not name stay as they are. While any of them is
-    not finished, the run has no table, which `say` receives as a line.
+    Units of a run that the suite does not name remain unchanged. While any of them is
+    unfinished, the run has no table, which `say` reports.
 
     Args:
-        suite: what is evaluated.
+        suite: the suite.
         folder: the run folder; it may hold a run, which is resumed or extended.
         jobs: number of worker processes, or the address of a Dask cluster's scheduler,
             whose workers are used.
-        overwrite: whether to drop the run that exists.
-        settings: how units are run: device, and time limit of planners.
+        overwrite: whether to delete an existing run first.
+        settings: device, and time limit of planners.
         say: receives what a user should know, a line at a time.
         shard: the shard of the units that is run; None for all.
-        reuse_code: whether to take finished units of other code, and say so.
+        reuse_code: whether to accept finished units of other code, and report it.
 
     Raises:
         ConfigError: If the folder holds something else, or the suite cannot be run.
-        DatasetError: If the dataset lacks what the suite asks for.
+        DatasetError: If the dataset lacks a split or map.
         BenchnavError: If the cluster cannot be reached, or is lost.
     """
     with sole_writer(folder, str(folder)):
@@ -107,38 +104,33 @@ def run_suite(
 def run_work(
     work: Work, folder: Path, jobs: int | str, overwrite: bool, say: Say
 ) -> Iterator[Progress]:
-    """Run the units of some work that are not finished in a folder that the caller has
-    locked; see `run_suite`.
-    """
+    """Run unfinished units in a folder that the caller has locked; see `run_suite`."""
     jobs, scheduler = (1, jobs) if isinstance(jobs, str) else (jobs, "")
     if scheduler:
-        with connected(scheduler):  # else nothing is dropped or written
+        with connected(scheduler):  # fails before anything is deleted or written
             pass
     if work.settings.device == "cuda":
         say(f"running on {gpu_name(work.settings.device)}")
     if overwrite:
         drop(folder)
-    asked, conditions, metrics = begin(work, folder, say)
-    every = units(conditions, work.record, metrics)
-    own = [
+    requested, conditions, metrics = begin(work, folder, say)
+    all_units = units(conditions, work.record, metrics)
+    shard_units = [
         unit
-        for unit in every
+        for unit in all_units
         if work.shard is None or unit.shard(work.shard.of) == work.shard
     ]
-    named, others = _parted(own, asked)
+    named, others = _parted(shard_units, requested)
     origins = work.settings.origins()
     missing = _missing(
         named, origins, folder, work.reuse_code, say, is_here=not scheduler
     )
-    if not own:
-        say(f"shard {work.shard} holds none of the {len(every)} units")
-    # Workers may be older than this call, so that they are told where names of files
-    # begin.
-    run = (
-        partial(run_on_worker, Path.cwd())
-        if scheduler
-        else partial(_run_in, Path.cwd(), folder.resolve())
-    )
+    if not shard_units:
+        say(f"shard {work.shard} holds none of the {len(all_units)} units")
+    # Workers may have started in another folder, so they receive the working folder.
+    run: Any = partial(_run_in, Path.cwd(), folder.resolve())
+    if scheduler:
+        run = partial(run_on_worker, Path.cwd())
     calls: list[Any] = [
         partial(run, unit, origin, work.settings) for unit, origin in missing
     ]
@@ -152,83 +144,82 @@ def run_work(
             store_files(folder, unit, files)
         yield steps.progress(unit)
     if missing:
-        say("measuring the planning time of one robot alone")
+        say("measuring the planning time of a single robot")
     measure_latencies(folder, {unit.condition.id for unit in named}, work.settings)
     finished, reused = _finished(
         in_table_order(named, conditions), origins, folder, work.reuse_code
     )
     if others:
-        lacking = [
+        unfinished = [
             unit
             for unit in others
             if _counted(unit, origins, folder, work.reuse_code) is None
         ]
-        if lacking:
+        if unfinished:
             write_errors(folder, finished)
             note_checksums(folder, [folder / ERRORS])
-            if missing:  # a table that is there is of other makings of what was run
+            if missing:  # An existing table contains rows of other units.
                 (folder / EPISODES).unlink(missing_ok=True)
-            say(_unfinished(folder, lacking, len(conditions)))
+            say(_unfinished(folder, unfinished, len(conditions)))
             return
         finished, reused = _finished(
-            in_table_order(own, conditions), origins, folder, work.reuse_code
+            in_table_order(shard_units, conditions), origins, folder, work.reuse_code
         )
     if not work.reuse_code:
-        _check_steady([one for _, one in finished], is_here=not scheduler)
+        _check_steady([making for _, making in finished], is_here=not scheduler)
     if work.shard is not None:
         write_errors(folder, finished)
         note_checksums(folder, [folder / ERRORS])
         return
-    align_steps(folder, every)
+    align_steps(folder, all_units)
     finish_run(folder, finished, reused)
     note_checksums(folder, [folder / ERRORS])
     keep_ground(folder)
 
 
 def _parted(
-    own: Sequence[Unit], conditions: Conditions
+    shard_units: Sequence[Unit], conditions: Conditions
 ) -> tuple[list[Unit], list[Unit]]:
-    """The units of a run that hold anything of what a command names, and the others; a
-    block of maps stays whole.
-    """
-    blocks = {
-        (u.condition.id, u.seed, u.realisation, u.block) for u in units(conditions)
-    }
-    parted: tuple[list[Unit], list[Unit]] = [], []
-    for u in own:
-        parted[(u.condition.id, u.seed, u.realisation, u.block) not in blocks].append(u)
-    return parted
+    """Split units into those with an episode of some conditions, and the others."""
+    requested = {_key(unit) for unit in units(conditions)}
+    named = [unit for unit in shard_units if _key(unit) in requested]
+    others = [unit for unit in shard_units if _key(unit) not in requested]
+    return named, others
 
 
-def _unfinished(folder: Path, lacking: Sequence[Unit], conditions: int) -> str:
-    ids = {unit.condition.id for unit in lacking}
-    other = sum(bool(find_units(folder, unit)) for unit in lacking)
-    why = f" ({other} of their units are of other code or maps)" if other else ""
+def _key(unit: Unit) -> tuple[str, int, int, int]:
+    return unit.condition.id, unit.seed, unit.realisation, unit.block
+
+
+def _unfinished(folder: Path, units_: Sequence[Unit], conditions: int) -> str:
+    ids = {unit.condition.id for unit in units_}
+    n_other = sum(bool(find_units(folder, unit)) for unit in units_)
+    reason = f" ({n_other} of their units are of other code or maps)" if n_other else ""
     return (
         f"what this command names is finished; {len(ids)} of {conditions} conditions "
-        f"of {folder} are not{why}, so that "
+        f"of {folder} are not{reason}, so that "
         "the run has no new table. Give the command that named them, or read what is "
         "there with `report --partial`"
     )
 
 
 class _Steps:
-    """Counts units as they are finished, and names them by what tells them apart."""
+    """Progress in units, with names of their distinguishing labels."""
 
     def __init__(
         self, named: Sequence[Unit], missing: Sequence[Unit], in_turn: bool
     ) -> None:
-        """Takes all units of a command, those that are to be run, and whether one is
-        run after the other.
-        """
+        """Take a command's units, those to run, and whether they run one by one."""
         self._names = unit_names(named)
-        self._total, self._episodes = len(named), sum(len(unit.maps) for unit in named)
-        self._waiting, self._in_turn = list(missing), in_turn
+        self._total = len(named)
+        self._episodes = sum(len(unit.maps) for unit in named)
+        self._waiting = list(missing)
+        self._in_turn = in_turn
         self._left = len(missing)
         self._left_episodes = sum(len(unit.maps) for unit in missing)
 
     def progress(self, finished: Unit | None = None) -> Progress:
-        """The progress, once a unit was finished; the first without one."""
+        """Return the progress after a unit was finished, or before the first."""
         if finished is not None:
             self._left -= 1
             self._left_episodes -= len(finished.maps)
@@ -247,17 +238,15 @@ class _Steps:
 
 
 def _run_in(
-    here: Path, folder: Path, unit: Unit, origin: Origin, settings: Settings
+    working_folder: Path, folder: Path, unit: Unit, origin: Origin, settings: Settings
 ) -> tuple[Unit, dict[str, bytes]]:
-    """Runs a unit in a process of this machine; gives it, and no files, which it wrote
-    itself.
-    """
-    with chdir(here):
+    """Run a unit in a process of this machine, which writes the files itself."""
+    with chdir(working_folder):
         run_unit(unit, folder, origin, settings)
     return unit, {}
 
 
-# Why units that are there in part are run again, as `say` receives it.
+# Why existing units are run again, as `say` receives it.
 _AGAIN = {
     "unrecorded": "are run again for recordings or steps that they lack",
     "unmeasured": "are run again for metrics that they lack ({})",
@@ -269,51 +258,51 @@ _AGAIN = {
 
 
 def _missing(
-    own: list[Unit],
+    shard_units: list[Unit],
     origins: Origins,
     folder: Path,
     reuse_code: bool,
     say: Say,
     is_here: bool,
 ) -> list[tuple[Unit, Origin]]:
-    """Return what is to be run: units that are not finished, damaged, or not recorded
-    as they are now to be.
+    """Return the units to run: unfinished, damaged, changed or not yet recorded ones.
 
     Args:
-        own: units of this run.
-        origins: what they come from now.
+        shard_units: units of this run.
+        origins: current origins of units.
         folder: the run folder.
-        reuse_code: take units of other code.
+        reuse_code: whether to accept units of other code.
         say: receives how many units are run again, and why.
-        is_here: units are run on this machine, so that what parts read can be compared
-            with what is here.
+        is_here: whether units run on this machine, so that what parts read can be
+            compared with its files.
     """
     missing: list[tuple[Unit, Origin]] = []
     counts: Counter[str] = Counter()
     details: dict[str, dict[str, None]] = defaultdict(dict)
-    for unit in own:
-        origin, makings = origins.of(unit), find_units(folder, unit)
+    for unit in shard_units:
+        origin = origins.of(unit)
+        makings = find_units(folder, unit)
         finished = _counting(makings, unit, origin, reuse_code)
-        why, lines = _why_missing(folder, unit, origin, makings, finished)
-        if not why and is_here and not reuse_code and finished:
+        reason, lines = _why_missing(folder, unit, origin, makings, finished)
+        if not reason and is_here and not reuse_code and finished:
             lines = changes_since(finished.about.get(TOUCHED, {}))
-            why = "changed" if lines else ""
-        if not why and finished and not finished.has(unit):
-            why = "unrecorded"
-        if not why:
+            reason = "changed" if lines else ""
+        if not reason and finished and not finished.has(unit):
+            reason = "unrecorded"
+        if not reason:
             continue
-        counts[why] += 1
-        if why != "damaged" or not details[why]:
-            details[why] |= dict.fromkeys(lines)
-        kept = makings[0] if why == "unmeasured" else finished
-        missing.append((replace(unit, record=_richest(unit, kept)), origin))
-    if done := len(own) - len(missing):
-        say(f"{done} of {len(own)} units were there already")
-    for why, text in _AGAIN.items():
-        if counts[why]:
+        counts[reason] += 1
+        if reason != "damaged" or not details[reason]:
+            details[reason] |= dict.fromkeys(lines)
+        making = makings[0] if reason == "unmeasured" else finished
+        missing.append((replace(unit, record=_richest(unit, making)), origin))
+    if done := len(shard_units) - len(missing):
+        say(f"{done} of {len(shard_units)} units were there already")
+    for reason, template in _AGAIN.items():
+        if counts[reason]:
             say(
-                f"{counts[why]} of {len(own)} units "
-                f"{text.format('; '.join(details[why]))}"
+                f"{counts[reason]} of {len(shard_units)} units "
+                f"{template.format('; '.join(details[reason]))}"
             )
     return missing
 
@@ -323,13 +312,14 @@ def _why_missing(
     unit: Unit,
     origin: Origin,
     makings: list[Finished],
-    finished: Finished | None,
+    making: Finished | None,
 ) -> tuple[str, list[str]]:
-    """Return why a unit is not there as a whole, a key of `_AGAIN` or "new", with lines
-    on it; else an empty key.
+    """Return why a unit is missing, a key of `_AGAIN` or "new", with details.
+
+    The key is empty if the unit is finished.
     """
-    if finished is not None:
-        damage = finished.damage()
+    if making is not None:
+        damage = making.damage()
         return ("damaged", damage[:1]) if damage else ("", [])
     path = unit_path(unit, origin.key(unit))
     if (folder / path).exists():
@@ -344,63 +334,56 @@ def _why_missing(
     return "other", differences
 
 
-def _richest(unit: Unit, counts: Finished | None) -> Record:
-    """What is recorded of a unit that is run again: no less than it has kept, however
-    little is asked for.
-    """
-    return max(
-        unit.record,
-        counts.about["record"] if counts else unit.record,
-        key=RECORDS.index,
-    )
+def _richest(unit: Unit, making: Finished | None) -> Record:
+    """Return the record of a unit that is run again, at least what it has stored."""
+    stored = making.about["record"] if making else unit.record
+    return max(unit.record, stored, key=RECORDS.index)
 
 
 def _counting(
-    known: list[Finished], unit: Unit, origin: Origin, reuse_code: bool
+    makings: list[Finished], unit: Unit, origin: Origin, reuse_code: bool
 ) -> Finished | None:
-    """The making of a unit that counts: that of the code and maps of now, else, if
-    asked for, of other code.
+    """Return the valid making of a unit, or None.
+
+    It has the current code and maps, or other code if `reuse_code`.
     """
-    key, maps = origin.key(unit), list(origin.maps)
-    counting = [
-        finished
-        for finished in known
-        if finished.about["key"] == key
-        or (
-            reuse_code
-            and finished.about["digests"] == maps
-            and not lacks_metrics(finished.about["code"], origin.code)
-        )
-    ]
-    return max(
-        counting, key=lambda finished: finished.about["key"] == key, default=None
-    )
+    key = origin.key(unit)
+    maps = list(origin.maps)
+    for making in makings:
+        if making.about["key"] == key:
+            return making
+    if not reuse_code:
+        return None
+    for making in makings:
+        has_metrics = not lacks_metrics(making.about["code"], origin.code)
+        if making.about["digests"] == maps and has_metrics:
+            return making
+    return None
 
 
 def _counted(
     unit: Unit, origins: Origins, folder: Path, reuse_code: bool
 ) -> Finished | None:
-    """The making of a unit that counts now; None where it is not finished."""
+    """Return the valid making of a unit; None if it is not finished."""
     return _counting(find_units(folder, unit), unit, origins.of(unit), reuse_code)
 
 
 def _differences(finished: Finished, origin: Origin) -> list[str]:
-    """What differs between the origin of a finished unit and another, in words."""
+    """Describe the differences between the origin of a finished unit and another."""
     maps = ["maps"] if finished.about["digests"] != list(origin.maps) else []
     return [*code_differences(finished.about["code"], origin.code), *maps]
 
 
 def _check_steady(finished: list[Finished], is_here: bool) -> None:
-    """Refuse units whose parts read different contents of one file, package or
-    variable.
+    """Reject units whose parts read different contents of a file, package or variable.
 
     Raises:
-        ConfigError: If there are such, or if what they read is not here any more.
+        ConfigError: If there are such units, or if what they read has changed since.
     """
     seen: dict[str, str] = {}
     changed: dict[str, None] = {}
-    for one in finished:
-        touched = one.about.get(TOUCHED, {})
+    for making in finished:
+        touched = making.about.get(TOUCHED, {})
         changed |= dict.fromkeys(unlike(seen, touched))
         seen |= touched
     changed |= dict.fromkeys(changes_since(seen)) if is_here else {}
@@ -414,31 +397,34 @@ def _check_steady(finished: list[Finished], is_here: bool) -> None:
 
 
 def _finished(
-    own: list[Unit], origins: Origins, folder: Path, reuse_code: bool
+    shard_units: list[Unit], origins: Origins, folder: Path, reuse_code: bool
 ) -> tuple[list[tuple[Unit, Finished]], str]:
-    """The makings of all units that count, and a line on those of other code; empty
-    where there are none.
+    """Return the valid makings of all units, and a line on those of other code.
+
+    The line is empty without such units.
 
     Raises:
-        ConfigError: one is not there any more.
+        ConfigError: If a unit was removed.
     """
-    found, reused = [], 0
-    other: dict[str, None] = {}
-    for unit in own:
-        origin, counts = origins.of(unit), _counted(unit, origins, folder, reuse_code)
-        if counts is None:
+    counted = []
+    reused = 0
+    changes: dict[str, None] = {}
+    for unit in shard_units:
+        origin = origins.of(unit)
+        making = _counted(unit, origins, folder, reuse_code)
+        if making is None:
             raise ConfigError(
                 f"Expected unit {unit.name} of condition {unit.condition.id} in "
                 f"{folder}, got none: it was removed. "
                 "Give its `benchnav-eval run` command again."
             )
-        found.append((unit, counts))
-        changed = changes_since(counts.about.get(TOUCHED, {})) if reuse_code else []
-        if changed or counts.about["key"] != origin.key(unit):
+        counted.append((unit, making))
+        changed = changes_since(making.about.get(TOUCHED, {})) if reuse_code else []
+        if changed or making.about["key"] != origin.key(unit):
             reused += 1
-            other |= dict.fromkeys([*_differences(counts, origin), *changed])
+            changes |= dict.fromkeys([*_differences(making, origin), *changed])
     line = (
-        f"{reused} of {len(own)} units were made by other code "
-        f"({'; '.join(other)}); column `code` tells which rows"
+        f"{reused} of {len(shard_units)} units were made by other code "
+        f"({'; '.join(changes)}); column `code` tells which rows"
     )
-    return found, line if reused else ""
+    return counted, line if reused else ""

@@ -1,8 +1,7 @@
-"""Running a unit of work: its maps, its problem and simulation, its episodes, and the
-files that hold them.
+"""Running a unit of work: its maps, problem, simulation, episodes and files.
 
-Only the unit's own block of maps is read and predicted. A prediction serves all
-planners and risk settings of its block that a process runs one after another.
+Only the unit's block of maps is read and predicted. A process reuses the prediction for
+all planners and risk settings of the block.
 """
 
 import traceback
@@ -45,7 +44,12 @@ from benchnav.models.predictor import Clairvoyant, loaded, nugget_of
 from benchnav.planning.planners.planner import Plan, Planner
 from benchnav.planning.problem import Prediction, Problem, heading_to, pose_problem
 from benchnav.planning.sensing.belief import CovarianceModel, Fields
-from benchnav.planning.sensing.knowledge import KnowledgeError, Truth, call, sensor_keys
+from benchnav.planning.sensing.knowledge import (
+    KnowledgeError,
+    Truth,
+    call,
+    sensor_keys,
+)
 from benchnav.planning.sensing.learner import Learner
 from benchnav.planning.sensing.sensor import Step
 from benchnav.planning.world.lower_bound import BOUNDED_ROBOTS, Motion, lower_bound_s
@@ -56,11 +60,11 @@ from benchnav.planning.world.world import Endpoints
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """How units are run.
+    """Settings of units.
 
     Args:
         planner_limit_s: time limit of each call of a planner; 0 for none.
-        device: where all is computed, "cpu" or "cuda".
+        device: device of all computation, "cpu" or "cuda".
     """
 
     planner_limit_s: float = 0.0
@@ -68,28 +72,25 @@ class Settings:
 
     @classmethod
     def on(cls, device: str, planner_limit_s: float = 0.0) -> "Settings":
-        """Choose the settings on a device: "cpu", "cuda", or "auto" for CUDA if there
-        is a GPU.
-        """
+        """Return the settings for "cpu", "cuda", or "auto": CUDA if there is a GPU."""
         return cls(planner_limit_s=planner_limit_s, device=find_device(device).type)
 
     def origins(self) -> Origins:
-        """Looks up what units come from that are run so."""
+        """Return the origins of units under these settings."""
         return Origins(self.planner_limit_s, self.device)
 
 
 def run_unit(unit: Unit, folder: Path, origin: Origin, settings: Settings) -> None:
-    """Runs one unit on one thread and writes its file, and before it its recordings and
-    steps.
+    """Run one unit on one thread, and write its recordings, its steps and its rows.
 
     Args:
-        unit: what is run.
+        unit: the unit.
         folder: the run folder.
-        origin: of the unit as the run was begun.
-        settings: how it is run.
+        origin: origin of the unit when the run was begun.
+        settings: settings of the run.
 
     Raises:
-        ConfigError: its code or its maps are others here and now.
+        ConfigError: If its code or its maps have changed since.
     """
     _check_origin(unit, origin, settings)
     clear_unit(folder, unit)
@@ -99,7 +100,8 @@ def run_unit(unit: Unit, folder: Path, origin: Origin, settings: Settings) -> No
         try:
             built = build(unit, origin, device)
         except KnowledgeError as error:
-            task, places = unit.condition.task, block.places
+            task = unit.condition.task
+            places = block.places
             budgets = unit.condition.world.budget_s(
                 places.reference_time_s, task.robot.top_speed_mps
             )
@@ -109,14 +111,14 @@ def run_unit(unit: Unit, folder: Path, origin: Origin, settings: Settings) -> No
             )
             write_unit(folder, unit, origin, rows, [str(error)], traceback.format_exc())
             return
-        problem, simulation = built.problem, built.simulation
+        problem = built.problem
+        simulation = built.simulation
         watched = unit.watched()
         recorder = Recorder(unit, problem, simulation, block.terrain, watched)
-        episodes, compiled = simulate(
-            unit, built, settings, observer=recorder.observer if watched else Observer()
-        )
-        failed = all(episodes.errors)  # a planner that cannot be made, say
-        least_s = None if failed else _lower_bounds_s(unit, built)
+        observer = recorder.observer if watched else Observer()
+        episodes, compiled = simulate(unit, built, settings, observer=observer)
+        failed = all(episodes.errors)  # such as a planner that cannot be created
+        bounds_s = None if failed else _lower_bounds_s(unit, built)
     succeeded = (episodes.outcome == Outcome.SUCCESS).tolist()
     for member in unit.recorded(succeeded):
         recorder.recording(episodes, member).save(folder / unit.recording_path(member))
@@ -125,7 +127,7 @@ def run_unit(unit: Unit, folder: Path, origin: Origin, settings: Settings) -> No
     draws = Draws(
         reference_time_s=block.places.reference_time_s.cpu().numpy(),
         rejected_draws=(simulation.attempts - 1).tolist(),
-        lower_bound_s=least_s or (),
+        lower_bound_s=bounds_s or (),
     )
     finished = finished_episodes(problem, episodes, draws)
     rows = episode_rows(unit, block.groups, finished, episodes.errors, compiled)
@@ -134,9 +136,7 @@ def run_unit(unit: Unit, folder: Path, origin: Origin, settings: Settings) -> No
 
 
 def _check_origin(unit: Unit, origin: Origin, settings: Settings) -> None:
-    """Refuses to make rows of other code or maps than those that the run was begun
-    with.
-    """
+    """Reject code or maps that differ from those that the run was begun with."""
     now = settings.origins().of(unit)
     changed = code_differences(origin.code, now.code)
     if now.maps != origin.maps:
@@ -151,13 +151,12 @@ def _check_origin(unit: Unit, origin: Origin, settings: Settings) -> None:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Block:
-    """What is stored of a block of maps; what is kept for it is kept for this very one.
+    """A block of maps; compared by identity, so that its prediction can be cached.
 
     Args:
         terrain: the true maps.
         places: starts, goals and grid reference times.
-        groups: which maps go together, as overlapping ones do: those of one number;
-            int64, shape [B].
+        groups: group index of each map, equal for overlapping maps, int64, shape [B].
     """
 
     terrain: Terrain
@@ -165,31 +164,28 @@ class Block:
     groups: np.ndarray
 
     def to(self, device: torch.device) -> "Block":
-        """The same on a device."""
+        """Return the block on a device."""
         return replace(
             self, terrain=self.terrain.to(device), places=self.places.to(device)
         )
 
 
 def read_maps(dataset: TerrainDataset, split: str, maps: Sequence[int]) -> Block:
-    """Reads some maps of a split, with starts, goals, reference times and groups; else
-    each map is one.
-    """
+    """Read some maps of a split; without stored groups, each map is a group."""
     places = dataset.read(split, maps, ["start_m", "goal_m", "reference_time_s"])
     groups: Any = maps
     if "group" in dataset.field_names:
         groups = dataset.read(split, maps, ["group"])["group"]
+    tensors = {name: torch.from_numpy(values) for name, values in places.items()}
     return Block(
         terrain=dataset.terrain(split, maps),
-        places=Endpoints(
-            **{name: torch.from_numpy(values) for name, values in places.items()}
-        ),
+        places=Endpoints(**tensors),
         groups=np.asarray(groups, dtype=np.int64).reshape(-1),
     )
 
 
 def read_block(unit: Unit, origin: Origin, device: torch.device = CPU) -> Block:
-    """Reads a unit's maps and places onto a device; they are kept for other settings."""
+    """Return a unit's maps and endpoints on a device, cached for other settings."""
     return _block(
         unit.condition.data, unit.condition.split, unit.maps, origin.maps, device
     )
@@ -197,12 +193,12 @@ def read_block(unit: Unit, origin: Origin, device: torch.device = CPU) -> Block:
 
 @dataclass(frozen=True, kw_only=True)
 class Built:
-    """What a unit's episodes are run with.
+    """Inputs of a unit's episodes.
 
     Args:
-        problem: of all episodes, when they begin.
-        simulation: with the truth.
-        learning: how the robots learn; None where they learn nothing.
+        problem: problem of all episodes at their start.
+        simulation: simulation with the true terrain.
+        learning: sensing and belief of the robots; None if they do not learn.
     """
 
     problem: Problem
@@ -211,21 +207,21 @@ class Built:
 
 
 def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> Built:
-    """Makes the problem and the simulation of a unit, and what its robots know when
-    they set out.
+    """Create the problem, the simulation and the initial knowledge of a unit.
 
     Args:
-        unit: what is to be run.
-        origin: of the unit; what is kept of predictions is kept for it.
-        device: where all is computed.
+        unit: the unit.
+        origin: origin of the unit, which cached predictions depend on.
+        device: device of all computation.
 
     Raises:
-        KnowledgeError: a sensor, the model, the belief or the risk measure failed.
-        DeviceError: the GPU failed.
-        BenchnavError: the data cannot be read, or are not enough for the world.
+        KnowledgeError: If a sensor, the model, the belief or the risk measure failed.
+        DeviceError: If the GPU failed.
+        BenchnavError: If data cannot be read, or are insufficient for the world.
     """
     condition = unit.condition
-    block, task = read_block(unit, origin, device), condition.task
+    block = read_block(unit, origin, device)
+    task = condition.task
     noise = noise_key(unit.seed, condition.split, unit.realisation)
     simulation = Simulation(
         block.terrain, task, condition.world, block.places, noise, unit.maps
@@ -233,9 +229,9 @@ def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> Built:
     try:
         learner = _learner(condition, block)
         redrawn = simulation.field is None
-        field = (
-            simulation.field_at(0) if condition.learns else block.terrain.traversability
-        )
+        field = block.terrain.traversability
+        if condition.learns:
+            field = simulation.field_at(0)
         truth = Truth(
             terrain=block.terrain, field=field, keys=sensor_keys(noise, unit.maps)
         )
@@ -248,13 +244,13 @@ def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> Built:
         start = task.robot.initial_state(
             heading_to(block.places.start_m, block.places.goal_m)
         )
-        known = learner.begin(truth, start, predicted)
-        fields = Fields(learner.belief, known.belief_state, tuple(unit.maps))
+        knowledge = learner.begin(truth, start, predicted)
+        fields = Fields(learner.belief, knowledge.belief_state, tuple(unit.maps))
         prediction = Prediction(
-            known.observation,
-            learner.distribution(known),
-            known.risk_map,
-            known.free,
+            knowledge.observation,
+            learner.distribution(knowledge),
+            knowledge.risk_map,
+            knowledge.free,
             fields,
         )
         problem = pose_problem(
@@ -271,7 +267,7 @@ def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> Built:
         return Built(problem=problem, simulation=simulation, learning=None)
     learning = Learning(
         learner=learner,
-        start=known,
+        start=knowledge,
         truth=truth,
         field_at=simulation.field_at if redrawn else None,
     )
@@ -279,20 +275,22 @@ def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> Built:
 
 
 def _learner(condition: Condition, block: Block) -> Learner:
-    """How the robots of a unit learn."""
-    dataset, world = condition.dataset, condition.world
+    """Return the sensing and belief of a unit's robots."""
+    dataset = condition.dataset
+    world = condition.world
     sensor = call(Outcome.SENSOR_ERROR, condition.sensor.create)
     belief = call(Outcome.BELIEF_ERROR, condition.belief.create)
     model = call(Outcome.MODEL_ERROR, lambda: condition.model.object)
+    correlation_m = world.correlation_m
+    if world.noise == "stored":
+        correlation_m = dataset.recipe.correlation_m
+    recipe_names = tuple(item.name for item in dataset.recipe.classes)
     covariance = CovarianceModel(
         grid=block.terrain.grid,
-        correlation_m=dataset.recipe.correlation_m
-        if world.noise == "stored"
-        else world.correlation_m,
+        correlation_m=correlation_m,
         nugget=nugget_of(model),
         statistics=condition.statistics,
-        class_names=model.class_names
-        or tuple(item.name for item in dataset.recipe.classes),
+        class_names=model.class_names or recipe_names,
     )
 
     return Learner(
@@ -309,19 +307,18 @@ def _learner(condition: Condition, block: Block) -> Learner:
 def _predict(
     model_key: str, block: Block, field: Tensor | None
 ) -> TraversabilityDistribution:
-    """The prediction of a block, kept for other settings; of the clairvoyant's λ, of
-    one unit alone.
-    """
+    """Return the prediction of a block, cached unless the model is given λ."""
     model = loaded(model_key)
     if not isinstance(model, Clairvoyant):
         return _prediction(model_key, block)
-    assert field is not None  # suites are refused in which λ cannot be known
+    assert field is not None  # suites with resampled λ are rejected
     return predict(model, replace(block.terrain, traversability=field))
 
 
 def noise_key(seed: int, split: str, realisation: int) -> int:
-    """Key of the simulation's noise: the same for every condition (common random
-    numbers).
+    """Return the simulation's noise key, equal for all conditions.
+
+    Conditions are thus compared under common random numbers.
     """
     return rng.stream_key(seed, "simulation", *_draw(split, realisation))
 
@@ -333,13 +330,12 @@ def _draw(split: str, realisation: int) -> tuple[str | int, ...]:
 def simulate(
     unit: Unit, built: Built, settings: Settings, **options: Any
 ) -> tuple[Episodes, bool]:
-    """Runs a unit's episodes; gives what happened, and whether the planner ran
-    compiled.
+    """Run a unit's episodes; return them and whether the planner ran compiled.
 
     Args:
-        unit: what is run.
-        built: the unit's.
-        settings: of them the time limit of planners.
+        unit: the unit.
+        built: inputs of its episodes.
+        settings: settings with the time limit of planners.
         **options: further arguments of `run_episodes`.
     """
     condition = unit.condition
@@ -353,7 +349,7 @@ def simulate(
             else:
                 planner = condition.planner.create()
         except (Exception, SystemExit) as error:
-            planner = _Unmade(error)
+            planner = _FailedPlanner(error)
         # Keyed by seed and split, never by the batch.
         key = rng.stream_key(
             unit.seed, "planner", *_draw(condition.split, unit.realisation)
@@ -371,10 +367,13 @@ def simulate(
 
 
 def _lower_bounds_s(unit: Unit, built: Built) -> list[float] | None:
-    """Lower bounds of the time to the goal where the planner is given λ, of robots and
-    worlds that have one.
+    """Return lower bounds of the time to the goal if the planner is given λ.
+
+    None if the robot or the world has no such bound.
     """
-    problem, field, condition = built.problem, built.simulation.field, unit.condition
+    problem = built.problem
+    field = built.simulation.field
+    condition = unit.condition
     if (
         field is None
         or type(problem.robot) not in BOUNDED_ROBOTS
@@ -388,18 +387,19 @@ def _lower_bounds_s(unit: Unit, built: Built) -> list[float] | None:
         goal_radius_m=problem.goal_radius_m,
         immobile=condition.world.immobile,
     )
-    ends = problem.start[:, :2].cpu().numpy(), problem.goal_m.cpu().numpy()
-    each = zip(field.cpu().numpy(), *ends, strict=True)
-    return [
-        lower_bound_s(values, problem.grid, motion, start_m, goal_m)
-        for values, start_m, goal_m in each
-    ]
+    starts_m = problem.start[:, :2].cpu().numpy()
+    goals_m = problem.goal_m.cpu().numpy()
+    bounds_s = []
+    for values, start_m, goal_m in zip(
+        field.cpu().numpy(), starts_m, goals_m, strict=True
+    ):
+        bound_s = lower_bound_s(values, problem.grid, motion, start_m, goal_m)
+        bounds_s.append(bound_s)
+    return bounds_s
 
 
-class _Unmade(Planner[None]):
-    """Stands for a planner that could not be made: it fails in each unit as one that
-    raises.
-    """
+class _FailedPlanner(Planner[None]):
+    """Substitute for a planner that could not be created, which raises its error."""
 
     def __init__(self, error: BaseException) -> None:
         self.error = error
@@ -413,9 +413,7 @@ class _Unmade(Planner[None]):
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """One thread for PyTorch, whose results do not then depend on the machine; what was
-    is put back.
-    """
+    """Limit PyTorch to one thread, so that results do not depend on the machine."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -424,8 +422,7 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-# What is kept of maps and models is kept for what they are now: other digests are read
-# and loaded anew.
+# Caches are keyed by digests, so that changed maps and models are read again.
 
 
 @lru_cache(maxsize=2)

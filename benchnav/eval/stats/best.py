@@ -1,5 +1,6 @@
-"""The best condition of each block of a run, and which others are significantly worse
-(`benchnav.stats.best`).
+"""The best condition of each block, and which are significantly worse.
+
+The test is `benchnav.stats.best`.
 """
 
 from collections.abc import Mapping
@@ -15,9 +16,9 @@ from benchnav.stats.by_map import alike
 from benchnav.stats.holm import ALPHA
 from benchnav.stats.intervals import success_interval
 
-# Conditions of a block met the same maps and the same noise, and were asked the same.
+# Conditions of a block have the same task, maps and noise.
 BLOCK = ("data", "scenario", "world", "robot", "objective")
-# Privileged models, the one that knows most first.
+# Privileged models, the one given most first.
 PRIVILEGED = ("clairvoyant", "oracle", "ideal")
 
 _COLUMNS = (
@@ -35,40 +36,38 @@ _COLUMNS = (
 
 
 def privileged_models(conditions: Mapping[str, Any]) -> dict[str, str]:
-    """Which conditions' models are privileged: given part of the truth.
+    """Return the conditions whose models are privileged: given part of the truth.
 
     Args:
-        conditions: by id what `run.json` knows of them.
+        conditions: entries of `run.json` by id.
 
     Returns:
-        By id one of `PRIVILEGED`.
+        One of `PRIVILEGED` by id.
     """
-    looking = {
-        condition: about["value"]["model"]["part"]
-        for condition, about in conditions.items()
-        if about["labels"]["model"] != NOT_USED
+    models = {
+        condition: entry["value"]["model"]["part"]
+        for condition, entry in conditions.items()
+        if entry["labels"]["model"] != NOT_USED
     }
-    return {
-        condition: part for condition, part in looking.items() if part in PRIVILEGED
-    }
+    return {condition: part for condition, part in models.items() if part in PRIVILEGED}
 
 
 def competing(rows: pd.DataFrame) -> pd.Series:
-    """Tells which conditions of a block compete for the best.
+    """Return which conditions of a block compete for the best.
 
-    A privileged model is a reference and no rival, unless nothing else is there that
-    looks at a prediction.
+    A privileged model is only a reference, unless no other condition of the block uses
+    a prediction.
 
     Args:
-        rows: of the summary, of one block, with `privileged` as of `against_best`.
+        rows: summary of one block, with `privileged` as in `against_best`.
 
     Returns:
         Bool, by the index of `rows`.
     """
-    for out in (list(PRIVILEGED), list(PRIVILEGED)[:1]):
-        left = ~rows["privileged"].isin(out)
-        if (left & (rows["model"] != NOT_USED)).any():
-            return left
+    for excluded in (list(PRIVILEGED), list(PRIVILEGED)[:1]):
+        is_competing = ~rows["privileged"].isin(excluded)
+        if (is_competing & (rows["model"] != NOT_USED)).any():
+            return is_competing
     return pd.Series(True, index=rows.index)
 
 
@@ -77,48 +76,47 @@ def against_best(
     summary: pd.DataFrame,
     privileged: Mapping[str, str] | None = None,
 ) -> pd.DataFrame:
-    """Compares the conditions of each block that compete, map by map, and tells which
-    are worse than the best.
+    """Compare the competing conditions of each block per map with the best.
 
-    All of them on the episodes that they have in common, so that one which was run on
-    more maps is not judged by others. The best has the highest success rate there and,
-    of several, the least mean T_total.
+    All are compared on the episodes that they have in common, so that a condition run
+    on more maps is compared on the same ones. The best has the highest success rate
+    there; ties are decided by the smaller mean T_total.
 
     Args:
         episodes: rows of episodes.
-        summary: of them, from `summary.summarise`.
-        privileged: from `privileged_models`; none where not given.
+        summary: their summary, from `summary.summarise`.
+        privileged: from `privileged_models`; by default no model is.
 
     Returns:
         A row a condition, in the order of the summary: `condition`; `privileged`, of
-        `PRIVILEGED`, empty where nothing is; `best`, the condition that is the best of
-        its block; `best_rivals`, how many others compete; `best_episodes`, of each of
-        them in common, on `best_maps`, of which a group counts as one;
+        `PRIVILEGED` or empty; `best`, the best condition of its block; `best_rivals`,
+        the number of other competitors; `best_episodes`, the number of common episodes,
+        on `best_maps` maps, where a group counts as one;
         `best_difference`, by how much the best's success rate is higher, with its 95 %
-        interval `_low`, `_high`, of the pair alone; `best_p`, from `best_set_p`;
+        interval `_low`, `_high`, of that pair, uncorrected; `best_p`, from `best_set_p`;
         `best_shown`, the minimum detectable difference with 80 % power; `best_alike`,
-        true where it competes and is not significantly worse than the best; and
-        `best_marked`, true where it is alike and something in its block is worse. NaN
-        where a condition does not compete, and for the best itself.
+        true if it competes and is not significantly worse than the best; and
+        `best_marked`, true if it is alike and some condition of its block is worse. NaN
+        if a condition does not compete, and for the best itself.
     """
     groups = dict(list(episodes.groupby("condition", sort=False)))
     summary = summary.assign(
         privileged=summary["condition"].map(privileged or {}).fillna("")
     )
-    found: list[dict[str, Any]] = []
+    table_rows: list[dict[str, Any]] = []
     for _, rows in summary.groupby(list(BLOCK), sort=False, dropna=False):
-        about, compared = _compare(
-            {
-                condition: groups[condition]
-                for condition in rows.loc[competing(rows), "condition"]
-            }
+        rivals = rows.loc[competing(rows), "condition"]
+        of_block, compared = _compare({name: groups[name] for name in rivals})
+        some_worse = not all(
+            of_condition["best_alike"] for of_condition in compared.values()
         )
-        some_worse = not all(one["best_alike"] for one in compared.values())
         for condition in rows["condition"]:
-            one = compared.get(condition, {"best_alike": False})
-            marked = {"best_marked": one["best_alike"] and some_worse}
-            found.append({"condition": condition, **about, **one, **marked})
-    table = pd.DataFrame(found).reindex(columns=_COLUMNS)
+            of_condition = compared.get(condition, {"best_alike": False})
+            marked = {"best_marked": of_condition["best_alike"] and some_worse}
+            table_rows.append(
+                {"condition": condition, **of_block, **of_condition, **marked}
+            )
+    table = pd.DataFrame(table_rows).reindex(columns=_COLUMNS)
     return summary[["condition", "privileged"]].merge(
         table, on="condition", how="left", validate="1:1"
     )
@@ -127,42 +125,39 @@ def against_best(
 def _compare(
     rivals: Mapping[str, pd.DataFrame],
 ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-    """Columns of `against_best` that are those of the block, and by condition its own."""
+    """Return the columns of `against_best` for the block, and for each condition."""
     common = on_common_draws(rivals)
-    is_none = any(rows.empty for rows in common.values())
-    judged = rivals if is_none else common
-    names = sorted(
-        judged
-    )  # those that are as good and as fast, in the order of their digests
-    times = np.array([judged[name]["total_time_s"].mean() for name in names])
+    has_no_draws = any(rows.empty for rows in common.values())
+    rows_of = rivals if has_no_draws else common
+    names = sorted(rows_of)  # ties are in the order of digests
+    times = np.array([rows_of[name]["total_time_s"].mean() for name in names])
     mean_s = dict(zip(names, alike(times, times.max()), strict=True))
-    best, *others = sorted(
-        names, key=lambda name: (-judged[name]["success"].mean(), mean_s[name])
-    )
-    episodes, maps = len(judged[best]), judged[best]["group"].nunique()
-    about = {
+    rates = {name: rows_of[name]["success"].mean() for name in names}
+    best, *others = sorted(names, key=lambda name: (-rates[name], mean_s[name]))
+    episodes = len(rows_of[best])
+    maps = rows_of[best]["group"].nunique()
+    of_block = {
         "best": best,
         "best_rivals": len(others),
         "best_episodes": episodes,
         "best_maps": maps,
     }
-    made: dict[str, dict[str, Any]] = {best: {"best_alike": True}}
-    if is_none:  # nothing to compare
-        return about, made | {
-            condition: {"best_alike": True, "best_p": 1.0} for condition in others
-        }
-    wins = [judged[one].groupby("group")["success"].sum() for one in (best, *others)]
+    of_conditions: dict[str, dict[str, Any]] = {best: {"best_alike": True}}
+    if has_no_draws:  # nothing to compare
+        untested = {"best_alike": True, "best_p": 1.0}
+        return of_block, of_conditions | {name: dict(untested) for name in others}
+    wins = [rows_of[name].groupby("group")["success"].sum() for name in (best, *others)]
     values = np.stack([won.to_numpy(dtype=int) for won in wins], axis=1)
-    draws = judged[best].groupby("group").size().to_numpy()
+    draws = rows_of[best].groupby("group").size().to_numpy()
     p, shown = best_set_p(values, draws)
-    for place, condition in enumerate(others, start=1):
-        gain = values[:, 0] - values[:, place]
-        entry = {"best_p": p[place], "best_alike": bool(p[place] >= ALPHA)}
+    for index, condition in enumerate(others, start=1):
+        gain = values[:, 0] - values[:, index]
+        entry = {"best_p": p[index], "best_alike": bool(p[index] >= ALPHA)}
         entry["best_difference"] = gain.sum() / episodes
         if maps > 1:
-            _, entry["best_low"], entry["best_high"] = map(
-                float, success_interval(gain, draws)
-            )
-            entry["best_shown"] = shown[place]
-        made[condition] = entry
-    return about, made
+            _, low, high = success_interval(gain, draws)
+            entry["best_low"] = float(low)
+            entry["best_high"] = float(high)
+            entry["best_shown"] = shown[index]
+        of_conditions[condition] = entry
+    return of_block, of_conditions

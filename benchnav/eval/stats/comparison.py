@@ -1,6 +1,4 @@
-"""The tables of comparisons: a row a pair of conditions, corrected over all rows
-together.
-"""
+"""Tables of comparisons: a row a pair of conditions, with Holm's correction."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -27,27 +25,26 @@ from benchnav.stats.power import maps_needed, smallest_difference
 
 
 def compare(pairs: Sequence[Pair], difference: float = 0.05) -> pd.DataFrame:
-    """Compare each pair map by map; Holm's correction is over all of them, for success
-    and for time apart.
+    """Compare each pair per map, with Holm's correction for success and for time.
 
     Args:
         pairs: from `pairs.find_pairs`.
-        difference: of success, for which the maps that it would need are counted, in
+        difference: difference of success whose required number of maps is computed, in
             (0, 1].
 
     Returns:
-        A row a pair: labels of the two, `one`, `other`; `n_maps`, `n_groups`, the
-        statistical units, which are as many unless maps are grouped, and `n_episodes`
-        of each condition; `success_one`, `success_other`; `success_difference` with its
+        A row a pair: common labels, `one`, `other`; `n_maps`; `n_groups`, the number of
+        statistical units, equal to `n_maps` unless maps are grouped; `n_episodes` of
+        each condition; `success_one`, `success_other`; `success_difference` with its
         95 % interval `_low`, `_high`, `success_p` and, corrected, `success_p_holm`;
         `success_detectable`, the minimum detectable difference with 80 % power, and
         `maps_needed` for `difference`, both at the level of the first step of Holm. The
-        same of `time`, T_total in seconds, where a failure counts as T:
-        `time_difference_s`, `time_low_s`, `time_high_s`. Where the two conditions of
-        some pair have unlike T, whose difference would else be that of the penalty, all
-        are in shares of T and end in `_share`. And of `arrival_time`, over episodes in
-        which both arrived: no test, since both conditions decide which episodes these
-            are.
+        same columns of `time`, T_total in seconds, where a failure counts as T:
+        `time_difference_s`, `time_low_s`, `time_high_s`. If T differs between the
+        conditions of some pair, all times are fractions of T and end in `_share`,
+        since the penalties would differ otherwise. Columns of `arrival_time` are over
+        episodes in which both reach the goal: without a test, since both conditions
+        select these episodes.
     """
     alpha = ALPHA / len(pairs)
     in_shares = any(budgets_differ(pair.episodes) for pair in pairs)
@@ -60,40 +57,33 @@ def compare(pairs: Sequence[Pair], difference: float = 0.05) -> pd.DataFrame:
 
 
 def compare_by(pairs: Sequence[Pair], quantity: Quantity) -> pd.DataFrame:
-    """Compare each pair by one metric, over the episodes in which both conditions have
-    a value.
+    """Compare each pair by one metric, over episodes in which both have a value.
 
     Args:
         pairs: from `pairs.find_pairs`.
-        quantity: what is compared.
+        quantity: the quantity compared.
 
     Returns:
-        A row a pair: labels of the two, `one`, `other`; `n_maps`, `n_groups`,
-        `n_episodes` of each condition; `metric`, `unit` of all that follows;
+        A row a pair: common labels, `one`, `other`; `n_maps`, `n_groups`,
+        `n_episodes` of each condition; `metric`; `unit` of the following columns;
         `mean_one`, `mean_other`, `difference` with its 95 % interval `low`, `high`; `p`
-        of a test by flipping signs and, corrected, `p_holm`. A difference and its ends
+        of a sign-flip test and, corrected, `p_holm`. A difference and its ends
         are NaN without episodes.
     """
     rows = []
     for pair in pairs:
-        one, other = pair.members
-        episodes = comparable(one.episodes, other.episodes, quantity)
-        rows.append(
-            {
-                **_labels(pair, episodes),
-                "metric": quantity.name,
-                "unit": quantity.unit,
-                **means_and_difference(quantity, episodes),
-                "p": difference_p(episodes, quantity.column),
-            }
-        )
+        first, second = pair.members
+        episodes = comparable(first.episodes, second.episodes, quantity)
+        row = _labels(pair, episodes)
+        row |= {"metric": quantity.name, "unit": quantity.unit}
+        row |= means_and_difference(quantity, episodes)
+        row["p"] = difference_p(episodes, quantity.column)
+        rows.append(row)
     return _corrected(rows, "p")
 
 
 def _labels(pair: Pair, episodes: pd.DataFrame) -> dict[str, Any]:
-    """Return the columns that say what a row is of, and how many maps and episodes it
-    has.
-    """
+    """Return the columns that identify a row, and its numbers of maps and episodes."""
     return {
         **pair.shared,
         "one": pair.one,
@@ -105,40 +95,38 @@ def _labels(pair: Pair, episodes: pd.DataFrame) -> dict[str, Any]:
 
 
 def _corrected(rows: Sequence[Mapping[str, Any]], *names: str) -> pd.DataFrame:
-    """Return the table of rows with p-values corrected over all of them, each kind
-    apart.
-    """
+    """Return the table of rows, with each column of p-values corrected by Holm."""
     table = pd.DataFrame(rows)
-    return table.assign(
-        **{f"{name}_holm": holm(table[name].to_numpy()) for name in names}
-    )
+    corrected = {f"{name}_holm": holm(table[name].to_numpy()) for name in names}
+    return table.assign(**corrected)
 
 
 def _compare(
     rows: pd.DataFrame, alpha: float, difference: float, in_shares: bool
 ) -> dict[str, Any]:
     timed = in_budgets(rows) if in_shares else rows
+    time_unit = "_share" if in_shares else "_s"
+    time_interval = interval_of(timed, "total_time_s")
     gain, draws = gain_by_map(rows)
     std = float(standard_deviation(gain, draws))
     arrived = mean_differences(rows[rows["success"] & rows["success_other"]])
     mean, low, high = map(float, mean_interval(arrived))
-    return {
+    row: dict[str, Any] = {
         "success_one": rows["success"].mean(),
         "success_other": rows["success_other"].mean(),
-        **named("success", interval_of(rows, "success")),
-        "success_p": difference_p(rows, "success"),
-        "success_detectable": smallest_difference(std, len(gain), alpha),
-        "maps_needed": maps_needed(std, difference, alpha),
-        **named(
-            "time", interval_of(timed, "total_time_s"), "_share" if in_shares else "_s"
-        ),
-        "time_p": signed_rank_p(summed_differences(timed)),
-        **named("arrival_time", (mean, low, high), "_s"),
-        "arrival_time_n_maps": len(arrived),
     }
+    row |= named("success", interval_of(rows, "success"))
+    row["success_p"] = difference_p(rows, "success")
+    row["success_detectable"] = smallest_difference(std, len(gain), alpha)
+    row["maps_needed"] = maps_needed(std, difference, alpha)
+    row |= named("time", time_interval, time_unit)
+    row["time_p"] = signed_rank_p(summed_differences(timed))
+    row |= named("arrival_time", (mean, low, high), "_s")
+    row["arrival_time_n_maps"] = len(arrived)
+    return row
 
 
 def named(name: str, interval: Interval, unit: str = "") -> dict[str, float]:
-    """Return a difference and the ends of its interval by the names of columns."""
+    """Return a difference and the ends of its interval, by column."""
     columns = (f"{name}_{value}{unit}" for value in ("difference", "low", "high"))
     return dict(zip(columns, interval, strict=True))

@@ -1,6 +1,4 @@
-"""Which conditions are compared: those whose values differ in one thing, on the same
-maps and the same draws of λ.
-"""
+"""Pairs of conditions whose values differ in one part, on the same maps and draws."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -20,8 +18,8 @@ from benchnav.eval.experiment.condition import (
 )
 from benchnav.eval.experiment.unit import DRAW
 
-# By what conditions may differ, each with its keys in a condition's value. Other data
-# or scenarios are other maps.
+# Columns that conditions may differ in, with their keys in a condition's value. Other
+# data or scenarios would be other maps.
 _KEYS: Mapping[str, tuple[str, ...]] = {
     **{
         name: (name,)
@@ -30,7 +28,7 @@ _KEYS: Mapping[str, tuple[str, ...]] = {
     "world": ("world", "rules"),
     "run": (),
 }
-# Of an episode, what pairs hold of both sides.
+# Columns of an episode that pairs have for both sides.
 _MEASURES = (
     "success",
     "total_time_s",
@@ -43,18 +41,17 @@ _MEASURES = (
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Compared:
-    """A condition of one of the runs, or of several that hold the same.
+    """A condition of one run, or of several that contain identical rows.
 
     Args:
-        labels: what tables call it, by column; `run` among them, `NOT_USED` where no
-            two runs share a condition.
-        value: all that bears on its rows, as `run.json` holds it.
+        labels: labels in tables by column, including `run`, which is `NOT_USED` unless
+            two runs contain one condition.
+        value: all that affects its rows, as in `run.json`.
         maps: digests of its maps, in the order of maps.
         episodes: its rows, with T of each as `time_budget_s`.
-        code: what code made the rows, by run: names of sources, versions and parts with
-            what identifies them.
-        about: digest of what the maps mean, `MEANING`; empty where the run does not
-            have it.
+        code: code that computed the rows, by run: names of sources, versions and parts
+            with their digests.
+        about: digest of the maps' properties `MEANING`; empty if the run lacks it.
     """
 
     labels: Mapping[str, str]
@@ -70,14 +67,13 @@ class Pair:
     """Two conditions, and their episodes side by side.
 
     Args:
-        one: label of what is compared.
-        other: and with what.
-        shared: labels of the two; of a label that one of them does not use, the
-            other's.
-        episodes: of both, paired by seed, realisation and map, on all maps that both
-            met: one's `success`, `total_time_s`, `time_budget_s` and other measures,
-            the other's with `_other`; and `group`, the statistical unit. Maps may have
-            unequally many.
+        one: label of the first condition.
+        other: label of the second condition, which the first is compared with.
+        shared: labels of both; if one does not use a part, the other's label.
+        episodes: common episodes by seed, realisation and map: `success`,
+            `total_time_s`, `time_budget_s` and other measures of the first, those of
+            the second with `_other`; and `group`, the statistical unit. Maps may have
+            different numbers of episodes.
         members: the conditions.
     """
 
@@ -91,34 +87,29 @@ class Pair:
 def find_pairs(
     conditions: Sequence[Compared], by: str = "", against: str = ""
 ) -> list[Pair]:
-    """Pairs conditions whose values differ in one thing alone.
+    """Pair conditions whose values differ only in one part.
 
-    What a condition does not use, such as the risk setting of a blind planner, is like
-    any other.
+    A part that a condition does not use, such as the risk setting of a blind planner,
+    equals any other.
 
     Args:
         conditions: conditions of one run or several, each once unless runs are compared
             with each other.
-        by: what differs, see `by_what`.
-        against: a label, which all others are compared with; all pairs when not given.
+        by: column that differs, see `by_what`.
+        against: label that all others are compared with; if empty, all pairs.
 
     Returns:
-        Pairs, those with the same other labels together.
+        Pairs, grouped by their common labels.
 
     Raises:
-        ConfigError: there is nothing to compare, or it cannot be paired.
+        ConfigError: If there is nothing to compare, or it cannot be paired.
     """
     by = by_what(conditions, by, against)
-    values = list(
-        dict.fromkeys(
-            condition.labels[by]
-            for condition in conditions
-            if condition.labels[by] != NOT_USED
-        )
-    )
+    used = [c.labels[by] for c in conditions if c.labels[by] != NOT_USED]
+    values = list(dict.fromkeys(used))
     if against:
         check_known("`against`", against, values)
-    pairs = [_pair(one, other, by) for one, other in matches(conditions, by, against)]
+    pairs = [_pair(a, b, by) for a, b in matches(conditions, by, against)]
     if not pairs:
         raise ConfigError(
             f"Expected two conditions or more that differ in their {by} and in "
@@ -132,72 +123,66 @@ def find_pairs(
 def matches(
     conditions: Sequence[Compared], by: str, against: str = ""
 ) -> Iterator[tuple[Compared, Compared]]:
-    """Yield the conditions of each pair that `find_pairs` makes: what is compared, and
-    with what.
+    """Yield both conditions of each pair of `find_pairs`.
 
     Args:
-        conditions: as there.
-        by: from `by_what`.
-        against: as there.
+        conditions: as in `find_pairs`.
+        by: column from `by_what`.
+        against: as in `find_pairs`.
     """
     for a, b in combinations(conditions, 2):
-        if _differ_in(a, b, by) and (
-            not against or against in (a.labels[by], b.labels[by])
-        ):
-            # The later of the two comes first, unless the earlier is compared with a
-            # named one.
+        is_selected = not against or against in (a.labels[by], b.labels[by])
+        if is_selected and _differ_in(a, b, by):
+            # The later one comes first, unless the earlier is compared with `against`.
             yield (a, b) if against and b.labels[by] == against else (b, a)
 
 
 def by_what(conditions: Sequence[Compared], by: str = "", against: str = "") -> str:
-    """By what conditions are compared, of the keys of `_KEYS`.
+    """Return the column by which conditions are compared, a key of `_KEYS`.
 
     Args:
         conditions: the conditions.
-        by: what was asked for. When empty: that in which `against` is found; `run`
-            where runs share conditions; else `risk`.
+        by: requested column. If empty: the column that contains `against`; `run` if
+            runs have common conditions; else `risk`.
         against: a label, or empty.
 
     Raises:
-        ConfigError: `by` is none, or `against` is found nowhere or in several.
+        ConfigError: If `by` is no key, or `against` is in no column or in several.
     """
     if by:
         check_known("`by` (other data or scenarios are other maps)", by, _KEYS)
         return by
     if not against:
-        return (
-            "run"
-            if any(condition.labels["run"] != NOT_USED for condition in conditions)
-            else "risk"
-        )
+        has_runs = any(c.labels["run"] != NOT_USED for c in conditions)
+        return "run" if has_runs else "risk"
     labels = [
         (name, condition.labels[name]) for condition in conditions for name in _KEYS
     ]
     check_known(
         "`against`", against, sorted({label for _, label in labels} - {NOT_USED})
     )
-    found = list(dict.fromkeys(name for name, label in labels if label == against))
-    if len(found) > 1:
+    columns = list(dict.fromkeys(name for name, label in labels if label == against))
+    if len(columns) > 1:
         raise ConfigError(
             f"Expected `against` to be a label of one kind, got {against!r}, a label "
-            f"of {' and of '.join(found)}. Pass "
-            f"--by {' or --by '.join(found)}."
+            f"of {' and of '.join(columns)}. Pass "
+            f"--by {' or --by '.join(columns)}."
         )
-    return found[0]
+    return columns[0]
 
 
 def check_one_value_each(conditions: Iterable[Compared]) -> None:
-    """Refuses two values under one label, which no reader of a table could distinguish.
+    """Reject two values under one label, which readers could not distinguish.
 
     Raises:
-        ConfigError: there are such.
+        ConfigError: If there are such values.
     """
-    known: dict[tuple[str, str], tuple[dict[str, Any], Compared]] = {}
+    values: dict[tuple[str, str], tuple[dict[str, Any], Compared]] = {}
     for condition in conditions:
         for name, keys in _KEYS.items():
             value = {key: condition.value.get(key) for key in keys}
             label = condition.labels[name]
-            earlier, first = known.setdefault((name, label), (value, condition))
+            earlier, first = values.setdefault((name, label), (value, condition))
             if earlier != value and label != NOT_USED:
                 runs = " and ".join(dict.fromkeys([*first.code, *condition.code]))
                 raise ConfigError(
@@ -209,64 +194,53 @@ def check_one_value_each(conditions: Iterable[Compared]) -> None:
                 )
 
 
-def _in_words(one: Any, other: Any) -> str:
-    """What differs between two values of plain data, with both, such as `options.level
-    0.5 and 0.9`.
-    """
+def _in_words(a: Any, b: Any) -> str:
+    """Describe differences of plain data, such as `options.level 0.5 and 0.9`."""
     return ", ".join(
-        f"{name} {first} and {second}"
-        for name, first, second in differences(one, other)
+        f"{name} {first} and {second}" for name, first, second in differences(a, b)
     )
 
 
 def _others(conditions: Sequence[Compared], by: str) -> str:
-    """Names the labels in which the conditions do differ, or what is unlike in their
-    worlds.
-    """
-    fields = {
-        repr(field): field for condition in conditions if (field := _field(condition))
-    }
+    """Describe the labels or worlds in which the conditions differ."""
+    fields: dict[str, dict[str, Any]] = {}
+    for condition in conditions:
+        field_ = _field(condition)
+        fields[repr(field_)] = field_
     if by == "world" and len(fields) > 1:
         first, second, *_ = fields.values()
         return f" λ itself differs between their worlds: {_in_words(first, second)}."
-    several = {
-        name: labels
-        for name in _KEYS
-        if name != by
-        and len(
-            labels := {condition.labels[name] for condition in conditions} - {NOT_USED}
-        )
-        > 1
-    }
-    if not several:
+    differing: dict[str, set[str]] = {}
+    for name in _KEYS:
+        labels = {condition.labels[name] for condition in conditions} - {NOT_USED}
+        if name != by and len(labels) > 1:
+            differing[name] = labels
+    if not differing:
         return ""
-    told = " and ".join(
-        f"{name} ({', '.join(sorted(labels))})" for name, labels in several.items()
+    differences_text = " and ".join(
+        f"{name} ({', '.join(sorted(labels))})" for name, labels in differing.items()
     )
-    return f" They differ in {told}: try `--by {next(iter(several))}`."
+    return f" They differ in {differences_text}: try `--by {next(iter(differing))}`."
 
 
-def _differ_in(one: Compared, other: Compared, by: str) -> bool:
-    """Tells whether two values are alike in all but one thing, which both use, and met
-    the same λ.
-    """
+def _differ_in(a: Compared, b: Compared, by: str) -> bool:
+    """Return whether two values differ only in one part that both use, on the same λ."""
     if by == "run":
-        return one.value == other.value and one.labels["run"] != other.labels["run"]
-    unused = [
-        name for name in _KEYS if NOT_USED in (one.labels[name], other.labels[name])
-    ]
+        return a.value == b.value and a.labels["run"] != b.labels["run"]
+    unused = [name for name in _KEYS if NOT_USED in (a.labels[name], b.labels[name])]
     keys = _KEYS[by]
-    alike = all(
-        one.value.get(key) == other.value.get(key)
-        for key in {*one.value, *other.value} - {*keys, *unused}
+    is_equal = all(
+        a.value.get(key) == b.value.get(key)
+        for key in {*a.value, *b.value} - {*keys, *unused}
     )
-    differ = any(one.value.get(key) != other.value.get(key) for key in keys)
-    return alike and differ and by not in unused and _field(one) == _field(other)
+    differ = any(a.value.get(key) != b.value.get(key) for key in keys)
+    return is_equal and differ and by not in unused and _field(a) == _field(b)
 
 
 def _field(condition: Compared) -> dict[str, Any]:
-    """What of a world decides which λ is drawn; time budgets do not, and what
-    immobilises does where λ is frozen.
+    """Return the settings of a world that determine the drawn λ.
+
+    Immobilising terrain is among them if λ is frozen; time budgets never are.
     """
     world = condition.value["world"]
     if world["noise"] != "frozen":
@@ -276,54 +250,55 @@ def _field(condition: Compared) -> dict[str, Any]:
     return {"noise": "frozen", **drawn, "immobile.below": below}
 
 
-def _pair(one: Compared, other: Compared, by: str) -> Pair:
-    names = f"{one.labels[by]!r} and {other.labels[by]!r}"
-    check_maps(one, other, names)
-    both = side_by_side(one.episodes, other.episodes, _MEASURES)
-    if both.empty:
+def _pair(first: Compared, second: Compared, by: str) -> Pair:
+    names = f"{first.labels[by]!r} and {second.labels[by]!r}"
+    check_maps(first, second, names)
+    paired = side_by_side(first.episodes, second.episodes, _MEASURES)
+    if paired.empty:
         raise ConfigError(
             f"Expected conditions with episodes in common, got {names} with "
-            f"{_draws(one)} and {_draws(other)}."
+            f"{_draws(first)} and {_draws(second)}."
         )
     shared = {
-        name: other.labels[name] if one.labels[name] == NOT_USED else one.labels[name]
+        name: second.labels[name]
+        if first.labels[name] == NOT_USED
+        else first.labels[name]
         for name in (*LABELS, "run")
         if name != by
     }
     return Pair(
-        one=one.labels[by],
-        other=other.labels[by],
+        one=first.labels[by],
+        other=second.labels[by],
         shared=shared,
-        episodes=both,
-        members=(one, other),
+        episodes=paired,
+        members=(first, second),
     )
 
 
 def side_by_side(
-    one: pd.DataFrame, other: pd.DataFrame, measures: Sequence[str]
+    first: pd.DataFrame, second: pd.DataFrame, measures: Sequence[str]
 ) -> pd.DataFrame:
-    """Episodes that two conditions have in common, a row each.
+    """Return the common episodes of two conditions, a row each.
 
     Args:
-        one: rows of a condition.
-        other: rows of the other.
-        measures: columns that are taken of both, the other's with `_other`.
+        first: rows of a condition.
+        second: rows of the other condition.
+        measures: columns of both, those of `second` with `_other`.
 
     Returns:
         `DRAW`, the measures, and `group`.
     """
     columns = [*DRAW, *measures]
-    return one[["group", *columns]].merge(
-        other[columns], on=DRAW, suffixes=("", "_other")
+    return first[["group", *columns]].merge(
+        second[columns], on=DRAW, suffixes=("", "_other")
     )
 
 
 def on_common_draws(conditions: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
-    """Return the episodes that all conditions have in common, in one order; no rows
-    where there are none.
+    """Return the episodes that all conditions have in common, in one order.
 
     Args:
-        conditions: rows of each.
+        conditions: rows of each condition, by id.
     """
     draws = [
         set(rows[DRAW].itertuples(index=False, name=None))
@@ -335,30 +310,30 @@ def on_common_draws(conditions: Mapping[str, pd.DataFrame]) -> dict[str, pd.Data
     }
 
 
-def check_maps(one: Compared, other: Compared, names: str) -> None:
-    """Checks that two conditions were evaluated on the same maps, with the same meaning
-    and in the same groups.
+def check_maps(first: Compared, second: Compared, names: str) -> None:
+    """Check that two conditions have the same maps, with one meaning and grouping.
 
     Raises:
         ConfigError: If maps of one index have different digests, or what the maps mean
             or their groups differ.
     """
-    common = min(len(one.maps), len(other.maps))
-    if list(one.maps[:common]) != list(other.maps[:common]):
+    common = min(len(first.maps), len(second.maps))
+    if list(first.maps[:common]) != list(second.maps[:common]):
         raise ConfigError(
             f"Expected conditions on the same maps, got {names}, whose maps have "
             "other digests."
         )
-    groups, other_groups = (
-        rows.groupby("map")["group"].first() for rows in (one.episodes, other.episodes)
-    )
-    both = groups.index.intersection(other_groups.index)
+    first_groups = first.episodes.groupby("map")["group"].first()
+    second_groups = second.episodes.groupby("map")["group"].first()
+    common_maps = first_groups.index.intersection(second_groups.index)
+    has_meaning = bool(first.about and second.about)
+    same_groups = first_groups[common_maps].equals(second_groups[common_maps])
     unlike = {
-        MEANING: bool(one.about and other.about) and one.about != other.about,
-        "groups of maps": not groups[both].equals(other_groups[both]),
+        MEANING: has_meaning and first.about != second.about,
+        "groups of maps": not same_groups,
     }
     if any(unlike.values()):
-        split = f"of {one.value['data']} {one.value['split']}"
+        split = f"of {first.value['data']} {first.value['split']}"
         differing = ", ".join(
             f"{name} {split}" for name, differs in unlike.items() if differs
         )

@@ -1,12 +1,12 @@
 """Regret, split along a chain of conditions that ends at the near-optimal reference.
 
-From a planner with a model's prediction to the optimal planner with the same
-prediction, with that of ideal eyes (`ideal`), with the true distribution (`oracle`),
-and to the near-optimal reference, which is given λ itself. What that drives is
-feasible, so regret against it is at most that against the least time; the lower bound
-of the time, which no trajectory undercuts, is given with it. Each step is a paired
-difference of its own. They add up to the whole by construction, which does not make
-them causes: a step may be negative, and another order of steps would give others.
+The chain leads from a planner with a model's prediction to the optimal planner with the
+same prediction, then with the models `ideal` and `oracle`, and to the near-optimal
+reference, which is given λ itself. The reference's trajectories are feasible, so regret
+against it is at most the regret against the minimum time; the table also has the lower
+bound of the time, which no trajectory undercuts. Each step is a paired difference. The
+steps add up to the total by construction, which does not make them causes: a step may
+be negative, and another order of steps would give other values.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,54 +29,63 @@ _MODELS = ("ideal", "oracle")
 
 
 def find_chains(conditions: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
-    """Finds chains of which all five conditions are there.
+    """Find complete chains of five conditions.
 
-    Robots that learn on their way are in none: the optimal planners plan once.
+    Robots that learn during the episode are in no chain: optimal planners plan once.
 
     Args:
-        conditions: by id what `run.json` knows of them.
+        conditions: entries of `run.json` by id.
 
     Returns:
-        Of each chain its conditions, by id: a planner with a model, the optimal planner
-        with it, with `ideal` and with `oracle`, and the reference.
+        Five ids for each chain: a planner with a model, the optimal planner with it,
+        with `ideal` and with `oracle`, and the reference.
     """
-    values = {condition: about["value"] for condition, about in conditions.items()}
+    values = {condition: entry["value"] for condition, entry in conditions.items()}
 
-    def like(value: Mapping[str, Any], but: Sequence[str], **parts: str) -> list[str]:
-        """Conditions that are as one is but for some keys, with these parts."""
-        kept = {key: own for key, own in value.items() if key not in but}
-        return [
-            other
-            for other, own in values.items()
-            if {key: one for key, one in own.items() if key not in but} == kept
-            and all(own[kind]["part"] == part for kind, part in parts.items())
-        ]
+    def like(
+        value: Mapping[str, Any], ignored: Sequence[str], **parts: str
+    ) -> list[str]:
+        """Return conditions with these parts that equal `value` except in some keys."""
+        expected = _without(value, ignored)
+        matching = []
+        for condition, candidate in values.items():
+            has_parts = all(candidate[kind]["part"] == parts[kind] for kind in parts)
+            if has_parts and _without(candidate, ignored) == expected:
+                matching.append(condition)
+        return matching
 
     chains = []
     for condition, value in values.items():
-        planner, model = value["planner"]["part"], value["model"]["part"]
+        planner = value["planner"]["part"]
+        model = value["model"]["part"]
         blind = conditions[condition]["labels"]["model"] == NOT_USED
         if planner in (OPTIMAL, REFERENCE) or model in PRIVILEGED or blind:
             continue
+        references = like(
+            value,
+            ("planner", "model", "risk"),
+            planner=REFERENCE,
+            model="clairvoyant",
+        )
+        # With zero levels, entering a soft spot counts as a loss: no reference.
         references = [
-            other
-            for other in like(
-                value,
-                ("planner", "model", "risk"),
-                planner=REFERENCE,
-                model="clairvoyant",
-            )
-            if values[other]["planner"]["options"].get("levels")
-            != 0  # where entry is loss it is no reference
+            name
+            for name in references
+            if values[name]["planner"]["options"].get("levels") != 0
         ]
         for optimal in like(value, ("planner",), planner=OPTIMAL):
-            told = [like(values[optimal], ("model",), model=one) for one in _MODELS]
-            if all(told):
-                chains += [
-                    [condition, optimal, *(found[0] for found in told), last]
-                    for last in references
-                ]
+            privileged = [
+                like(values[optimal], ("model",), model=name) for name in _MODELS
+            ]
+            if not all(privileged):
+                continue
+            start = [condition, optimal, *(names[0] for names in privileged)]
+            chains += [[*start, reference] for reference in references]
     return chains
+
+
+def _without(value: Mapping[str, Any], ignored: Sequence[str]) -> dict[str, Any]:
+    return {key: part for key, part in value.items() if key not in ignored}
 
 
 def split_regret(
@@ -84,85 +93,80 @@ def split_regret(
     episodes: pd.DataFrame,
     worlds: Mapping[str, Mapping[str, Any]],
 ) -> pd.DataFrame:
-    """Paired differences along each chain, on the episodes that all five of its
-    conditions have in common.
+    """Tabulate paired differences along each chain, on common episodes.
 
     Args:
-        conditions: by id what `run.json` knows of them.
+        conditions: entries of `run.json` by id.
         episodes: all rows of the run.
-        worlds: by condition what λ did.
+        worlds: world of each condition, by id.
 
     Returns:
-        A row a step of a chain: `chain`, its number; labels of what it begins with;
-        `against`, the end that regret is against; ids, planners and models of the
-        two conditions, `one`, `one_planner`, `one_model` and `other…`; `n_maps`, of
-        which a group counts as one, and `n_episodes`; of `success` and of `time`,
-        T_total in seconds, a failure counted as T: the means `_one` and `_other`, and
-        the `_difference` of one less other with its 95 % interval `_low`, `_high`; and
-        `_bound`, the best mean that the lower bounds of the time allow, NaN where the
+        A row a step of a chain: `chain`, its index from 1; labels of its first
+        condition; `against`, the reference; ids, planners and models of the two
+        conditions, `one`, `one_planner`, `one_model` and `other…`; `n_maps`, where a
+        group counts as one, and `n_episodes`; for `success` and `time` (T_total in
+        seconds, a failure counts as T) the means `_one` and `_other`, and their
+        `_difference`, one minus other, with its 95 % interval `_low`, `_high`; and
+        `_bound`, the best mean that the lower bounds of the time allow, NaN if the
         reference's rows have none.
     """
     rows = dict(list(episodes.groupby("condition", sort=False)))
-    made: list[dict[str, Any]] = []
+    steps: list[dict[str, Any]] = []
     for number, chain in enumerate(find_chains(conditions), start=1):
         common = on_common_draws({condition: rows[condition] for condition in chain})
-        own = {
-            condition: found.assign(
-                time_budget_s=time_budgets(found, worlds[condition])
-            )
-            for condition, found in common.items()
-        }
-        if own[chain[0]].empty:
+        with_budgets = {}
+        for condition, group in common.items():
+            budgets = time_budgets(group, worlds[condition])
+            with_budgets[condition] = group.assign(time_budget_s=budgets)
+        if with_budgets[chain[0]].empty:
             continue
         labels = conditions[chain[0]]["labels"]
-        about = {name: labels[name] for name in (*BLOCK, "planner", "model", "risk")}
-        bounds = best_possible(own[chain[-1]])
-        for one, other in pairwise(chain):
-            both = side_by_side(
-                own[one], own[other], ["success", "total_time_s", "time_budget_s"]
+        of_chain = {name: labels[name] for name in (*BLOCK, "planner", "model", "risk")}
+        bounds = best_possible(with_budgets[chain[-1]])
+        for first, second in pairwise(chain):
+            paired = side_by_side(
+                with_budgets[first],
+                with_budgets[second],
+                ["success", "total_time_s", "time_budget_s"],
             )
-            made.append(
-                {
-                    "chain": number,
-                    **about,
-                    "against": AGAINST,
-                    "one": one,
-                    "other": other,
-                    **{
-                        f"{end}_{kind}": conditions[condition]["labels"][kind]
-                        for end, condition in (("one", one), ("other", other))
-                        for kind in ("planner", "model")
-                    },
-                    **_differences(both),
-                    **bounds,
-                }
-            )
-    return pd.DataFrame(made)
+            step = {"chain": number, **of_chain, "against": AGAINST}
+            step |= {"one": first, "other": second}
+            for side, condition in (("one", first), ("other", second)):
+                for kind in ("planner", "model"):
+                    step[f"{side}_{kind}"] = conditions[condition]["labels"][kind]
+            steps.append({**step, **_differences(paired), **bounds})
+    return pd.DataFrame(steps)
 
 
 def best_possible(rows: pd.DataFrame) -> dict[str, float]:
-    """The best means that the lower bounds of the time allow: `success_bound`, and
-    `time_bound` in seconds of T_total.
+    """Return the best means of success and T_total that the lower bounds allow.
 
     Args:
-        rows: episodes, with `time_budget_s`; NaN where some have no `lower_bound_s`.
+        rows: episodes, with `time_budget_s`.
+
+    Returns:
+        `success_bound`, and `time_bound` in seconds; NaN if some episode has no
+        `lower_bound_s`.
     """
-    least = rows.get("lower_bound_s")
-    if least is None or least.isna().any():
+    bounds = rows.get("lower_bound_s")
+    if bounds is None or bounds.isna().any():
         return {"success_bound": float("nan"), "time_bound": float("nan")}
-    limit = rows["time_budget_s"]
+    budgets = rows["time_budget_s"]
     return {
-        "success_bound": float((least <= limit).mean()),
-        "time_bound": float(least.clip(upper=limit).mean()),
+        "success_bound": float((bounds <= budgets).mean()),
+        "time_bound": float(bounds.clip(upper=budgets).mean()),
     }
 
 
-def _differences(both: pd.DataFrame) -> dict[str, Any]:
-    row: dict[str, Any] = {"n_maps": both["group"].nunique(), "n_episodes": len(both)}
+def _differences(paired: pd.DataFrame) -> dict[str, Any]:
+    row: dict[str, Any] = {
+        "n_maps": paired["group"].nunique(),
+        "n_episodes": len(paired),
+    }
     for name, column in (("success", "success"), ("time", "total_time_s")):
         row |= {
-            f"{name}_one": float(both[column].mean()),
-            f"{name}_other": float(both[f"{column}_other"].mean()),
+            f"{name}_one": float(paired[column].mean()),
+            f"{name}_other": float(paired[f"{column}_other"].mean()),
         }
-        row |= named(name, interval_of(both, column))
+        row |= named(name, interval_of(paired, column))
     return row

@@ -1,10 +1,9 @@
-"""Summaries of conditions: success with its interval, and means with how many episodes
-each is made of.
+"""Summaries of conditions: success rates with intervals, and means with counts.
 
-The map is the unit, or the group of maps where a dataset has groups. Episodes on one
-map, under other seeds or realisations, have much in common, so that a hundred of them
-on twenty maps tell less than a hundred maps would. The design effect says how much
-less.
+The statistical unit is the map, or the group of maps if a dataset has groups. Episodes
+on one map under several seeds or realisations are correlated: a hundred of them on
+twenty maps contain less information than a hundred maps. The design effect states how
+much less.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,8 +26,7 @@ from benchnav.stats.intervals import (
     wilson_interval,
 )
 
-# Metrics with mean and standard deviation, those with a median, and those of what
-# robots learnt, with a mean.
+# Metrics with mean and standard deviation, with a median, and of learning with a mean.
 _SPREAD: tuple[Metric, ...] = (
     shipped.TRAVERSABILITY,
     shipped.TIME_RATIO,
@@ -46,12 +44,11 @@ _LEARNT: tuple[Metric, ...] = (
 
 
 def time_budgets(episodes: pd.DataFrame, world: Mapping[str, Any]) -> pd.Series:
-    """T of each episode in seconds: what a failure counts as, and what a success might
-    have cost.
+    """Return T of each episode in seconds: T_total of a failure, else from the world.
 
     Args:
         episodes: rows of one condition.
-        world: of the condition, as `run.json` holds it.
+        world: world of the condition, as in `run.json`.
     """
     if "time_budget_ratio" in world:
         # The time over its ratio is the reference time at the robot's top speed.
@@ -66,35 +63,34 @@ def time_budgets(episodes: pd.DataFrame, world: Mapping[str, Any]) -> pd.Series:
 
 
 def success_mean(episodes: pd.DataFrame) -> tuple[float, float, float]:
-    """Success rate of one condition with its 95 % interval, Wilson's on the episodes
-    over `design_effect`.
+    """Return the success rate of a condition with Wilson's 95 % interval.
+
+    The number of episodes is divided by `design_effect`.
     """
     success = episodes["success"].to_numpy(dtype=bool)
     effect = design_effect(success, episodes["group"].to_numpy())
-    return float(success.mean()), *wilson_interval(
-        float(success.mean()), len(success) / effect
-    )
+    rate = float(success.mean())
+    low, high = wilson_interval(rate, len(success) / effect)
+    return rate, low, high
 
 
 def total_time_mean(
     episodes: pd.DataFrame, world: Mapping[str, Any]
 ) -> tuple[float, float, float]:
-    """Mean of T_total of one condition with its 95 % interval, which lies within 0 and
-    T.
+    """Return the mean T_total of a condition with its 95 % interval within [0, T].
 
     Args:
         episodes: rows of one condition.
-        world: of the condition, as `run.json` holds it.
+        world: world of the condition, as in `run.json`.
 
     Returns:
-        Mean and ends in seconds; the ends are NaN where there are fewer than
-        `stats.bootstrap.LEAST_MAPS` maps.
+        Mean and ends in seconds; the ends are NaN below `stats.bootstrap.LEAST_MAPS`
+        maps.
     """
-    success, maps = (
-        episodes["success"].to_numpy(dtype=bool),
-        episodes["group"].to_numpy(),
-    )
-    taken, budgets = episodes["total_time_s"].to_numpy(), time_budgets(episodes, world)
+    success = episodes["success"].to_numpy(dtype=bool)
+    maps = episodes["group"].to_numpy()
+    taken = episodes["total_time_s"].to_numpy()
+    budgets = time_budgets(episodes, world)
     arrival = taken[success].mean() if success.any() else 0.0  # no arrival takes less
     _, low, high = success_mean(episodes)
     mean, low_s, high_s = total_time_interval(
@@ -116,35 +112,34 @@ def summarise(
     worlds: Mapping[str, Mapping[str, Any]],
     further: Sequence[Quantity] = (),
 ) -> pd.DataFrame:
-    """Summarises each condition, in the order in which conditions first appear.
+    """Summarise each condition, in the order in which conditions first appear.
 
     Args:
         episodes: rows of episodes.
-        worlds: by condition what λ did, as `run.json` holds it.
-        further: quantities that the episodes have besides those of every run.
+        worlds: world of each condition by id, as in `run.json`.
+        further: quantities of the episodes in addition to the built-in ones.
 
     Returns:
         A row a condition: `condition` and its labels; `n_episodes`, `n_maps`, and
-        `n_groups`, which is the number of maps where the dataset has no groups;
-        `success_rate` with Wilson's interval `success_low`, `success_high` on the
-        number of episodes over `design_effect`. Of each quantity `NAME_mean`,
-        `NAME_std` and `NAME_n`, the number of episodes that have it: total time, a
-        failure counted as T; time of the successes alone; observed λ; time over the
-        reference time; score; path length; share of stuck steps; roughness.
+        `n_groups`, equal to `n_maps` if the dataset has no groups; `success_rate` with
+        Wilson's interval `success_low`, `success_high` on the number of episodes over
+        `design_effect`. For each quantity `NAME_mean`, `NAME_std` and `NAME_n`, the
+        number of episodes that have it: total time, where a failure counts as T; time
+        of successes only; observed λ; time over the reference time; score; path length;
+        fraction of stuck steps; roughness.
         `total_time_low_s`, `total_time_high_s`, the 95 % interval of its mean, from
         `total_time_interval`. `planning_ms_median`, and so for `planning_ms_p95` and
-        `planning_start_ms`; `NAME_mean` of what robots learnt, NaN where they learn
-        nothing; `compiled_share`; and `OUTCOME_count` of each failure. Of each further
-        quantity mean, standard deviation and number of episodes that have it, as above,
-        and `NAME_low`, `NAME_high`, Student's 95 % interval of the mean by map.
+        `planning_start_ms`; `NAME_mean` of metrics of learning, NaN if robots do not
+        learn; `compiled_share`; and `OUTCOME_count` of each failure. For each further
+        quantity mean, standard deviation and number of episodes, as above, and
+        `NAME_low`, `NAME_high`, Student's 95 % interval of the mean per map.
     """
     groups = episodes.groupby("condition", sort=False)
-    return pd.DataFrame(
-        [
-            _summarise_condition(group, worlds[str(condition)], further)
-            for condition, group in groups
-        ]
-    )
+    rows = [
+        _summarise_condition(group, worlds[str(condition)], further)
+        for condition, group in groups
+    ]
+    return pd.DataFrame(rows)
 
 
 def _summarise_condition(
@@ -188,7 +183,7 @@ def _summarise_condition(
 
 
 def _spread(quantity: Quantity, values: pd.Series) -> dict[str, object]:
-    """Mean and standard deviation of a quantity, and how many episodes have it."""
+    """Return mean and standard deviation of a quantity, and its number of episodes."""
     stem = quantity.column.removesuffix(quantity.suffix)
     return {
         quantity.summary_column("mean"): values.mean(),
@@ -198,17 +193,17 @@ def _spread(quantity: Quantity, values: pd.Series) -> dict[str, object]:
 
 
 def _mean_with_interval(quantity: Quantity, group: pd.DataFrame) -> dict[str, object]:
-    """As `_spread`, with Student's 95 % interval of the mean by map; of a part of a run
-    the column may be missing.
+    """Return `_spread` with Student's 95 % interval of the mean per map.
+
+    The column may be missing if the run is not finished.
     """
-    values = (
-        group[quantity.column]
-        if quantity.column in group
-        else pd.Series(np.nan, index=group.index)
-    )
-    known = values.notna()
+    values = pd.Series(np.nan, index=group.index)
+    if quantity.column in group:
+        values = group[quantity.column]
+    has_value = values.notna()
     by_unit = by_map(
-        values[known].to_numpy(dtype=float), group.loc[known, "group"].to_numpy()
+        values[has_value].to_numpy(dtype=float),
+        group.loc[has_value, "group"].to_numpy(),
     )
     _, low, high = mean_interval(by_unit)
     return {

@@ -308,8 +308,8 @@ def train_parts(
     class_table = target.checkpoint.class_names
     members = []
     for name in names:
-        part = target.checkpoint.part(name)
-        member = trainable.kind.from_tensors(part.config, class_table, part.tensors)
+        stored = target.checkpoint.part(name)
+        member = trainable.kind.from_tensors(stored.config, class_table, stored.tensors)
         members.append(member)
     maps = MapDataset(
         dataset.path,

@@ -11,7 +11,8 @@ import torch
 from benchnav.core.tables import Bold, Table
 from benchnav.eval.experiment.condition import LABELS
 from benchnav.eval.figures.data import RunData
-from benchnav.eval.recording import KnownMap, Recording, drawn_plan, reach_outline
+from benchnav.eval.recorded_plans import KnownMap, drawn_plan, reach_outline
+from benchnav.eval.recording import Recording
 from benchnav.eval.stats.best import against_best, privileged_models
 from benchnav.eval.stats.summary import summarise
 from benchnav.metrics import SHIPPED

@@ -428,7 +428,7 @@ def test_times_in_shares_of_unlike_budgets_say_so() -> None:
     )  # shares 0.1, 1, 0.2 less 0.1, 0.5, 0.25
     assert not [heading for heading in shown.headings if "T_total [s]" in heading]
     assert (
-        "in shares of each condition's own T"
+        "in fractions of each condition's own T"
         in dict(shown.explained)["Δ T_total [% of T], 95 %"]
     )
 

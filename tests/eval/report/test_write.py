@@ -8,7 +8,7 @@ import pytest
 
 from benchnav.core.errors import ConfigError
 from benchnav.eval.folder.run_folder import write_run
-from benchnav.eval.report import write
+from benchnav.eval.report import header
 from benchnav.eval.report.write import (
     print_report,
     provenance_lines,
@@ -84,7 +84,7 @@ def test_report_has_its_files_and_gives_the_summary(tmp_path: Path) -> None:
     np.testing.assert_allclose(again["success_low"], summary["success_low"], rtol=1e-5)
     text = (folder / "summary.md").read_text()
     for line in (
-        "- World paper: λ resampled; time budget T = 100 s; free ground has λ̂ above 0.3.",
+        "- World paper: λ resampled; time budget T = 100 s; free terrain has λ̂ above 0.3.",
         "- Data: paper-v1. Models: paper-v1. Seeds: 0, 7.",
         "- Each condition: 4 episodes on 2 maps.",
         "¹ Cost minimised in place of J: its own time.",
@@ -217,9 +217,9 @@ def test_the_share_of_lambda_drawn_again_is_that_of_frozen_worlds_whatever_faile
             "rejected_draws": [0, 0, 2, 0, 0, 0],
         }
     )  # fmt: skip
-    (line,) = write._rejected_draws(rows, conditions)
+    (line,) = header._rejected_draws(rows, conditions)
     assert line.startswith("50.0 % of the draws of λ had no feasible path")
-    assert write._rejected_draws(rows[rows["condition"] == "c"], conditions) == []
+    assert header._rejected_draws(rows[rows["condition"] == "c"], conditions) == []
 
 
 def test_a_sweep_has_its_figure(tmp_path: Path) -> None:

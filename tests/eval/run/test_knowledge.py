@@ -175,7 +175,7 @@ def test_a_belief_that_learns_nothing_drives_as_if_there_were_none(
     name: str, belief: Belief[Any]
 ) -> None:
     given = drives(belief=belief)
-    options: dict[str, Any] = {"enough": lambda step: step == 12}
+    options: dict[str, Any] = {"stop": lambda step: step == 12}
     found = given.run(make(name), given.learning, **options)
     assert same(given.run(make(name), None, **options), found)
     assert (found.revisions == 0).all()
@@ -185,7 +185,7 @@ def test_who_probes_the_ground_is_immobilised_less_often(probed: Episodes) -> No
     given, contact = drives(), drives(ground=Contact())
     static = given.run(astar_dwa(), None)
     # With contact the test is only that robots learn.
-    touched = contact.run(astar_dwa(), contact.learning, enough=lambda step: step == 40)
+    touched = contact.run(astar_dwa(), contact.learning, stop=lambda step: step == 40)
     for found, learns in ((static, False), (touched, True), (probed, True)):
         assert bool((found.revisions > 0).any()) == learns
         assert (found.learning_s > 0.01) == learns
@@ -284,7 +284,7 @@ def test_what_was_not_sensed_changes_no_action(
             simulation,
             generator(),
             learning=how,
-            enough=lambda step: step == steps,
+            stop=lambda step: step == steps,
         )
 
     first = drive(before, sensed)
@@ -505,7 +505,7 @@ def test_a_sensor_under_the_key_of_the_other_kind_is_refused() -> None:
     found = given.run(
         astar_dwa(),
         learning(given.problem, truth, ground=both),
-        enough=lambda step: step == 6,
+        stop=lambda step: step == 6,
     )
     assert set(found.errors) == {""}
 
@@ -575,7 +575,7 @@ def test_a_planner_in_a_process_of_its_own_learns_as_one_here() -> None:
     )
     (condition,) = conditions_of(suite, lambda data: ["std"])
     given = drives()
-    options: dict[str, Any] = {"enough": lambda step: step == 25}
+    options: dict[str, Any] = {"stop": lambda step: step == 25}
     with closing(IsolatedPlanner(condition, 20.0)) as isolated:
         found = given.run(isolated, given.learning, **options)
     assert (found.revisions > 0).any()
@@ -621,7 +621,7 @@ def test_a_sensor_and_a_belief_may_write_into_what_they_are_given() -> None:
             return found
 
     given = drives()
-    options: dict[str, Any] = {"enough": lambda step: step == 40}
+    options: dict[str, Any] = {"stop": lambda step: step == 40}
     wanted = given.run(astar_dwa(), given.learning, **options)
     scribbled = learning(
         given.problem, given.learning.truth, ground=Scribbles(), belief=Scrawls()
@@ -636,7 +636,7 @@ def test_a_planner_that_begins_anew_learns_too() -> None:
             return NotImplemented
 
     given = drives()
-    options: dict[str, Any] = {"enough": lambda step: step == 60}
+    options: dict[str, Any] = {"stop": lambda step: step == 60}
     found = given.run(Forgets(CONFIG), given.learning, **options)
     assert (found.revisions > 5).all()
     assert not same(given.run(Forgets(CONFIG), None, **options), found)
@@ -716,7 +716,7 @@ EXPLORES = AStarDWA(replace(CONFIG, explore=1.0))
 @pytest.mark.parametrize("planner", [*SHIPPED, EXPLORES], ids=[*SHIPPED, "explores"])
 def test_what_an_episode_learns_depends_on_no_other(planner: Any) -> None:
     given = drives(ground=Contact())
-    options: dict[str, Any] = {"enough": lambda step: step == 25}
+    options: dict[str, Any] = {"stop": lambda step: step == 25}
     one = make(planner) if isinstance(planner, str) else planner
     whole = given.run(one, given.learning, **options)
     for members in ([2], [7, 1]):

@@ -18,14 +18,14 @@ from benchnav.eval.run import latency
 from benchnav.eval.run.merge import merge_shards
 from benchnav.eval.run.runner import run_suite
 from benchnav.eval.run.unit import Settings
-from tests.eval.conftest import MOST_STEPS
+from tests.eval.conftest import MAX_STEPS
 
 MAPS = 3
 
 
 @pytest.fixture(autouse=True)
 def whole(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(latency, "_MOST_STEPS", MOST_STEPS)
+    monkeypatch.setattr(latency, "_MAX_STEPS", MAX_STEPS)
 
 
 def suite_on(dataset: Path, *planners: Any, **changes: Any) -> Suite:

@@ -21,7 +21,13 @@ from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.find_episodes import find_episodes
 from benchnav.eval.folder.run_folder import open_run
-from benchnav.eval.recording import NUMBERS, KnownMap, Recording, drawn_plan, thinned
+from benchnav.eval.recorded_plans import (
+    NUMBERS,
+    KnownMap,
+    drawn_plan,
+    thinned,
+)
+from benchnav.eval.recording import Recording
 from benchnav.eval.run.recorder import Recorder
 from benchnav.eval.run.recordings import find_recording
 from benchnav.eval.run.runner import run_suite

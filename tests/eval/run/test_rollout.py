@@ -196,7 +196,9 @@ def home(
         assert planned is not None
         planned.append((step, members, plan.path[:, 0, 0].tolist()))
 
-    observer = rollout.Observer(plan=None if planned is None else watch, every=5)
+    observer = rollout.Observer(
+        plan=None if planned is None else watch, plan_interval=5
+    )
     return rollout.run_episodes(
         planner, problem, simulation, torch.Generator(), observer
     )

@@ -226,7 +226,7 @@ def test_a_killed_run_goes_on_to_the_same_rows(
         pd.read_parquet(whole / "episodes.parquet"),
     )
     assert all(path.stat().st_mtime_ns == when for path, when in kept.items())
-    measured = "measuring the planning time of one robot alone"
+    measured = "measuring the planning time of a single robot"
     assert said == [f"{len(kept)} of 14 units were there already", measured]
 
 

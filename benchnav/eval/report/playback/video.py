@@ -1,8 +1,7 @@
 """Videos of episodes on one map, at one time base, 16:9.
 
-Of each episode the λ̂ that its planner was given is shown, with what was planned, and
-changes as a robot learns; next to these, the λ field, once for all episodes that drove
-on the same.
+A frame shows each planner's λ̂ with its plan, which changes as a robot learns, and next
+to these the λ field, once for all episodes on the same field.
 """
 
 import textwrap
@@ -34,26 +33,24 @@ SIZE = (1280, 720)  # of a frame: width and height in pixels
 FRAMES_A_SECOND = 20
 # Seconds of an episode in a second of video.
 SPEED = 4.0
-HOLD_S = 2.0  # of the last frame, which says how it ended
-MOST_CONDITIONS = 6
+HOLD_S = 2.0  # duration of the last frame, which shows the outcome
+MAX_CONDITIONS = 6
 
-# a frame is as large as a printed figure, and letters and lines are those of one
+# A frame has the size, letters and lines of a printed figure.
 _DPI = 160
-_ENDS_IN, _HEADING_IN = (
-    0.8,
-    0.6,
-)  # heights of what is over and below all maps, and around each row of them
+# Height over and below all maps, and of the heading of each row of maps.
+_ENDS_IN = 0.8
+_HEADING_IN = 0.6
 _BAR_IN = 0.9  # width of the colour bar
 _LETTER_IN = 0.068
-_MOMENTS = 9  # of an episode, of which the legend names what is drawn
+_MOMENTS = 9  # times of an episode whose contents the legend names
 
 
 def frame_times(end_s: float) -> np.ndarray:
-    """Return times in an episode that frames show, up to its end, which is shown a
-    while.
+    """Return times in an episode that frames show; its end is repeated for `HOLD_S`.
 
     Args:
-        end_s: when the last episode ends.
+        end_s: end of the last episode, in seconds.
     """
     moving = np.arange(0.0, end_s, SPEED / FRAMES_A_SECOND)
     return np.append(moving, np.full(round(HOLD_S * FRAMES_A_SECOND), end_s))
@@ -62,27 +59,24 @@ def frame_times(end_s: float) -> np.ndarray:
 def write_video(
     recordings: Sequence[Recording], path: Path
 ) -> Iterator[tuple[int, int]]:
-    """Write a video atomically, yielding (frames done, frames in all); to be iterated
-    to the end.
+    """Write a video atomically, and yield (frames done, total frames).
 
     Args:
-        recordings: one, or several of one map.
+        recordings: one recording, or several on one map.
         path: an `.mp4` file.
 
     Raises:
-        ConfigError: If there are too many to be seen.
+        ConfigError: If there are more than `MAX_CONDITIONS` recordings.
     """
     import av
 
-    if len(recordings) > MOST_CONDITIONS:
+    if len(recordings) > MAX_CONDITIONS:
         raise ConfigError(
-            f"Expected at most {MOST_CONDITIONS} conditions side by side, got "
+            f"Expected at most {MAX_CONDITIONS} conditions side by side, got "
             f"{len(recordings)}."
         )
-    frames, times = (
-        Frames(recordings),
-        frame_times(max(recording.end_s for recording in recordings)),
-    )
+    frames = Frames(recordings)
+    times = frame_times(max(recording.end_s for recording in recordings))
     faststart = {"movflags": "+faststart"}
     with (
         replacing(path) as partial,
@@ -103,52 +97,52 @@ def write_video(
 
 
 class Frames:
-    """Draws episodes at any time.
+    """Frames of episodes at any time.
 
     Args:
-        recordings: at least one, of one map.
+        recordings: one or more, on one map.
 
     Attributes:
-        given: of each recording the panel of the λ̂ that its planner was given.
-        truths: the panels of the λ field.
-        time: what says the time.
+        given: panel of each recording with the planner's λ̂.
+        truths: panels of the λ field.
+        time: text with the time.
     """
 
     @styled()
     def __init__(self, recordings: Sequence[Recording]) -> None:
-        """Draw what never changes."""
-        self._recordings, self._shared = recordings, _alike(recordings)
+        """Draw the static contents."""
+        self._recordings = recordings
+        self._shared = _groups_of_truth(recordings)
         self._moving: list[Artist] = []
-        count, extent_m = (
-            len(recordings) + len(self._shared),
-            recordings[0].grid.extent_m,
-        )
+        count = len(recordings) + len(self._shared)
+        extent_m = recordings[0].grid.extent_m
         self._figure = Figure(
             figsize=(SIZE[0] / _DPI, SIZE[1] / _DPI), dpi=_DPI, layout="constrained"
         )
         self._canvas = FigureCanvasAgg(self._figure)
         columns = _columns(count, extent_m[1] / extent_m[0])
         panels = [panel for (panel,) in stack_panels(self._figure, count, columns)]
-        self.given, self.truths = panels[: len(recordings)], panels[len(recordings) :]
-        names = episode_names([own.about for own in recordings])
-        planners = [own.about["planner"] for own in recordings]
+        self.given = panels[: len(recordings)]
+        self.truths = panels[len(recordings) :]
+        names = episode_names([recording.about for recording in recordings])
+        planners = [recording.about["planner"] for recording in recordings]
         self._colours = (
             condition_colours(planners) if len(recordings) > 1 else ["black"]
         )
         letters = int(SIZE[0] / _DPI / (columns + 0.4) / _LETTER_IN)
-        for own, panel, name, colour in zip(
+        for recording, panel, name, colour in zip(
             recordings, self.given, names, self._colours, strict=True
         ):
-            _title(panel, f"{name}\n{moment.known_in_words(own)}", letters, colour)
-            if not own.known:
-                moment.show_known(panel, own, 0)
+            _title(
+                panel, f"{name}\n{moment.known_in_words(recording)}", letters, colour
+            )
+            if not recording.known:
+                moment.show_known(panel, recording, 0)
         for panel, indices in zip(self.truths, self._shared, strict=True):
             is_field = recordings[indices[0]].field is not None
-            heading = (
-                "λ field of the episode"
-                if is_field
-                else "mean of λ, resampled at each step"
-            )
+            heading = "mean of λ, resampled at each step"
+            if is_field:
+                heading = "λ field of the episode"
             of = (
                 "; ".join(names[index] for index in indices)
                 if len(self._shared) > 1
@@ -162,16 +156,18 @@ class Frames:
         about = "{data}, {scenario}, map {map}".format(**recordings[0].about)
         words = f"{about}; {SPEED:g} × as fast as driven"
         self._figure.suptitle(words, x=0.01, ha="left", parse_math=False)
-        at: dict[str, float | str] = {
+        placement: dict[str, float | str] = {
             "x": 0.99,
             "y": 0.985,
             "va": "top",
             "ha": "right",
             "s": "",
         }
-        self.time = self._figure.text(**at, family="monospace", animated=True)  # type: ignore[arg-type]
+        self.time = self._figure.text(**placement, family="monospace", animated=True)  # type: ignore[arg-type]
         maps.draw_bar(self._figure, "traversability λ, λ̂", aspect=30)
-        for time_s in np.linspace(0, max(own.end_s for own in recordings), _MOMENTS):
+        for time_s in np.linspace(
+            0, max(recording.end_s for recording in recordings), _MOMENTS
+        ):
             self._put(float(time_s))
         legend_outside(self._figure, columns=5)
         engine = self._figure.get_layout_engine()
@@ -187,7 +183,7 @@ class Frames:
         """Draw a frame, uint8 of shape [height, width, 3].
 
         Args:
-            time_s: since the episodes began; those that have ended stay as they ended.
+            time_s: time since the start; ended episodes remain in their last state.
         """
         self._canvas.restore_region(self._background)
         self._clear()
@@ -202,34 +198,34 @@ class Frames:
         self._moving = []
 
     def _put(self, time_s: float) -> None:
-        """Put on the panels what they show at a time."""
+        """Draw the contents of all panels at a time."""
         before = {
             artist for panel in self._figure.axes for artist in panel.get_children()
         }
         self.time.set_text(f"t = {time_s:5.1f} s")
-        for index, (panel, own) in enumerate(
+        for index, (panel, recording) in enumerate(
             zip(self.given, self._recordings, strict=True)
         ):
-            step = _step(own, time_s)
-            if own.known:
-                moment.show_known(panel, own, step)
-            moment.draw_plan(panel, own, step)
+            step = _step(recording, time_s)
+            if recording.known:
+                moment.show_known(panel, recording, step)
+            moment.draw_plan(panel, recording, step)
             self._put_robot(panel, index, step)
-            words = (
-                "observed λ = "
-                f"{own.traversability[min(step, len(own.traversability) - 1)]:.2f}"
-                if step
-                else ""
-            )
-            words = (
-                f"{own.outcome}, {own.end_s:.1f} s"
-                if moment.has_ended(own, step)
-                else words
+            text = ""
+            if step:
+                text = (
+                    "observed λ = "
+                    f"{recording.traversability[min(step, len(recording.traversability) - 1)]:.2f}"
+                )
+            text = (
+                f"{recording.outcome}, {recording.end_s:.1f} s"
+                if moment.has_ended(recording, step)
+                else text
             )
             panel.text(
                 1,
                 -0.02,
-                words,
+                text,
                 transform=panel.transAxes,
                 ha="right",
                 va="top",
@@ -263,31 +259,27 @@ def _step(recording: Recording, time_s: float) -> int:
 
 
 def _columns(count: int, ratio: float) -> int:
-    """Return how many maps of a height over width stand side by side, so that they are
-    as large as possible.
-    """
+    """Return the number of columns that makes maps of a height/width ratio largest."""
     wide, high = (size / _DPI for size in SIZE)
-    widths = {
-        columns: min(
-            (wide - _BAR_IN) / columns, ((high - _ENDS_IN) / rows - _HEADING_IN) / ratio
-        )
-        for columns in range(1, count + 1)
-        for rows in [-(-count // columns)]
-    }
+    widths = {}
+    for columns in range(1, count + 1):
+        rows = -(-count // columns)
+        by_height = ((high - _ENDS_IN) / rows - _HEADING_IN) / ratio
+        widths[columns] = min((wide - _BAR_IN) / columns, by_height)
     return max(widths, key=widths.__getitem__)
 
 
 def _title(panel: Axes, words: str, letters: int, colour: str = "black") -> None:
-    """Write over a panel what it shows, in lines of a number of letters."""
+    """Set the title of a panel, wrapped to a number of letters."""
     lines = [
         line for part in words.splitlines() for line in textwrap.wrap(part, letters)
     ]
     panel.set_title("\n".join(lines), color=colour, parse_math=False)
 
 
-def _alike(recordings: Sequence[Recording]) -> list[list[int]]:
-    """Indices of recordings by the λ that was there, those of one λ together."""
+def _groups_of_truth(recordings: Sequence[Recording]) -> list[list[int]]:
+    """Return indices of recordings, grouped by equal true λ."""
     groups: dict[bytes, list[int]] = {}
-    for index, own in enumerate(recordings):
-        groups.setdefault(moment.true_colours(own).tobytes(), []).append(index)
+    for index, recording in enumerate(recordings):
+        groups.setdefault(moment.true_colours(recording).tobytes(), []).append(index)
     return list(groups.values())

@@ -1,11 +1,10 @@
 """Files for the Rerun viewer: one episode, or several on one map.
 
-A file holds the terrain as a mesh, its colours and layers, the true mean of λ, the λ
-field, the λ̂ that each planner was given, each robot with its heading at every step,
-the path driven so far, what the planner was thinking, how it ended, and time series;
-and a blueprint that arranges them. Of a robot that learns on its way, λ̂, mean and
-spread of its belief, what it saw and sensed, and how far its sensors reached change
-over time.
+A file contains the terrain as a mesh, its colours and layers, the true mean of λ, the λ
+field, each planner's λ̂ and plans, each robot with its heading, driven path and outcome,
+time series, and a blueprint that arranges them. For a robot that learns, λ̂, mean and
+spread of its belief, observed and measured cells, and the sensors' footprint change over
+time.
 """
 
 from collections.abc import Sequence
@@ -37,18 +36,18 @@ from benchnav.viz.style import bytes_of, condition_colours
 APPLICATION = "benchnav"
 
 _ALONE = "#00aa00"
-# Maps of a robot that learns, by what their views are called.
+# Maps of a robot that learns, with the titles of their views.
 _LEARNT = {
     "mean": "Belief: mean of λ",
     "spread": f"Belief: spread of λ, 0 to {MAX_SPREAD:g}",
     "seen": "Seen light, λ sensed blue",
 }
-_ALL, _PLACES = "/map/overlay/**", "/map/places/**"
+_ALL = "/map/overlay/**"
+_PLACES = "/map/places/**"
 
 
 def write_viewer_files(folder: Path) -> None:
-    """Write the viewer's file of each recording in a run folder that has none, or a
-    damaged one.
+    """Write missing and damaged viewer files of the recordings in a run folder.
 
     Args:
         folder: the run folder.
@@ -63,15 +62,14 @@ def write_viewer_files(folder: Path) -> None:
 
 
 def write_rerun(recordings: Sequence[Recording], path: Path) -> None:
-    """Writes an `.rrd` file, whole or not at all.
+    """Write an `.rrd` file atomically.
 
     Args:
-        recordings: one, or several of one map.
-        path: file to write; its name is what the viewer calls it.
+        recordings: one recording, or several on one map.
+        path: path of the file; the viewer shows its name.
     """
     drivers = drivers_of(recordings)
-    # One chunk an entity, however slow the machine is: each has a header of more than a
-    # kilobyte.
+    # One chunk for each entity, since a chunk has a header of more than a kilobyte.
     batches = rr.ChunkBatcherConfig.NEVER()
     stream = rr.RecordingStream(
         APPLICATION, recording_id=path.stem, batcher_config=batches
@@ -94,15 +92,15 @@ def write_rerun(recordings: Sequence[Recording], path: Path) -> None:
 
 
 def drivers_of(recordings: Sequence[Recording]) -> list[Driver]:
-    """Gives each robot a name and a colour; one that is alone needs no name."""
+    """Return drivers with unique names and colours; a single one has no name."""
     if len(recordings) == 1:
         return [Driver(recording=recordings[0], name="", colour=bytes_of(_ALONE))]
-    abouts = [recording.about for recording in recordings]
-    colours = condition_colours([about["planner"] for about in abouts])
+    identities = [recording.about for recording in recordings]
+    colours = condition_colours([identity["planner"] for identity in identities])
     return [
         Driver(recording=recording, name=name, colour=bytes_of(colour))
         for recording, name, colour in zip(
-            recordings, contender_names(abouts), colours, strict=True
+            recordings, contender_names(identities), colours, strict=True
         )
     ]
 
@@ -110,15 +108,15 @@ def drivers_of(recordings: Sequence[Recording]) -> list[Driver]:
 def _title(drivers: Sequence[Driver]) -> str:
     if len(drivers) == 1:
         return drivers[0].recording.title
-    about = drivers[0].recording.about
+    identity = drivers[0].recording.about
     return (
-        f"{about['scenario']} {about['map']}: "
+        f"{identity['scenario']} {identity['map']}: "
         f"{', '.join(driver.name for driver in drivers)}"
     )
 
 
 def arrange(drivers: Sequence[Driver]) -> Any:
-    """Arranges the views: the terrain and time series to the left, maps to the right."""
+    """Arrange terrain and time series on the left, maps on the right."""
     series = [
         rrb.TimeSeriesView(
             name="Observed λ",
@@ -154,9 +152,9 @@ def arrange(drivers: Sequence[Driver]) -> Any:
 
 
 def map_views(drivers: Sequence[Driver]) -> dict[str, list[str]]:
-    """What each view of a map shows, by its name."""
+    """Return the entities that each view of a map shows, by its title."""
     recording = drivers[0].recording
-    own = ["/map/closed"] if len(drivers) == 1 else []
+    closed = ["/map/closed"] if len(drivers) == 1 else []
     colour = "Colour, soft ground hatched" if recording.soft.any() else "Colour"
     views = {
         colour: ["/map/colour", "/map/soft/**", _ALL, _PLACES],
@@ -164,12 +162,12 @@ def map_views(drivers: Sequence[Driver]) -> dict[str, list[str]]:
             layer_title(name, layer): [f"/{layer_entity(name)}", _ALL, _PLACES]
             for name, layer in recording.layers.items()
         },
-        "True mean of λ": ["/map/true_mean", *own, _ALL, _PLACES],
+        "True mean of λ": ["/map/true_mean", *closed, _ALL, _PLACES],
     }
     if recording.field is not None:
         views["λ field of the episode; dark red immobilises a robot"] = [
             "/map/field",
-            *own,
+            *closed,
             _ALL,
             _PLACES,
         ]
@@ -191,9 +189,7 @@ def map_views(drivers: Sequence[Driver]) -> dict[str, list[str]]:
 
 
 def layer_title(name: str, layer: np.ndarray) -> str:
-    """What the view of a layer is called: its name, and the values of its lightest and
-    its darkest colour.
-    """
+    """Return the title of a layer's view: its name and the range of its colours."""
     if is_azimuth(name):
         return f"{name}, directions"
     scale = layer_scale(name, layer)
@@ -201,37 +197,46 @@ def layer_title(name: str, layer: np.ndarray) -> str:
 
 
 def describe(drivers: Sequence[Driver]) -> str:
-    """Says in Markdown what is shown, how each episode ended, and which ground was
-    free.
-    """
-    about, driven = drivers[0].recording.about, [driver.recording for driver in drivers]
+    """Describe the episodes in Markdown: labels, outcomes, and the rule of free space."""
+    identity = drivers[0].recording.about
+    recordings = [driver.recording for driver in drivers]
     labels = {
-        name: [reading_name(name, own.about.get(name, NOT_USED)) for own in driven]
+        name: [
+            reading_name(name, recording.about.get(name, NOT_USED))
+            for recording in recordings
+        ]
         for name in NAMING
     }
-    rows: dict[str, Sequence[str]] = {
-        **{name: cells for name, cells in labels.items() if set(cells) != {NOT_USED}},
-        "outcome": [Bold(own.outcome) for own in driven],
-        "time": [f"{own.end_s:.1f} s of {own.time_budget_s:g} s" for own in driven],
-        "observed λ": [
-            f"{own.traversability.mean():.2f}" if len(own.traversability) else NOT_USED
-            for own in driven
-        ],
-        "free": [free_rule(own) for own in driven],
-    }
+    rows: dict[str, Sequence[str]] = {}
+    for name, cells in labels.items():
+        if set(cells) != {NOT_USED}:
+            rows[name] = cells
+    rows["outcome"] = [Bold(recording.outcome) for recording in recordings]
+    rows["time"] = [
+        f"{recording.end_s:.1f} s of {recording.time_budget_s:g} s"
+        for recording in recordings
+    ]
+    rows["observed λ"] = [
+        _mean_in_words(recording.traversability) for recording in recordings
+    ]
+    rows["free"] = [free_rule(recording) for recording in recordings]
     table = Table(
         headings=("", *(driver.name for driver in drivers)),
         rows=tuple((name, *cells) for name, cells in rows.items()),
     )
     lines = [
-        f"# {about['data']}, {about['scenario']} {about['map']}",
-        f"Seed {about['seed']}, realisation {about['realisation']}",
+        f"# {identity['data']}, {identity['scenario']} {identity['map']}",
+        f"Seed {identity['seed']}, realisation {identity['realisation']}",
         to_markdown(table),
     ]
     return "\n\n".join(lines)
 
 
+def _mean_in_words(traversability: np.ndarray) -> str:
+    return f"{traversability.mean():.2f}" if len(traversability) else NOT_USED
+
+
 def free_rule(recording: Recording) -> str:
-    """Which ground was free, in words."""
+    """Return the rule of free space in words."""
     by = "mean λ" if recording.free_by == "mean" else "λ̂"
     return f"{by} above {recording.free_above:g}"

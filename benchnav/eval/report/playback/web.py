@@ -1,4 +1,4 @@
-"""The Rerun viewer in a browser, served to this machine alone."""
+"""The Rerun viewer in a browser, served only to this machine."""
 
 import os
 import signal
@@ -14,22 +14,23 @@ from benchnav.core.errors import BenchnavError
 
 HOST = "127.0.0.1"
 
-# The viewer's own, for those who forward ports to another machine.
-_PAGE_PORT, _DATA_PORT = 9090, 9876
+# The viewer's default ports, for users who forward ports to another machine.
+_PAGE_PORT = 9090
+_DATA_PORT = 9876
 _START_S = 60.0
 
 
 def serve(path: Path) -> None:
-    """Serves the viewer with a recording, and prints its address, until it is
-    interrupted or told to end.
+    """Serve the viewer with a recording, and print its address, until interrupted.
 
     Args:
         path: an `.rrd` file.
 
     Raises:
-        BenchnavError: the viewer did not start.
+        BenchnavError: If the viewer did not start.
     """
-    page, data = _free_port(_PAGE_PORT), _free_port(_DATA_PORT)
+    page = _free_port(_PAGE_PORT)
+    data = _free_port(_DATA_PORT)
     command = [
         sys.executable,
         "-m",
@@ -40,15 +41,14 @@ def serve(path: Path) -> None:
         HOST,
     ]
     command += ["--web-viewer-port", str(page), "--port", str(data)]
-    # It has a child of its own, so that both are ended as a group.
+    # The viewer has a child process, so both are ended as a group.
     viewer = subprocess.Popen(
         command, env={**os.environ, "RUST_LOG": "error"}, start_new_session=True
     )
-    # Also where Ctrl-C was ignored, as in a process that a script started in the
-    # background.
+    # Background processes of scripts ignore Ctrl-C unless handlers are set.
     before = {
-        one: signal.signal(one, signal.default_int_handler)
-        for one in (signal.SIGINT, signal.SIGTERM)
+        number: signal.signal(number, signal.default_int_handler)
+        for number in (signal.SIGINT, signal.SIGTERM)
     }
     try:
         _wait_for(page, viewer)
@@ -62,13 +62,13 @@ def serve(path: Path) -> None:
         with suppress(ProcessLookupError):
             os.killpg(viewer.pid, signal.SIGTERM)
         viewer.wait()
-        for one, handler in before.items():
-            signal.signal(one, handler)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
-def _free_port(wanted: int) -> int:
-    """A port that is free now: the wanted one, or any other."""
-    for port in (wanted, 0):
+def _free_port(preferred: int) -> int:
+    """Return a free port, the preferred one if possible."""
+    for port in (preferred, 0):
         with socket.socket() as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             try:

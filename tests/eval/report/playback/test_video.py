@@ -12,7 +12,8 @@ from matplotlib.axes import Axes
 
 from benchnav.core.errors import ConfigError
 from benchnav.eval.figures.moment import known_colours, true_colours
-from benchnav.eval.recording import KnownMap, Recording
+from benchnav.eval.recorded_plans import KnownMap
+from benchnav.eval.recording import Recording
 from benchnav.eval.report.playback.video import (
     FRAMES_A_SECOND,
     HOLD_S,

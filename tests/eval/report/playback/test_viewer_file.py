@@ -7,7 +7,8 @@ import pytest
 
 from benchnav.core.grid import outline
 from benchnav.eval.figures.moment import known_colours
-from benchnav.eval.recording import MOST_POINTS, DrawnPlan, Recording, thinned
+from benchnav.eval.recorded_plans import MAX_POINTS, DrawnPlan, thinned
+from benchnav.eval.recording import Recording
 from benchnav.eval.report.playback.viewer_file import (
     arrange,
     describe,
@@ -295,7 +296,7 @@ def test_a_long_recording_of_a_crowded_planner_is_small(tmp_path: Path) -> None:
     assert path.stat().st_size + (tmp_path / "a.npz").stat().st_size < 3e6
     _, strips = column(path, "/map/overlay/plan/tree", "strips")
     kept = thinned(plans[0]).lines["tree"]
-    assert sum(map(len, kept)) <= MOST_POINTS
+    assert sum(map(len, kept)) <= MAX_POINTS
     for line, shown in zip(kept, strips[0], strict=True):  # type: ignore[call-overload]
         np.testing.assert_allclose(np.array(shown)[:, 0] * 0.5, line[:, 0], rtol=1e-5)
     for line in (plans[0].lines["tree"][0], plans[0].lines["tree"][-1]):

@@ -1,0 +1,230 @@
+"""Plans and known maps of a recording, and their packing into few arrays.
+
+Letters in shapes: H×W cells, P points.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from benchnav.core.grid import outline
+
+# Points of a layer of a plan; keeps recordings of long episodes within 3 MB.
+MAX_POINTS = 160
+# Fields of `KnownMap`: in files, numbers have steps of 1/255, and masks are bits.
+NUMBERS = ("predicted", "mean", "spread")
+_MASKS = ("free", "seen", "sensed")
+_LEVELS = 255
+
+
+@dataclass(frozen=True, kw_only=True)
+class DrawnPlan:
+    """The drawable plan of one step of an episode.
+
+    Args:
+        step: index of the step.
+        lines: polylines by layer, (x, y) in metres, each of shape [P, 2] with P ≥ 2.
+    """
+
+    step: int
+    lines: Mapping[str, Sequence[np.ndarray]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class KnownMap:
+    """A robot's knowledge of its map from a step on.
+
+    Args:
+        step: first step at which it is valid.
+        predicted: λ̂ under the risk setting, shape [H, W].
+        free: S_free, bool, shape [H, W].
+        mean: E[λ] of the belief, shape [H, W].
+        spread: half of the range from the 16 % to the 84 % quantile of λ, shape [H, W].
+        seen: cells whose appearance was observed by then, bool, shape [H, W].
+        sensed: cells whose λ was measured by then, bool, shape [H, W].
+        outline: outline of the sensors' footprint at that step, (x, y) in metres, shape
+            [P, 2]; rows of NaN separate lines.
+    """
+
+    step: int
+    predicted: np.ndarray
+    free: np.ndarray
+    mean: np.ndarray
+    spread: np.ndarray
+    seen: np.ndarray
+    sensed: np.ndarray
+    outline: np.ndarray
+
+    @property
+    def outlines(self) -> list[np.ndarray]:
+        """The lines of the outline, each of shape [P, 2]."""
+        ends = np.flatnonzero(np.isnan(self.outline[:, 0]))
+        lines = [line[~np.isnan(line[:, 0])] for line in np.split(self.outline, ends)]
+        return [line for line in lines if len(line) > 1]
+
+
+def reach_outline(cells: np.ndarray, resolution_m: float) -> np.ndarray:
+    """Return the `KnownMap.outline` of cells within the sensors' footprint.
+
+    Args:
+        cells: bool, shape [H, W].
+        resolution_m: edge length of a cell.
+    """
+    edges = outline(cells, resolution_m)
+    return np.pad(edges, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan).reshape(
+        -1, 2
+    )
+
+
+def under(prefix: str, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return values whose names start with a prefix, by the rest of their names."""
+    return {
+        name.removeprefix(prefix): value
+        for name, value in values.items()
+        if name.startswith(prefix)
+    }
+
+
+def drawn_plan(step: int, layers: Mapping[str, Tensor]) -> DrawnPlan:
+    """Return the drawable part of a plan: finite points, lines of at least two.
+
+    Args:
+        step: index of the step.
+        layers: from `Plan.lines`, polylines of shape [lines, P, 2] by layer; unused
+            points are NaN.
+    """
+    lines = {}
+    for name, layer in layers.items():
+        finite = [
+            line[np.isfinite(line).all(axis=1)] for line in layer.detach().cpu().numpy()
+        ]
+        lines[name] = [line for line in finite if len(line) > 1]
+    return DrawnPlan(step=step, lines=lines)
+
+
+def thinned(plan: DrawnPlan) -> DrawnPlan:
+    """Return a plan with at most about `MAX_POINTS` points in each layer."""
+    layers = {}
+    for name, lines in plan.lines.items():
+        shown = [lines[index] for index in _spread(len(lines), MAX_POINTS // 2)]
+        max_points = MAX_POINTS // max(len(shown), 1)
+        layers[name] = [line[_spread(len(line), max_points)] for line in shown]
+    return DrawnPlan(step=plan.step, lines=layers)
+
+
+def _spread(count: int, max_count: int) -> np.ndarray:
+    """Return up to `max_count` evenly spread indices, including first and last."""
+    return np.linspace(0, count - 1, min(count, max_count)).round().astype(int)
+
+
+def pack_plans(plans: Sequence[DrawnPlan]) -> dict[str, np.ndarray]:
+    """Pack plans, in order of steps, into few arrays, which `unpack_plans` reads.
+
+    Returns:
+        `plans:steps`; for each layer its points `plans:points/LAYER`, numbers of points
+        of lines `plans:sizes/LAYER`, and of lines of plans `plans:counts/LAYER`.
+    """
+    arrays: dict[str, np.ndarray] = {
+        "plans:steps": np.array([plan.step for plan in plans], np.int64)
+    }
+    for name in dict.fromkeys(name for plan in plans for name in plan.lines):
+        layers = [plan.lines.get(name, ()) for plan in plans]
+        lines = [line for layer in layers for line in layer]
+        arrays[f"plans:points/{name}"] = np.concatenate(
+            [np.empty((0, 2), np.float32), *lines]
+        )
+        arrays[f"plans:sizes/{name}"] = np.array(
+            [len(line) for line in lines], np.int64
+        )
+        arrays[f"plans:counts/{name}"] = np.array(
+            [len(layer) for layer in layers], np.int64
+        )
+    return arrays
+
+
+def unpack_plans(arrays: Mapping[str, np.ndarray]) -> list[DrawnPlan]:
+    """Return the plans that `pack_plans` packed; names are without `plans:`."""
+    points, sizes, counts = (
+        under(kind, arrays) for kind in ("points/", "sizes/", "counts/")
+    )
+    layers = {
+        name: _cut(_cut(points[name], sizes[name]), counts[name]) for name in points
+    }
+    return [
+        DrawnPlan(
+            step=int(step), lines={name: lines[index] for name, lines in layers.items()}
+        )
+        for index, step in enumerate(arrays["steps"])
+    ]
+
+
+def _cut(values: Any, sizes: np.ndarray) -> list[Any]:
+    """Split a sequence into consecutive parts of given sizes."""
+    ends = sizes.cumsum()
+    return [values[end - size : end] for end, size in zip(ends, sizes, strict=True)]
+
+
+def pack_known(known_maps: Sequence[KnownMap]) -> dict[str, np.ndarray]:
+    """Pack known maps into few arrays, which `unpack_known` reads.
+
+    Each map is stored as its difference from the previous one, which compresses well:
+    most cells do not change.
+
+    Returns:
+        `known:steps`; `known:NAME` for each field of λ, uint8, and for each mask, bits;
+        the outlines' points `known:outline`, and their numbers `known:sizes`. Empty
+        without maps.
+    """
+    if not known_maps:
+        return {}
+    arrays: dict[str, np.ndarray] = {
+        "known:steps": np.array([known_map.step for known_map in known_maps], np.int64)
+    }
+    for name in NUMBERS:
+        levels = (
+            np.stack([getattr(known_map, name) for known_map in known_maps])
+            .astype(np.float32)
+            .clip(0, 1)
+            * _LEVELS
+        )
+        # Differences modulo 256 are inverted by sums.
+        arrays[f"known:{name}"] = np.diff(
+            levels.round().astype(np.uint8), axis=0, prepend=np.uint8(0)
+        )
+    for name in _MASKS:
+        masks = np.stack([getattr(known_map, name) for known_map in known_maps])
+        changed = np.diff(masks, axis=0, prepend=False)
+        arrays[f"known:{name}"] = np.packbits(changed, axis=-1)
+    outlines = [known_map.outline for known_map in known_maps]
+    arrays["known:outline"] = np.concatenate(outlines).astype(np.float32)
+    arrays["known:sizes"] = np.array(
+        [len(known_map) for known_map in outlines], np.int64
+    )
+    return arrays
+
+
+def unpack_known(arrays: Mapping[str, np.ndarray]) -> tuple[KnownMap, ...]:
+    """Return the maps that `pack_known` packed; names are without `known:`."""
+    values = dict(arrays)
+    width = values[NUMBERS[0]].shape[-1]
+    for name in NUMBERS:
+        values[name] = (
+            values[name].cumsum(axis=0, dtype=np.uint8).astype(np.float32) / _LEVELS
+        )
+    for name in _MASKS:
+        changed = np.unpackbits(values[name], axis=-1, count=width)
+        values[name] = np.logical_xor.accumulate(changed.astype(bool), axis=0)
+    outlines = _cut(values["outline"], values["sizes"])
+    return tuple(
+        KnownMap(
+            step=int(step),
+            outline=lines,
+            **{name: values[name][index] for name in (*NUMBERS, *_MASKS)},
+        )
+        for index, (step, lines) in enumerate(
+            zip(values["steps"], outlines, strict=True)
+        )
+    )
