@@ -1,5 +1,5 @@
-"""What README, FAQ and the openings of studies say is a registered hypothesis, or says
-that it is exploratory.
+"""Findings in README, the home page, the FAQ and the openings of studies are registered
+hypotheses, or are called exploratory.
 """
 
 import re
@@ -104,8 +104,9 @@ def opening(study: str) -> str:
 FINDINGS = {
     "README": (ROOT / "README.md")
     .read_text()
-    .partition("## What was found")[2]
+    .partition("## Findings")[2]
     .partition("\n## ")[0],
+    "home": (DOCS / "index.md").read_text(),
     "faq": (DOCS / "faq.md").read_text(),
     **{study: opening(study) for study in ("risk", "results", "zoo", "knowledge")},
 }
