@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     import matplotlib.figure
 
 
+_DPI = 200  # of a figure that is saved without another
+
+
 class Figure(Specified, ABC):
     """A figure.
 
@@ -72,6 +75,7 @@ class Figure(Specified, ABC):
 
         with styled():
             drawing = self.draw(data)
+        drawing.set_dpi(_DPI)
         # Notebooks show an object by this method, whatever backend is active.
         vars(drawing)["_repr_png_"] = partial(_png, drawing)
         return drawing
@@ -79,7 +83,7 @@ class Figure(Specified, ABC):
 
 def _png(drawing: "matplotlib.figure.Figure") -> bytes:
     image = BytesIO()
-    drawing.savefig(image, format="png", dpi=150, bbox_inches="tight")
+    drawing.savefig(image, format="png", bbox_inches="tight")
     return image.getvalue()
 
 
