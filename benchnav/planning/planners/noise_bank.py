@@ -1,7 +1,7 @@
 """Noise of MPPI: normal numbers that are drawn once and read differently at each step.
 
 Letters in shapes: A action dimensions, T horizon steps, K samples, N numbers of a part
-    of the bank.
+of the bank.
 """
 
 from dataclasses import dataclass

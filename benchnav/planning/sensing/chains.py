@@ -9,8 +9,8 @@ is represented by a Gaussian term of expectation propagation at the more probabl
 of its cell. Only cells near new observations are drawn (`sites`). A labelling that is
 in none of the chains can return only by these moves.
 Letters in shapes: B episodes, H×W cells, R×C cells of a block, N observed cells, S
-    chains.
-    chains.
+chains.
+chains.
 """
 
 from dataclasses import replace

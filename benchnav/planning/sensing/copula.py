@@ -12,7 +12,7 @@ model's prediction the marginals are an approximation too.
 λ that is impossible under a prediction is moved to the nearest possible value,
 `_MAX_SCORE` standard deviations off.
 Letters in shapes: B episodes, H×W cells, N observations, R×C cells of a block, K values
-    of λ.
+of λ.
 """
 
 import math

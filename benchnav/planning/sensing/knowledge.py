@@ -6,7 +6,7 @@ sensor is used as well and the belief is updated, after a new prediction if more
 observed. A `Learner` holds the parts that do this, a `Knowledge` the current state.
 Only sensors receive the `Truth`.
 Letters in shapes: B episodes, S state dimensions, H×W cells, N cells of all maps
-    together.
+together.
 """
 
 from collections.abc import Callable

@@ -1,7 +1,7 @@
 """Learner: how a robot's knowledge is updated during an episode.
 
 Letters in shapes: B episodes, S state dimensions, H×W cells, N cells of all maps
-    together.
+together.
 """
 
 from collections.abc import Callable, Sequence

@@ -8,10 +8,10 @@ of range, out of the field of view or hidden below the horizon raises no horizon
 the mask of observed cells depends only on observed terrain, as long as hidden terrain
 stays below its horizon.
 Letters in shapes: B episodes, S state dimensions, H×W cells, N cells of the rings,
-    observed or in total.
+observed or in total.
 
 Source: Franklin, Ray and Mehta (1994), "Geometric algorithms for siting of air defense
-    missile batteries", for XDraw.
+missile batteries", for XDraw.
 """
 
 import math

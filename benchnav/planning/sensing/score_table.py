@@ -4,7 +4,7 @@ A row belongs to one cell and contains the normal scores of `VALUES` under the c
 prediction. They give P(λ ≤ value) for a posterior of the score. Rows are computed only
 for requested cells, and are cached.
 Letters in shapes: B episodes, H×W cells, *B any leading dimensions, K values of λ, R
-    rows, N cells.
+rows, N cells.
 """
 
 import math
