@@ -1,16 +1,15 @@
-"""Datasets and checkpoints of a hub, `owner/name@revision`: downloaded once into the
-cache of huggingface_hub.
+"""Datasets and checkpoints of a hub, `owner/name@revision`, as cached downloads.
 
-Data alone is downloaded, files of the names that the readers read, and nothing of it is
-run. The revision is part of
-the name, so that a run says what it read: a commit is for good, a branch or tag may
-move. What `HF_HOME`, `HF_HUB_OFFLINE`, `HF_ENDPOINT` and `HF_TOKEN` mean to
-huggingface_hub they mean here.
+Only files with the names that the readers read are downloaded, and no code is executed.
+The revision is part of the address, so that a run records its input. A commit never
+changes; a branch or tag may move. `HF_HOME`, `HF_HUB_OFFLINE`, `HF_ENDPOINT` and
+`HF_TOKEN` have the meaning that huggingface_hub gives them.
 """
 
 import json
 import re
 from functools import cache
+from itertools import chain
 from pathlib import Path
 from typing import Literal
 
@@ -23,120 +22,117 @@ FILES: dict[Kind, tuple[str, ...]] = {
     "model": ("config.json", "ground.json", "*.safetensors", "README.md"),
     "dataset": ("*.h5", "manifest.json", "README.md"),
 }
-"""What is downloaded, by kind of repository."""
+"""Patterns of the files that are downloaded, by kind of repository."""
 
 _ADDRESS = re.compile(r"(\w[\w.-]*/\w[\w.-]*)@([\w][\w./-]*)", re.ASCII)
 _COMMIT = re.compile(r"[0-9a-f]{40}")
 
 
 def is_address(source: str | Path) -> bool:
-    """Tells whether a text is of the form `owner/name@revision`."""
+    """Return whether a text has the form `owner/name@revision`."""
     return _ADDRESS.fullmatch(str(source)) is not None
 
 
 @cache
 def download(address: str, kind: Kind, error: type[BenchnavError]) -> Path:
-    """Downloads what is not in the cache yet.
+    """Download a revision, unless the cache contains it, and return its folder.
 
     Args:
         address: `owner/name@revision`.
-        kind: of the repository.
-        error: what is raised.
+        kind: kind of the repository.
+        error: exception class to raise.
 
     Returns:
-        The folder of the revision.
+        The folder of the revision in the cache.
 
     Raises:
-        BenchnavError: of the type `error`: the hub cannot be reached, or has no such
-            repository or revision.
+        BenchnavError: If the hub is not reachable, or has no such repository or
+            revision. The exception is an `error`.
     """
     from huggingface_hub import errors, snapshot_download
 
-    named = _ADDRESS.fullmatch(address)
-    assert named is not None
-    name, revision = named[1], named[2]
+    match = _ADDRESS.fullmatch(address)
+    assert match is not None
+    name, revision = match.groups()
 
     def snapshot(local: bool) -> Path:
-        patterns = list(FILES[kind])
-        return Path(
-            snapshot_download(
-                name,
-                repo_type=kind,
-                revision=revision,
-                allow_patterns=patterns,
-                local_files_only=local,
-            )
+        folder = snapshot_download(
+            name,
+            repo_type=kind,
+            revision=revision,
+            allow_patterns=list(FILES[kind]),
+            local_files_only=local,
         )
+        return Path(folder)
 
     with quiet("huggingface_hub"):
-        if _COMMIT.fullmatch(
-            revision
-        ):  # which does not change, so that the hub need not be asked again
+        # A commit never changes, so that a complete copy needs no request.
+        if _COMMIT.fullmatch(revision):
             try:
                 folder = snapshot(local=True)
             except (errors.LocalEntryNotFoundError, OSError):
                 pass
             else:
-                if _is_whole(folder, kind):
+                if _is_complete(folder, kind):
                     return folder
         try:
             folder = snapshot(local=False)
-        except Exception as cause:  # of many kinds, and not of one base
-            raise error(f"Expected {_refused(cause, name, revision, kind)}") from cause
+        except Exception as cause:  # the client raises unrelated classes
+            raise error(f"Expected {_reason(cause, name, revision, kind)}") from cause
     if not _COMMIT.fullmatch(revision):
         commit = folder.name
         tell(
-            f"benchnav: note: {address} is {commit} now and may move; @{commit} stays "
-            "what it is"
+            f"benchnav: note: {address} is {commit} now and may move; @{commit} never "
+            "changes"
         )
     return folder
 
 
-def _is_whole(folder: Path, kind: Kind) -> bool:
-    """Tells whether all files are there that the first of them names: a download may
-    have been cut short.
+def _is_complete(folder: Path, kind: Kind) -> bool:
+    """Return whether a folder contains all files that its index lists.
+
+    A download may have been interrupted.
     """
     try:
         if kind == "model":
             config = json.loads((folder / "config.json").read_text())
-            named = [f"{part}.safetensors" for part in config["parts"]]
-            named += ["ground.json"] if "ground" in config else []
+            names = [f"{part}.safetensors" for part in config["parts"]]
+            names += ["ground.json"] if "ground" in config else []
         elif (folder / "manifest.json").exists():
-            shards = json.loads((folder / "manifest.json").read_text())["shards"]
-            named = [shard["file"] for own in shards.values() for shard in own]
+            manifest = json.loads((folder / "manifest.json").read_text())
+            shards = chain.from_iterable(manifest["shards"].values())
+            names = [shard["file"] for shard in shards]
         else:
             return len(list(folder.glob("*.h5"))) == 1
-        return all((folder / name).is_file() for name in named)
+        return all((folder / name).is_file() for name in names)
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return False
 
 
-def _refused(cause: Exception, name: str, revision: str, kind: Kind) -> str:
+def _reason(cause: Exception, name: str, revision: str, kind: Kind) -> str:
+    """Return expectation, value and remedy for an exception of the client."""
     from huggingface_hub import errors
 
     if isinstance(cause, errors.RevisionNotFoundError):
         return (
-            f"a revision of {name} on the hub, got {revision!r}, which it has "
-            "not. "
+            f"a revision of {name} on the hub, got {revision!r}, which does not exist. "
             "Name a commit, tag or branch."
         )
     if isinstance(cause, errors.GatedRepoError):
         return (
-            f"access to {name} on the hub, got none. Ask its owner for it, and "
-            "log "
-            "in with `hf auth login`."
+            f"access to {name} on the hub, got none. Request it from the owner, and "
+            "log in with `hf auth login`."
         )
     if isinstance(cause, errors.RepositoryNotFoundError):
         return (
-            f"a {kind} repository on the hub, got {name!r}, which is not there or is "
-            "private. Check the name, or log "
-            "in with `hf auth login`."
+            f"a {kind} repository on the hub, got {name!r}, which does not exist or is "
+            "private. Check the name, or log in with `hf auth login`."
         )
     if isinstance(cause, errors.HFValidationError):
         return f"the name of a repository, owner/name, got {name!r}."
+    detail = " ".join(str(cause).split())[:160]
     return (
         f"to reach the hub for {name}@{revision}, which is not in the cache, got "
-        f"{type(cause).__name__}: "
-        f"{' '.join(str(cause).split())[:160]} Try again with a connection, or name a "
+        f"{type(cause).__name__}: {detail} Try again with a connection, or name a "
         "local folder."
     )

@@ -1,8 +1,7 @@
-"""Progress of work that takes long: what is done, the rate, and the time left, in a
-terminal and in plain logs.
+"""Progress of long work in a terminal and in plain logs: count, rate, remaining time.
 
-The rate is that of this command: what was there before it does not count, and its
-start-up does. So early estimates are too slow rather than too quick; a line says
+The rate is that of this command. It excludes results of earlier commands and includes
+the start-up. Early estimates of the remaining time are therefore too long; a line says
 "about".
 """
 
@@ -16,25 +15,26 @@ from typing import Any
 
 from benchnav.core.command import tell
 
-# Before that an estimate is of the start-up alone.
+# Earlier, the rate would measure only the start-up.
 _ESTIMATED_FROM_S = 5.0
-# Plain lines come at each tenth, and at least this often: more rarely the longer the
-# work has taken.
-_QUIET_S, _MOST_QUIET_S = 60.0, 600.0
-_LOOK_S = 1.0
+# A log has a line at each tenth, and after this time without one. The time grows with
+# the duration of the work.
+_MIN_SILENCE_S = 60.0
+_MAX_SILENCE_S = 600.0
+_POLL_S = 1.0
 
 
 @dataclass(frozen=True)
 class Progress:
-    """How far some work is; unpacks as `done, total`.
+    """Progress of some work; unpacks as `done, total`.
 
     Args:
-        done: parts that are done, those that were there before included.
-        total: parts in all.
-        doing: what is being done or was done last, in words.
-        size_done: sizes of the parts that are done, summed, where parts differ in size.
-        size: sizes of all parts; 0 where all parts count alike.
-        sized: what sizes count, such as "episodes".
+        done: number of finished parts, including those of earlier commands.
+        total: number of all parts.
+        doing: description of the current or last part.
+        size_done: sum of the sizes of finished parts, if parts differ in size.
+        size: sum of the sizes of all parts; 0 if all parts have the same size.
+        sized: plural noun for what sizes count, such as "episodes".
     """
 
     done: int
@@ -45,81 +45,79 @@ class Progress:
     sized: str = ""
 
     def __iter__(self) -> Iterator[int]:
-        """Done and total."""
+        """Iterate over `done` and `total`."""
         return iter((self.done, self.total))
 
     @property
     def amount(self) -> tuple[int, int]:
-        """What is done and what there is in all, as the rate counts it."""
+        """Finished and total amount, in the unit of the rate."""
         return (self.size_done, self.size) if self.size else (self.done, self.total)
 
 
 class Watch:
-    """Puts the progress of one piece of work into words.
+    """Description of the progress of some work, with its rate.
 
     Args:
-        what: what is counted, for example "units".
+        noun: plural noun for what is counted, for example "units".
     """
 
-    def __init__(self, what: str) -> None:
-        """Starts the clock."""
-        self.what = what
+    def __init__(self, noun: str) -> None:
+        """Start the clock."""
+        self.noun = noun
         self.step = Progress(0, 0)
-        self._first: int | None = None
-        self._began_s = self._told_s = time.monotonic()
+        self._initial_amount: int | None = None
+        self._start_s = time.monotonic()
+        self._last_line_s = self._start_s
         self._tenth = -1
 
     def update(self, step: Progress | tuple[int, int]) -> None:
-        """Takes the next step; what the first one says to be done is not of this
-        command.
-        """
+        """Record progress; work done at the first call is of an earlier command."""
         self.step = step if isinstance(step, Progress) else Progress(*step)
-        if self._first is None:
-            self._first = self.step.amount[0]
-            self._began_s = time.monotonic()
+        if self._initial_amount is None:
+            self._initial_amount = self.step.amount[0]
+            self._start_s = time.monotonic()
 
     def is_due(self) -> bool:
-        """Whether a log should have a line now; True once for each time it is due."""
+        """Return whether a log line is due; True once for each line."""
         now_s = time.monotonic()
         if not self.step.total:
             return False
         tenth = self.step.done * 10 // self.step.total
-        quiet_s = min(max(_QUIET_S, (now_s - self._began_s) / 10), _MOST_QUIET_S)
-        if tenth <= self._tenth and now_s - self._told_s < quiet_s:
+        elapsed_s = now_s - self._start_s
+        silence_s = min(max(_MIN_SILENCE_S, elapsed_s / 10), _MAX_SILENCE_S)
+        if tenth <= self._tenth and now_s - self._last_line_s < silence_s:
             return False
-        self._tenth, self._told_s = max(tenth, self._tenth), now_s
+        self._tenth = max(tenth, self._tenth)
+        self._last_line_s = now_s
         return True
 
     def line(self) -> str:
-        """A line of a log."""
-        return ", ".join(
-            [f"{self.what}: {self.step.done}/{self.step.total}", *self.words()]
-        )
+        """Return a line for a log."""
+        count = f"{self.noun}: {self.step.done}/{self.step.total}"
+        return ", ".join([count, *self.words()])
 
     def words(self) -> list[str]:
-        """The rate, the time left or taken, and what is being done; what is not known
-        is left out.
-        """
-        return [*self._pace(), *([self.step.doing] if self.step.doing else [])]
+        """Return the available ones of rate, remaining or elapsed time and activity."""
+        activity = [self.step.doing] if self.step.doing else []
+        return [*self._pace(), *activity]
 
     def _pace(self) -> list[str]:
-        elapsed_s = time.monotonic() - self._began_s
+        elapsed_s = time.monotonic() - self._start_s
         done, total = self.step.amount
-        mine = done - (self._first or 0)
+        new_amount = done - (self._initial_amount or 0)
         if elapsed_s < _ESTIMATED_FROM_S:
             return []
-        if not mine:
+        if not new_amount:
             return [f"{in_words(elapsed_s)} so far"]
-        rate = f"{_rate(mine / elapsed_s, self.step.sized or self.what)}"
+        rate = _rate(new_amount / elapsed_s, self.step.sized or self.noun)
         if done == total:
             return [rate, f"took {in_words(elapsed_s)}"]
-        return [rate, f"about {in_words((total - done) * elapsed_s / mine)} left"]
+        remaining_s = (total - done) * elapsed_s / new_amount
+        return [rate, f"about {in_words(remaining_s)} left"]
 
 
 def _rate(per_s: float, unit: str) -> str:
-    """A rate with two digits that count, in the largest unit of time in which it is 1
-    or more.
-    """
+    """Return a rate per s, min or h, the first in which it is at least 1."""
     for seconds, name in ((1, "s"), (60, "min")):
         if per_s * seconds >= 1:
             return f"{_two_digits(per_s * seconds)} {unit}/{name}"
@@ -131,7 +129,7 @@ def _two_digits(value: float) -> str:
 
 
 def in_words(seconds: float) -> str:
-    """A duration, in the unit in which people count it."""
+    """Return a duration as text, in s, min, h or days by its length."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     if seconds < 90 * 60:
@@ -141,19 +139,20 @@ def in_words(seconds: float) -> str:
     return f"{seconds / 86400:.1f} days"
 
 
-def show_progress(steps: Iterable[Progress | tuple[int, int]], what: str) -> None:
-    """Runs work to its end while showing how far it is: a bar in a terminal, plain
-    lines elsewhere.
+def show_progress(steps: Iterable[Progress | tuple[int, int]], noun: str) -> None:
+    """Run work and show its progress: a bar in a terminal, lines in a log.
 
     Args:
-        steps: the work, yielding its progress as it goes, first what is done already.
-        what: what is counted, for example "maps".
+        steps: iterator that does the work and yields its progress. The first value
+            counts the results of earlier commands.
+        noun: plural noun for what is counted, for example "maps".
     """
     from rich.console import Console
 
-    watch, console = Watch(what), Console(stderr=True)
-    shown = _bar(watch, console) if console.is_terminal else _lines(watch)
-    with shown as show:
+    watch = Watch(noun)
+    console = Console(stderr=True)
+    display = _bar(watch, console) if console.is_terminal else _lines(watch)
+    with display as show:
         for step in steps:
             watch.update(step)
             show()
@@ -184,7 +183,7 @@ def _bar(watch: Watch, console: Any) -> Iterator[Any]:
         TimeElapsedColumn(),
     ]
     with Bar(*columns, words, console=console, expand=True) as bar:
-        task = bar.add_task(watch.what, total=None)
+        task = bar.add_task(watch.noun, total=None)
         yield lambda: bar.update(
             task, completed=watch.step.done, total=watch.step.total
         )
@@ -192,21 +191,21 @@ def _bar(watch: Watch, console: Any) -> Iterator[Any]:
 
 @contextmanager
 def _lines(watch: Watch) -> Iterator[Any]:
-    lock, ended = threading.Lock(), threading.Event()
+    lock = threading.Lock()
+    ended = threading.Event()
 
     def show() -> None:
         with lock:
             if watch.is_due():
                 tell(watch.line())
 
-    def look() -> None:
-        # An interruption is for the main thread, which would not wake if this one took
-        # it.
+    def poll() -> None:
+        # If this thread received an interruption, the main thread would not wake.
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
-        while not ended.wait(_LOOK_S):
+        while not ended.wait(_POLL_S):
             show()
 
-    thread = threading.Thread(target=look, daemon=True)
+    thread = threading.Thread(target=poll, daemon=True)
     thread.start()
     try:
         yield show

@@ -1,6 +1,4 @@
-"""Where a user's code comes from: loading it by file, taking a part of it, and digests
-of its sources.
-"""
+"""Import of user code by file and by name, and digests of its sources."""
 
 import ast
 import hashlib
@@ -27,49 +25,53 @@ from benchnav.core.shipped_files import PACKAGE
 
 
 def moved(error: BaseException) -> str:
-    """Return a sentence with the new name of what an import did not find; empty if none
-    is known.
-    """
+    """Return a sentence with the new name of a failed import; empty without one."""
     if not isinstance(error, ImportError) or not error.name:
         return ""
-    name = re.search(r"cannot import name '(\w+)'", str(error))
-    old = f"{error.name}.{name[1]}" if name else error.name
-    return f". {old} is now {IMPORTS[old]}." if old in IMPORTS else ""
+    match = re.search(r"cannot import name '(\w+)'", str(error))
+    old_name = f"{error.name}.{match[1]}" if match else error.name
+    new_name = IMPORTS.get(old_name)
+    return f". {old_name} is now {new_name}." if new_name else ""
 
 
-def attribute(module: ModuleType, place: str, name: str) -> Any:
-    """Gives a class or function of a module.
+def attribute(module: ModuleType, source: str, name: str) -> Any:
+    """Return a class or function of a module.
 
     Args:
-        module: where it is.
-        place: what users call the module, for messages.
-        name: its name there, with dots where it is within a class.
+        module: module that defines the attribute.
+        source: name or path of the module as the user wrote it, for messages.
+        name: name of the attribute, with dots within a class.
 
     Raises:
-        ConfigError: there is none.
+        ConfigError: If the module has no class or function of this name.
     """
     target: Any = module
     for part in name.split("."):
         target = getattr(target, part, None)
     if _is_part(target):
         return target
-    known = {
-        n: v for n, v in vars(module).items() if _is_part(v) and not n.startswith("_")
+    options = {
+        key: value
+        for key, value in vars(module).items()
+        if _is_part(value) and not key.startswith("_")
     }
-    own = [
-        n for n, v in known.items() if getattr(v, "__module__", "") == module.__name__
+    defined = [
+        key
+        for key, value in options.items()
+        if getattr(value, "__module__", "") == module.__name__
     ]
     got = "" if target is None else f", which is an object of {type(target).__name__}"
-    listed = f" ({', '.join(own)})" if own else ""
+    choices = f" ({', '.join(defined)})" if defined else ""
     raise ConfigError(
-        f"Expected a class or function of {place}{listed}, got "
-        f"{name!r}{got}.{hint(name, known)}"
+        f"Expected a class or function of {source}{choices}, got "
+        f"{name!r}{got}.{hint(name, options)}"
     )
 
 
 def _is_part(target: Any) -> bool:
-    """Tells a class, function or wrapped function from an object that can be called,
-    such as a robot.
+    """Return whether an object is a class or function, wrapped ones included.
+
+    Other objects that can be called, such as a robot, are excluded.
     """
     return callable(target) and (
         inspect.isclass(target)
@@ -81,76 +83,67 @@ def _is_part(target: Any) -> bool:
 
 @cache
 def load_file(path: Path, content: bytes) -> ModuleType:
-    """Imports a file once for each of its contents, and writes nothing beside it.
+    """Import a file, once per content, without writing a compiled file.
 
     Args:
-        path: the file, absolute.
-        content: what it holds.
+        path: absolute path of the file.
+        content: content of the file.
 
     Raises:
-        ConfigError: it cannot be imported.
+        ConfigError: If the file cannot be imported.
     """
-    where = hashlib.sha256(str(path).encode() + b"\0" + content).hexdigest()[:16]
-    module = ModuleType(f"benchnav_file_{path.stem}_{where}")
+    digest = hashlib.sha256(str(path).encode() + b"\0" + content).hexdigest()[:16]
+    module = ModuleType(f"benchnav_file_{path.stem}_{digest}")
     module.__file__ = str(path)
-    sys.modules[module.__name__] = (
-        module  # dataclasses and compiled functions look their module up
-    )
+    # Dataclasses and compiled functions look up their module.
+    sys.modules[module.__name__] = module
     try:
         exec(compile(content, str(path), "exec"), vars(module))
     except (Exception, SystemExit) as error:
         del sys.modules[module.__name__]
         if isinstance(error, BenchnavError):
             raise
-        lines = [
-            f.lineno
-            for f in traceback.extract_tb(error.__traceback__)
-            if f.filename == str(path)
-        ]
-        at = f" (line {lines[-1]})" if lines else ""
+        frames = traceback.extract_tb(error.__traceback__)
+        lines = [frame.lineno for frame in frames if frame.filename == str(path)]
+        position = f" (line {lines[-1]})" if lines else ""
         remedy = moved(error)
         if not remedy and isinstance(error, ModuleNotFoundError):
             remedy = (
-                ". A file stands alone: install what it imports, or write it "
-                "into the file."
+                ". A file must not depend on its folder: install the module, or copy "
+                "its code into the file."
             )
         raise out_of_memory(error) or ConfigError(
-            f"{path} could not be imported: {one_line(error)}{at}{remedy}"
+            f"{path} could not be imported: {one_line(error)}{position}{remedy}"
         ) from error
     return module
 
 
 def digest_of(contents: Iterable[bytes]) -> str:
-    """SHA-256 over contents, each by its own digest."""
-    whole = hashlib.sha256()
+    """Return the SHA-256 of the SHA-256 digests of several contents."""
+    combined = hashlib.sha256()
     for content in contents:
-        whole.update(hashlib.sha256(content).digest())
-    return whole.hexdigest()
+        combined.update(hashlib.sha256(content).digest())
+    return combined.hexdigest()
 
 
 def digest_of_path(path: Path) -> str:
-    """Digest of a file, or of all files of a folder with their names; empty where there
-    is neither.
+    """Return the digest of a file, or of a folder's files and names; empty without any.
 
     Raises:
-        ConfigError: it cannot be read.
+        ConfigError: If the path cannot be read.
     """
     try:
         if path.is_dir():
-            files = sorted(
-                f
-                for f in path.rglob("*")
-                if f.is_file() and "__pycache__" not in f.parts
-            )
-            pairs = (
-                (file.relative_to(path).as_posix(), digest_of_path(file))
-                for file in files
-            )
-            return digest_of(item.encode() for pair in pairs for item in pair)
+            files = [file for file in path.rglob("*") if file.is_file()]
+            items = []
+            for file in sorted(files):
+                if "__pycache__" not in file.parts:
+                    items += [file.relative_to(path).as_posix(), digest_of_path(file)]
+            return digest_of(item.encode() for item in items)
         if not path.is_file():
             return ""
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
     except OSError as error:
         raise ConfigError(
             f"Expected {path} to be readable, since a part reads it: {error.strerror}."
@@ -158,232 +151,212 @@ def digest_of_path(path: Path) -> str:
 
 
 def digest_of_file_part(path: Path, content: bytes) -> str:
-    """Digest of a file that stands alone and of the modules that it imports; see
-    `imported_sources`.
-    """
-    return _digest_of_sources(
-        {"": content} | imported_sources(path.parent, "", content)
-    )
+    """Return the digest of a file and its imports; see `imported_sources`."""
+    imports = imported_sources(path.parent, "", content)
+    return _digest_of_sources({"": content} | imports)
 
 
 def digest_of_target(target: Callable[..., Any]) -> str:
-    """Digest of the file that defines a target and its imports or, in a notebook, of
-    its own source; else empty.
+    """Return the digest of the file that defines a target, and of its imports.
+
+    In a notebook, the source of the target replaces the file. Without a source, the
+    digest is empty.
     """
     try:
         path = Path(inspect.getfile(target))
-        content = (
-            path.read_bytes() if path.is_file() else inspect.getsource(target).encode()
-        )
+        is_file = path.is_file()
+        content = path.read_bytes() if is_file else inspect.getsource(target).encode()
     except (TypeError, OSError):
         return ""
     return digest_of_file_part(path, content)
 
 
 def digest_of_modules(names: Iterable[str]) -> str:
-    """Digest of modules: of all sources of the packages that they are in, and of what
-    they import besides.
-    """
-    found: dict[str, bytes] = {}
+    """Return the digest of modules: the sources of their packages and their imports."""
+    sources: dict[str, bytes] = {}
     for name in sorted(names):
         package = importlib.import_module(name.partition(".")[0])
         folders = [Path(folder) for folder in getattr(package, "__path__", [])]
-        files = [
-            (file.relative_to(folder.parent), file)
-            for folder in folders
-            for file in folder.rglob("*.py")
-        ]
+        files: dict[str, Path] = {}
+        for folder in folders:
+            for file in folder.rglob("*.py"):
+                files[file.relative_to(folder.parent).as_posix()] = file
         if not files and getattr(package, "__file__", None):
-            files = [(Path(package.__name__), Path(str(package.__file__)))]
-        found |= {place.as_posix(): _read_source(file) for place, file in files}
+            files = {package.__name__: Path(str(package.__file__))}
+        sources |= {key: _read_source(file) for key, file in files.items()}
         module = sys.modules.get(name)
         file = Path(getattr(module, "__file__", None) or "")
         if file.is_file():
-            within = getattr(module, "__package__", "") or ""
-            found |= imported_sources(file.parent, within, file.read_bytes())
-    return _digest_of_sources(found)
+            parent = getattr(module, "__package__", "") or ""
+            sources |= imported_sources(file.parent, parent, file.read_bytes())
+    return _digest_of_sources(sources)
 
 
 def package_modules(names: Iterable[str]) -> dict[str, str]:
-    """Digests of modules of this package, and of all of it that they import, wherever
-    in the code an import stands.
+    """Return digests of modules of this package and of all their imports from it.
 
-    A digest is of the syntax tree without docstrings: comments, layout and
-    documentation do not change it. What a process has once read stays, as what it has
-    imported does. Packages' own faces are left out: they hand names on.
+    A digest is of the syntax tree without docstrings, so that comments, layout and
+    documentation do not change it. A process reads each module once. Imports within
+    functions count. The `__init__.py` files are excluded, because they only re-export.
 
     Args:
-        names: of the modules to begin with.
+        names: names of the first modules.
 
     Returns:
-        12 hexadecimal digits by name, in alphabetical order.
+        12 hexadecimal digits by module name, in alphabetical order.
     """
-    found: dict[str, str] = {}
-    todo = list(names)
-    while todo:
-        name = todo.pop()
-        module = None if name in found else _module(name)
+    digests: dict[str, str] = {}
+    pending = list(names)
+    while pending:
+        name = pending.pop()
+        module = None if name in digests else _module(name)
         if module is not None:
-            found[name], imported = module
-            todo += imported
-    return dict(sorted(found.items()))
+            digests[name], imported = module
+            pending += imported
+    return dict(sorted(digests.items()))
 
 
 @cache
 def _module(name: str) -> tuple[str, tuple[str, ...]] | None:
-    """The digest of a module of this package, and what it imports; None of any other
-    name.
-    """
+    """Return digest and imports of a module of this package; None for other names."""
     path = PACKAGE.parent.joinpath(*name.split(".")).with_suffix(".py")
     if name.partition(".")[0] != PACKAGE.name or not path.is_file():
         return None
     content = path.read_bytes()
     tree = ast.parse(content)
+    documented = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
     for node in ast.walk(tree):
-        if not isinstance(
-            node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
-        ):
+        if not isinstance(node, documented):
             continue
         if ast.get_docstring(node, clean=False) is not None:
             node.body = node.body[1:]
-    return hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:12], imported_names(
-        content, ""
-    )
+    digest = hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:12]
+    return digest, imported_names(content, "")
 
 
-def _digest_of_sources(found: Mapping[str, bytes]) -> str:
-    return digest_of(
-        item for name in sorted(found) for item in (name.encode(), found[name])
-    )
+def _digest_of_sources(sources: Mapping[str, bytes]) -> str:
+    items = []
+    for name in sorted(sources):
+        items += [name.encode(), sources[name]]
+    return digest_of(items)
 
 
-def imported_sources(near: Path, package: str, content: bytes) -> dict[str, bytes]:
-    """Sources of all that a module imports, and of what that imports, wherever in the
-    code an import stands.
+def imported_sources(folder: Path, package: str, content: bytes) -> dict[str, bytes]:
+    """Return the sources of all modules that a module imports, recursively.
 
-    The standard library, installed distributions and benchnav itself are left out:
-    `run.json` has their versions and digests. Nothing is imported by this, and names
-    that are put together at run time are not seen.
+    The standard library, installed distributions and benchnav itself are excluded,
+    because `run.json` records their versions and digests. Imports within functions
+    count; names that are composed at run time do not. Nothing is imported.
 
     Args:
-        near: folder in which an imported file may lie besides `sys.path`.
-        package: of the module, empty for none.
-        content: its source.
+        folder: folder to search for modules, in addition to `sys.path`.
+        package: package of the module; empty without one.
+        content: source of the module.
 
     Returns:
-        By the name of the module.
+        Sources by module name.
     """
-    found: dict[str, bytes] = {}
-    todo = [(package, content)]
-    while todo:
-        package, content = todo.pop()
+    sources: dict[str, bytes] = {}
+    excluded = {*sys.stdlib_module_names, "benchnav"}
+    pending = [(package, content)]
+    while pending:
+        package, content = pending.pop()
         for name in imported_names(content, package):
-            if name in found or name.partition(".")[0] in (
-                *sys.stdlib_module_names,
-                "benchnav",
-            ):
+            if name in sources or name.partition(".")[0] in excluded:
                 continue
-            spec = _spec(name, near)
+            spec = _spec(name, folder)
             if spec is None or not spec.has_location or not spec.origin:
                 continue
             path = Path(spec.origin)
             if not path.is_file() or any(map(path.is_relative_to, installed_folders())):
                 continue
-            found[name] = _read_source(path)
+            sources[name] = _read_source(path)
             if path.suffix == ".py":
-                todo.append((spec.parent or "", path.read_bytes()))
-    return found
+                pending.append((spec.parent or "", path.read_bytes()))
+    return sources
 
 
 @cache
 def imported_names(content: bytes, package: str) -> tuple[str, ...]:
-    """Modules that a source may import, with the packages around them; of `from a
-    import b` both a and a.b.
+    """Return the modules that a source may import, and their parent packages.
+
+    `from a import b` yields both a and a.b.
     """
-    named = []
+    names: list[str] = []
     try:
         tree = ast.parse(content)
     except (SyntaxError, ValueError):
         return ()
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            named += [alias.name for alias in node.names]
+            names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
-            outer = (
-                package.split(".")[: len(package.split(".")) - node.level + 1]
-                if node.level
-                else []
-            )
-            base = ".".join([*outer, *([node.module] if node.module else [])])
-            named += [base, *(f"{base}.{alias.name}" for alias in node.names)]
-        elif (
-            isinstance(node, ast.Call)
-            and node.args
-            and isinstance(node.args[0], ast.Constant)
-        ):
-            called = getattr(node.func, "attr", getattr(node.func, "id", ""))
-            if called in ("import_module", "__import__") and isinstance(
-                node.args[0].value, str
-            ):
-                named.append(node.args[0].value)
-    parts = [name.split(".") for name in named if name and not name.startswith(".")]
-    return tuple(
-        dict.fromkeys(
-            ".".join(part[: n + 1]) for part in parts for n in range(len(part))
-        )
-    )
+            base_parts: list[str] = []
+            if node.level:
+                parents = package.split(".")
+                base_parts = parents[: len(parents) - node.level + 1]
+            if node.module:
+                base_parts = [*base_parts, node.module]
+            base = ".".join(base_parts)
+            names.append(base)
+            names += [f"{base}.{alias.name}" for alias in node.names]
+        elif isinstance(node, ast.Call) and node.args:
+            function = getattr(node.func, "attr", getattr(node.func, "id", ""))
+            name = getattr(node.args[0], "value", None)
+            is_import = function in ("import_module", "__import__")
+            if is_import and isinstance(name, str):
+                names.append(name)
+    modules: dict[str, None] = {}  # an ordered set
+    for name in names:
+        if name and not name.startswith("."):
+            parts = name.split(".")
+            for end in range(1, len(parts) + 1):
+                modules[".".join(parts[:end])] = None
+    return tuple(modules)
 
 
-def _spec(name: str, near: Path) -> ModuleSpec | None:
-    """Where a module is, without importing it or its package."""
-    head = name.rpartition(".")[0]
-    if head:
-        parent = _spec(head, near)
-        places = parent.submodule_search_locations if parent else None
-        return PathFinder.find_spec(name, places) if places is not None else None
+def _spec(name: str, folder: Path) -> ModuleSpec | None:
+    """Return the spec of a module without importing it or its package."""
+    package = name.rpartition(".")[0]
+    if package:
+        parent = _spec(package, folder)
+        folders = parent.submodule_search_locations if parent else None
+        return PathFinder.find_spec(name, folders) if folders is not None else None
     try:
         spec = importlib.util.find_spec(name)
     except (ImportError, ValueError):
         spec = None
-    return spec or PathFinder.find_spec(name, [str(near)])
+    return spec or PathFinder.find_spec(name, [str(folder)])
 
 
 @cache
 def installed_folders() -> frozenset[str]:
-    """Folders of the standard library and of installed distributions, wherever on the
-    path they were put.
-    """
-    known = sysconfig.get_paths()
-    return frozenset(
-        [known[name] for name in ("stdlib", "platstdlib", "purelib", "platlib")]
-        + [*site.getsitepackages(), site.getusersitepackages()]
-        + [
-            folder
-            for folder in sys.path
-            if folder and any(Path(folder).glob("*.dist-info"))
-        ]
-    )
+    """Return the folders of the standard library and of installed distributions."""
+    paths = sysconfig.get_paths()
+    folders = {paths[name] for name in ("stdlib", "platstdlib", "purelib", "platlib")}
+    folders |= {*site.getsitepackages(), site.getusersitepackages()}
+    for folder in sys.path:
+        if folder and any(Path(folder).glob("*.dist-info")):
+            folders.add(folder)
+    return frozenset(folders)
 
 
 _FIRST_READ: dict[Path, bytes] = {}
 
 
 def _read_source(path: Path) -> bytes:
-    """A module's source; where it has changed since this process first read it, with
-    what it was then.
+    """Return a module's source; after a change, its first content precedes it.
 
-    A module that was imported stays what it was, so that a process with an older one is
-    like no other.
+    A process keeps the module that it imported. Its digest therefore must differ from
+    that of a process with only the old or only the new content.
     """
     content = path.read_bytes()
-    first = _FIRST_READ.setdefault(path, content)
-    return content if content == first else first + content
+    first_content = _FIRST_READ.setdefault(path, content)
+    return content if content == first_content else first_content + content
 
 
 @cache
 def distribution_of(package: str) -> str:
-    """Name and version of the distribution that a package was installed with; empty
-    where there is none.
-    """
+    """Return name and version of a package's distribution; empty without one."""
     distribution = next(iter(packages_distributions().get(package, [])), "")
     return f"{distribution} {version(distribution)}" if distribution else ""

@@ -1,9 +1,7 @@
-"""Stored work, of datasets, runs and models alike: held by one writer, written whole or
-not at all, made in shards.
+"""Storage of datasets, runs and models: locks, atomic writes, digests and shards.
 
-A file or folder is written under another name beside its own and then renamed. A text
-that describes a store is
-sealed: it holds its own digest, so that an edit is found.
+A file or folder is written under a temporary name in the same folder and then renamed.
+A text that describes a store contains its own digest, so that an edit is detected.
 """
 
 import fcntl
@@ -26,39 +24,39 @@ MAX_JOBS = 10_000
 
 @contextmanager
 def replacing(path: Path, durable: bool = True) -> Iterator[Path]:
-    """Gives a name to write to; what stands there at the end takes `path`'s place in
-    one step.
+    """Write a file atomically: yield a temporary path, and rename it at the end.
 
-    A kill at any moment leaves `path` as it was or as it is to be. The name is the
-    process's own, so that two writers of one file do not mix.
+    A kill at any moment leaves the old or the new file. The temporary name contains the
+    process ID, so that two writers of one file do not mix.
 
     Args:
-        path: the file to be written; its folder is made.
-        durable: wait until it is on the disk, so that not even a loss of power leaves
-            it damaged.
+        path: file to write; its folder is created.
+        durable: whether to wait until the data is on the disk, so that a power failure
+            does not damage the file.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         yield partial
         if durable:
-            with open(partial, "rb") as written:
-                os.fsync(written.fileno())
+            with open(partial, "rb") as file:
+                os.fsync(file.fileno())
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
 
 
 def check_output(name: str, option: str = "out") -> None:
-    """Refuse what is no path on this machine that an output can be written to.
+    """Check that an output can be written to a path on this machine.
 
     Args:
         name: the path; `~` is the user's home.
-        option: what it is given as, for messages.
+        option: option that the path is the value of, for messages.
 
     Raises:
-        ConfigError: If it is empty, an address, such as s3://bucket/name, which would
-            become a folder `s3:`, or has characters that no listing shows.
+        ConfigError: If `name` is empty, is not below a folder, has non-printable
+            characters, or is an address, such as s3://bucket/name, which would create a
+            folder `s3:`. If `option` is not `out`, also if `name` is a folder.
     """
     expect(name, f"`{option}` as a path, got ''.")
     expect(
@@ -68,16 +66,15 @@ def check_output(name: str, option: str = "out") -> None:
     expect(
         not re.match(r"[A-Za-z][A-Za-z0-9+.-]*:/", name),
         f"`{option}` as a path on this machine, got the address {name!r}. Write to a "
-        "folder here, and copy it.",
+        "local folder, and copy it.",
     )
     path = Path(os.path.expanduser(name))
-    nearest = next(
-        (place for place in path.absolute().parents if os.path.lexists(place)), path
-    )
+    existing = filter(os.path.lexists, path.absolute().parents)
+    nearest = next(existing, path)
     expect(
         nearest.is_dir(),
-        f"`{option}` as a path in a folder, got {name!r}, and {nearest} is no folder. "
-        f"Choose another `{option}`.",
+        f"`{option}` as a path in a folder, got {name!r}, and {nearest} is not a "
+        f"folder. Choose another `{option}`.",
     )
     expect(
         option == "out" or not path.is_dir(),
@@ -86,57 +83,55 @@ def check_output(name: str, option: str = "out") -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Writes a text file whole or not at all."""
+    """Write a text file atomically."""
     with replacing(path) as partial:
         partial.write_text(text)
 
 
 def real_place(path: Path) -> Path:
-    """The place that a name stands for: where a link points to; the folder that `.` is,
-    by its own name.
-    """
+    """Return the target of a link or of a path that ends in `.` or `..`."""
     return path.resolve() if path.is_symlink() or path.name in ("", "..") else path
 
 
 @contextmanager
-def sole_writer(path: Path, what: str, shared: bool = False) -> Iterator[None]:
-    """Holds a file or folder for one process, whether or not it exists yet; a kill
-    frees it.
+def sole_writer(path: Path, output: str, shared: bool = False) -> Iterator[None]:
+    """Acquire an exclusive lock on a path, which need not exist; a kill releases it.
 
-    The lock is a file beside it, so `path` may be moved, replaced or removed while it
-    is held.
+    The lock is a file in the same folder, so that `path` may be moved, replaced or
+    removed while it is locked.
 
     Args:
-        path: what is held; its folder is made, and removed at the end where nothing
-            came into it.
-        what: what is written there, for the message.
-        shared: hold it together with others who share it, and keep out those who do
-            not.
+        path: file or folder to lock. Missing parent folders are created, and removed at
+            the end if they are empty.
+        output: name of the output at `path`, for the message.
+        shared: whether to share the lock with other shared ones. It still excludes
+            those that are not shared.
 
     Raises:
-        BenchnavError: another process, or another part of this one, holds it.
+        BenchnavError: If this or another process has locked `path`.
     """
     path = path.resolve()
-    made = [folder for folder in path.parents if not folder.exists()]
+    new_folders = [folder for folder in path.parents if not folder.exists()]
     path.parent.mkdir(parents=True, exist_ok=True)
     lock = path.with_name(f".{path.name}.lock")
-    descriptor = _take(lock, what, fcntl.LOCK_SH if shared else fcntl.LOCK_EX)
+    kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
+    descriptor = _lock(lock, output, kind)
     try:
         yield
     finally:
-        with suppress(BlockingIOError):  # others share it still
+        with suppress(BlockingIOError):  # others still share the lock
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            # Removed while it is still held: whoever opened it meanwhile sees that its
-            # name is gone.
+            # The file is removed while it is locked. A process that has opened it
+            # meanwhile detects that the path no longer leads to it.
             lock.unlink(missing_ok=True)
         os.close(descriptor)
-        with suppress(OSError):  # one is not empty, or was removed by others
-            for folder in made:
+        with suppress(OSError):  # a folder is not empty, or already removed
+            for folder in new_folders:
                 folder.rmdir()
 
 
-def _take(lock: Path, what: str, kind: int) -> int:
-    """Opens and locks a file that has its name still; gives its descriptor."""
+def _lock(lock: Path, output: str, kind: int) -> int:
+    """Return the descriptor of the lock file, opened and locked."""
     while True:
         descriptor = os.open(lock, os.O_RDWR | os.O_CREAT, 0o644)
         try:
@@ -146,13 +141,13 @@ def _take(lock: Path, what: str, kind: int) -> int:
         except BlockingIOError as error:
             os.close(descriptor)
             raise BenchnavError(
-                f"Another run is writing {what}. Wait for it to end, or choose "
+                f"Another run is writing {output}. Wait for it to end, or choose "
                 "another `out`."
             ) from error
         except BaseException:
             os.close(descriptor)
             raise
-        os.close(descriptor)  # its holder has removed it since it was opened
+        os.close(descriptor)  # the process that had locked the file has removed it
 
 
 def _is_same(descriptor: int, path: Path) -> bool:
@@ -163,106 +158,104 @@ def _is_same(descriptor: int, path: Path) -> bool:
 
 
 def refuse_taken(out: Path, overwrite: bool, foreign: Callable[[Path], str]) -> None:
-    """Refuses a place for an output that is taken; one rule for files, folders and
-    checkpoints.
+    """Check that a file, folder or checkpoint may be written to `out`.
 
     Args:
-        out: file or folder that is to be written.
-        overwrite: whether what is there may be replaced.
-        foreign: says of a place that is taken why it is of another kind, which no
-            option may replace, such as "holds notes.txt"; empty where it is not.
+        out: file or folder to write.
+        overwrite: whether an earlier output may be replaced.
+        foreign: returns why an existing path is not an output of this kind, such as
+            "holds notes.txt"; empty if it is one. No option replaces a foreign path.
 
     Raises:
-        ConfigError: something of another kind is there; or something is there, and may
-            not be replaced.
+        ConfigError: If `out` exists, and is foreign or may not be replaced.
     """
     if not out.exists() and not out.is_symlink():
         return
-    if why := foreign(out):
+    reason = foreign(out)
+    if reason:
         raise ConfigError(
             "Expected `out` to be new or an earlier result of this command, got "
-            f"{out}, which {why}. "
-            "Choose another `out`."
+            f"{out}, which {reason}. Choose another `out`."
         )
-    if not overwrite and not (out.is_dir() and not any(out.iterdir())):
+    is_empty_folder = out.is_dir() and not any(out.iterdir())
+    if not overwrite and not is_empty_folder:
         raise ConfigError(
             f"Expected `out` to be new, got {out}, which exists. Pass --overwrite to "
             "replace it."
         )
 
 
-def new_folder(place: Path) -> Path:
-    """Makes an empty folder beside a place, to be filled and then given to
-    `take_place`; one that a kill left goes.
+def new_folder(path: Path) -> Path:
+    """Return a new empty folder next to `path`, to fill and pass to `take_place`.
+
+    A folder of an interrupted process is removed.
     """
-    partial = place.with_name(f".{place.name}.partial")
+    partial = path.with_name(f".{path.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     return partial
 
 
 @contextmanager
-def building(place: Path) -> Iterator[Path]:
-    """Gives an empty folder beside a place, to be filled and then given to
-    `take_place`; where it was not, it goes.
+def building(path: Path) -> Iterator[Path]:
+    """Yield a new empty folder next to `path`, to fill and pass to `take_place`.
+
+    It is removed at the end if it was not passed.
     """
-    partial = new_folder(place.with_name(f"{place.name}.building"))
+    partial = new_folder(path.with_name(f"{path.name}.building"))
     try:
         yield partial
     finally:
         shutil.rmtree(partial, ignore_errors=True)
 
 
-def take_place(partial: Path, place: Path, last: str = "") -> None:
-    """Moves a whole folder to where it is to be, in the place of one that is there; see
-    `restore`.
+def take_place(partial: Path, path: Path, last: str = "") -> None:
+    """Replace the folder at `path` by a complete one; see `restore`.
 
-    An empty folder that is there is filled, since it may be a link, or the one that the
-    user is in.
+    The files move into an existing empty folder, because it may be a link or the user's
+    working directory.
 
     Args:
-        partial: the folder, beside `place`.
-        place: where it is to be.
-        last: file that makes an empty folder what it is to be, which so comes into it
-            last.
+        partial: the complete folder, next to `path`.
+        path: final path of the folder.
+        last: name of the file that marks a folder as complete. It is moved last.
     """
-    if place.is_dir() and not any(place.iterdir()):
-        for path in sorted(partial.iterdir(), key=lambda path: path.name == last):
-            os.replace(path, place / path.name)
+    if path.is_dir() and not any(path.iterdir()):
+        for file in sorted(partial.iterdir(), key=lambda file: file.name == last):
+            os.replace(file, path / file.name)
         partial.rmdir()
         return
-    dropped = _dropped(place)
+    dropped = _dropped(path)
     shutil.rmtree(dropped, ignore_errors=True)
-    if place.exists():
-        place.rename(dropped)
-    partial.rename(place)
+    if path.exists():
+        path.rename(dropped)
+    partial.rename(path)
     shutil.rmtree(dropped, ignore_errors=True)
 
 
-def restore(place: Path) -> None:
-    """Gives a folder its name back which `take_place` had taken away, where a kill came
-    before the new one had it.
-    """
-    if _dropped(place).exists() and not place.exists():
-        with suppress(FileNotFoundError):  # another process was quicker
-            _dropped(place).rename(place)
+def restore(path: Path) -> None:
+    """Undo an interrupted `take_place`, which had renamed the old folder."""
+    dropped = _dropped(path)
+    if dropped.exists() and not path.exists():
+        with suppress(FileNotFoundError):  # another process has restored it
+            dropped.rename(path)
 
 
-def _dropped(place: Path) -> Path:
-    return place.with_name(f".{place.name}.dropped")
+def _dropped(path: Path) -> Path:
+    return path.with_name(f".{path.name}.dropped")
 
 
 def seal(content: Mapping[str, Any]) -> str:
-    """Writes plain data as JSON that holds the SHA-256 of all else in it under `SEAL`."""
+    """Return plain data as JSON, with its SHA-256 under the key `SEAL`."""
     content = {name: value for name, value in content.items() if name != SEAL}
     return json.dumps({**content, SEAL: text_digest(content)}, indent=1)
 
 
 def unseal(text: str | bytes) -> dict[str, Any]:
-    """Reads what `seal` wrote, without the digest.
+    """Return the data in a text of `seal`, without the digest.
 
     Raises:
-        ValueError: it is no JSON object, or was changed since.
+        ValueError: If the text is not a JSON object, or does not match its digest.
     """
     content = json.loads(text)
     if not isinstance(content, dict):
@@ -273,41 +266,41 @@ def unseal(text: str | bytes) -> dict[str, Any]:
 
 
 def text_digest(content: Any) -> str:
-    """SHA-256 of plain data, whatever the order of its keys."""
-    return hashlib.sha256(
-        json.dumps(content, sort_keys=True, separators=(",", ":")).encode()
-    ).hexdigest()
+    """Return the SHA-256 of plain data, independent of the order of keys."""
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 @dataclass(frozen=True, kw_only=True)
 class Shard:
-    """A share of some work that several machines do apart, written 2/5 on the command
-    line.
+    """Part of some work that one of several machines does, written as 2/5.
 
     Args:
-        index: which one, from 1 on.
-        of: how many there are.
+        index: number of the shard, from 1 to `of`.
+        of: number of all shards.
+
+    Raises:
+        ConfigError: If `index` is out of range.
     """
 
     index: int
     of: int
 
     def __post_init__(self) -> None:
-        """Refuses one that is none of them."""
+        """Check the range of the index."""
         if not 1 <= self.index <= self.of:
             raise ConfigError(f"Expected `shard` I/N with 1 ≤ I ≤ N, got {self}.")
 
     def __str__(self) -> str:
-        """As it is written on the command line."""
+        """Return the shard as on the command line, such as 2/5."""
         return f"{self.index}/{self.of}"
 
 
 def read_shard(text: str) -> Shard | None:
-    """Reads a shard as it is written on the command line; None of an empty text, which
-    means all.
+    """Return the shard of a text such as 2/5, or None (all work) if it is empty.
 
     Raises:
-        ConfigError: it is no such text.
+        ConfigError: If the text has another form, or the index is out of range.
     """
     if not text:
         return None
@@ -318,16 +311,16 @@ def read_shard(text: str) -> Shard | None:
 
 
 def check_workers(jobs: int, backend: str, scheduler: str) -> None:
-    """Refuse numbers and kinds of workers that no machine has.
+    """Check the number and kind of workers.
 
     Args:
-        jobs: worker processes of this machine.
+        jobs: number of worker processes on this machine, 1–`MAX_JOBS`.
         backend: "local" or "dask".
-        scheduler: address of a Dask cluster's scheduler; empty for none.
+        scheduler: address of a Dask cluster's scheduler; empty without a cluster.
 
     Raises:
-        ConfigError: If there is none or more than `MAX_JOBS`, or a cluster without an
-            address or the reverse.
+        ConfigError: If `jobs` is out of range, or only one of the backend dask and an
+            address is given.
     """
     expect(1 <= jobs <= MAX_JOBS, f"`jobs` in 1–{MAX_JOBS}, got {jobs}.")
     expect(

@@ -1,8 +1,7 @@
-"""Tables as text, and one way of writing each: in Markdown, in LaTeX, and for a
-terminal.
+"""Tables of text, written as Markdown, as LaTeX, or for a terminal.
 
-The HTML page of a report reads the same value in its template. CSV holds numbers rather
-than text; pandas writes it.
+The template of a report's HTML page reads the same `Table`. CSV files contain numbers
+instead of text; pandas writes them.
 """
 
 import io
@@ -12,14 +11,14 @@ import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-# Stands for a number or a name that there is not.
+# Shown for a missing number or name.
 NOTHING = "–"
 
-# Wide enough for any table where there is no terminal to fit it into.
-_UNBROKEN = 400
-_WIDEST_LINE = 56  # of a list in a cell, that is not broken
+# Width without a terminal, enough for any table.
+_UNLIMITED_WIDTH = 400
+_MAX_LIST_WIDTH = 56  # up to which the lines of a list in a cell are not broken
 
-# Words before the characters that they begin with.
+# Longer texts precede the characters that they start with.
 _LATEX = {
     "λ̄": r"$\bar{\lambda}$",
     "λ̂": r"$\hat{\lambda}$",
@@ -57,40 +56,40 @@ _LATEX = {
     "¶": r"\P{}",
 }
 _LATEX |= {
-    raised: rf"\textsuperscript{{{digit}}}" for digit, raised in enumerate("⁰¹²³⁴⁵⁶⁷⁸⁹")
+    superscript: rf"\textsuperscript{{{digit}}}"
+    for digit, superscript in enumerate("⁰¹²³⁴⁵⁶⁷⁸⁹")
 }
-# Digits below the line, with the dots between them.
-_LOWERED = re.compile("[₀-₉]+(?:\\.[₀-₉]+)?")
-_RAISED = str.maketrans("₀₁₂₃₄₅₆₇₈₉", "0123456789")
-_WRITTEN = re.compile("|".join([_LOWERED.pattern, *map(re.escape, _LATEX)]))
+# Subscript digits, with dots between them.
+_SUBSCRIPT = re.compile("[₀-₉]+(?:\\.[₀-₉]+)?")
+_NORMAL_DIGITS = str.maketrans("₀₁₂₃₄₅₆₇₈₉", "0123456789")
+_ESCAPED = re.compile("|".join([_SUBSCRIPT.pattern, *map(re.escape, _LATEX)]))
 _MINUS = re.compile(r"(?<![\w-])-(?=\d)")
 _COLOUR = re.compile(r"#[0-9a-f]{6}")
 
 
 class Bold(str):
-    """A cell of a table that is set in bold."""
+    """Table cell in bold."""
 
     bold = True
 
 
 @dataclass(frozen=True, kw_only=True)
 class Table:
-    """A table as text.
+    """Table of text.
 
     Args:
-        headings: one a column, those of labels first; a line break within one is kept
-            in a terminal alone.
-        rows: a cell a column. What stands in brackets at a cell's end is set smaller in
-            LaTeX.
-        labels: number of columns that are labels.
-        numbers: whether the other columns hold a number each, which is set right.
-        title: over the table, in a terminal alone.
-        notes: lines under the table.
-        bold_note: what bold means.
-        explained: what columns hold, (heading, sentence).
-        groups: titles over the columns that are no labels, each over as many, in LaTeX
-            alone.
-        rules: rows that a line is drawn over, in LaTeX alone.
+        headings: one heading per column, labels first. Only a terminal keeps a line
+            break in a heading.
+        rows: rows with one cell per column. LaTeX sets brackets at the end of a cell in
+            a smaller font.
+        labels: number of leading columns that are labels.
+        numbers: whether the other columns contain numbers, which are aligned right.
+        title: title above the table, only in a terminal.
+        notes: lines below the table.
+        bold_note: meaning of bold cells.
+        explained: meanings of columns, as (heading, sentence).
+        groups: titles above equally many columns that are not labels, only in LaTeX.
+        rules: indices of rows with a rule above them, only in LaTeX.
     """
 
     headings: tuple[str, ...]
@@ -106,30 +105,21 @@ class Table:
 
 
 def to_markdown(table: Table) -> str:
-    """Writes a table in Markdown, with its notes under it and what its columns hold."""
-    right = "---:" if table.numbers else "---"
-    lines = [
-        _markdown_row(markdown(_one_line(heading)) for heading in table.headings),
-        "|"
-        + "---|" * table.labels
-        + f"{right}|" * (len(table.headings) - table.labels),
-    ]
-    for row in table.rows:
-        cells = (
-            f"**{markdown(cell)}**" if isinstance(cell, Bold) else markdown(cell)
-            for cell in row
-        )
-        lines.append(_markdown_row(cells))
-    notes = [*table.notes, *([f"Bold: {table.bold_note}"] if table.bold_note else [])]
+    """Return a table in Markdown, with notes and meanings of columns below it."""
+    headings = [markdown(_one_line(heading)) for heading in table.headings]
+    label_rules = "---|" * table.labels
+    rule = "---:|" if table.numbers else "---|"
+    value_rules = rule * (len(headings) - table.labels)
+    lines = [_markdown_row(headings), f"|{label_rules}{value_rules}"]
+    lines += [_markdown_row(map(_markdown_cell, row)) for row in table.rows]
+    notes = [*table.notes]
+    if table.bold_note:
+        notes.append(f"Bold: {table.bold_note}")
     lines += [f"\n{markdown(note)}" for note in notes]
     if table.explained:
-        lines += [
-            "",
-            *(
-                f"- **{markdown(heading)}**: {markdown(text)}"
-                for heading, text in table.explained
-            ),
-        ]
+        lines.append("")
+    for heading, meaning in table.explained:
+        lines.append(f"- **{markdown(heading)}**: {markdown(meaning)}")
     return "\n".join([*lines, ""])
 
 
@@ -140,75 +130,72 @@ def to_latex(
     wide: bool = True,
     size: str = "scriptsize",
 ) -> str:
-    """Writes a complete environment, with notes under the tables. Needs LaTeX's
-    `booktabs` and nothing else.
+    """Return a LaTeX environment with notes below its tables; it needs `booktabs`.
 
     Args:
-        tables: one, or several under each other; labels are set left, all else is
+        tables: tables to stack vertically. Labels are aligned left, other columns
             centred.
-        caption: what is shown.
-        label: what it is referred to by.
-        wide: as wide as the page, not as a column.
-        size: of the text, one of LaTeX's.
+        caption: caption of the environment.
+        label: name for cross-references, without "tab:".
+        wide: whether the environment spans the page instead of a column.
+        size: LaTeX font size, such as "scriptsize".
     """
     environment = "table*" if wide else "table"
+    label = re.sub(r"[^A-Za-z0-9.:_-]+", "-", label)
     notes = dict.fromkeys(note for table in tables for note in table.notes)
-    return "\n".join(
-        [
-            rf"\begin{{{environment}}}[t]",
-            r"  \centering",
-            rf"  \caption{{{latex(caption)}}}",
-            rf"  \label{{tab:{re.sub(r'[^A-Za-z0-9.:_-]+', '-', label)}}}",
-            rf"  \{size}",
-            r"  \setlength{\tabcolsep}{3pt}",
-            "\n  \\par\\medskip\n".join(map(_tabular, tables)),
-            *(rf"  \par\smallskip\raggedright {latex(note)}" for note in notes),
-            rf"\end{{{environment}}}",
-            "",
-        ]
-    )
+    lines = [
+        rf"\begin{{{environment}}}[t]",
+        r"  \centering",
+        rf"  \caption{{{latex(caption)}}}",
+        rf"  \label{{tab:{label}}}",
+        rf"  \{size}",
+        r"  \setlength{\tabcolsep}{3pt}",
+        "\n  \\par\\medskip\n".join(map(_tabular, tables)),
+    ]
+    lines += [rf"  \par\smallskip\raggedright {latex(note)}" for note in notes]
+    lines += [rf"\end{{{environment}}}", ""]
+    return "\n".join(lines)
 
 
 def _tabular(table: Table) -> str:
-    numbers = len(table.headings) - table.labels
-    lines = [
-        r"  \begin{tabular}{" + "l" * table.labels + "c" * numbers + "}",
-        r"    \toprule",
-    ]
+    n_values = len(table.headings) - table.labels
+    alignment = "l" * table.labels + "c" * n_values
+    lines = [rf"  \begin{{tabular}}{{{alignment}}}", r"    \toprule"]
     if table.groups:
-        width = numbers // len(table.groups)
-        titles = [
-            rf"\multicolumn{{{width}}}{{c}}{{{latex(title)}}}" for title in table.groups
-        ]
+        width = n_values // len(table.groups)
+        group = rf"\multicolumn{{{width}}}{{c}}"
+        titles = [f"{group}{{{latex(title)}}}" for title in table.groups]
         ends = range(table.labels + width, len(table.headings) + 1, width)
         lines.append(_latex_row([*[""] * table.labels, *titles]))
-        lines.append(
-            "    "
-            + " ".join(rf"\cmidrule(lr){{{end - width + 1}-{end}}}" for end in ends)
-        )
-    lines += [
-        _latex_row(latex(_one_line(heading)) for heading in table.headings),
-        r"    \midrule",
-    ]
-    for place, row in enumerate(table.rows):
-        lines += [r"    \midrule"] if place in table.rules else []
+        rules = [rf"\cmidrule(lr){{{end - width + 1}-{end}}}" for end in ends]
+        lines.append(f"    {' '.join(rules)}")
+    headings = [latex(_one_line(heading)) for heading in table.headings]
+    lines += [_latex_row(headings), r"    \midrule"]
+    for index, row in enumerate(table.rows):
+        if index in table.rules:
+            lines.append(r"    \midrule")
         lines.append(_latex_row(map(_latex_cell, row)))
     return "\n".join([*lines, r"    \bottomrule", r"  \end{tabular}"])
 
 
 def _latex_cell(cell: str) -> str:
-    """A cell whose brackets at its end, such as of an interval, are set smaller and
-    never in bold.
-    """
-    value, space, bracket = (
-        cell.rpartition(" (") if cell.endswith(")") else (cell, "", "")
-    )
-    written = rf"\textbf{{{latex(value)}}}" if isinstance(cell, Bold) else latex(value)
-    return rf"{written} {{\scriptsize ({latex(bracket)}}}" if space else written
+    """Return a cell for LaTeX; brackets at its end are smaller and never bold."""
+    value, bracket = cell, ""
+    if cell.endswith(")") and " (" in cell:
+        value, _, bracket = cell.rpartition(" (")
+    escaped = latex(value)
+    if isinstance(cell, Bold):
+        escaped = rf"\textbf{{{escaped}}}"
+    return rf"{escaped} {{\scriptsize ({latex(bracket)}}}" if bracket else escaped
 
 
 def _latex_row(cells: Iterable[str]) -> str:
     return f"    {' & '.join(cells)} \\\\"
+
+
+def _markdown_cell(cell: str) -> str:
+    escaped = markdown(cell)
+    return f"**{escaped}**" if isinstance(cell, Bold) else escaped
 
 
 def _markdown_row(cells: Iterable[str]) -> str:
@@ -220,82 +207,80 @@ def _one_line(heading: str) -> str:
 
 
 def latex(text: str) -> str:
-    """Escapes text for LaTeX; a hyphen before a number of its own is a minus."""
-    return _WRITTEN.sub(_latex_of, _MINUS.sub("−", text))
+    """Escape text for LaTeX; a hyphen before a separate number becomes a minus."""
+    return _ESCAPED.sub(_latex_of, _MINUS.sub("−", text))
 
 
-def _latex_of(found: re.Match[str]) -> str:
-    lowered = found[0].translate(_RAISED)
-    return _LATEX.get(found[0]) or rf"$_{{{lowered}}}$"
+def _latex_of(match: re.Match[str]) -> str:
+    digits = match[0].translate(_NORMAL_DIGITS)
+    return _LATEX.get(match[0]) or rf"$_{{{digits}}}$"
 
 
 def markdown(text: str) -> str:
-    """Escapes text for Markdown."""
+    """Escape text for Markdown."""
     return re.sub(r"[\\|*<`]", r"\\\g<0>", text)
 
 
 def to_terminal(table: Table, width: int | None = None, styled: bool = False) -> str:
-    """Draws a table for a terminal, with its notes under it; a colour such as #00ff00
-    is shown beside its code.
+    """Return a table as text for a terminal, with notes below it.
 
     Args:
-        table: what to draw.
-        width: columns of the terminal; not limited when not given.
-        styled: set bold cells in bold and show colours; else a star stands behind bold
-            cells.
+        table: table to write.
+        width: columns of the terminal; None for no limit.
+        styled: whether to set bold cells in bold and to show the colour of codes such
+            as #00ff00. Otherwise, an asterisk follows bold cells.
     """
     from rich import box
     from rich.console import Console
     from rich.markup import escape
-    from rich.table import Table as Drawn
+    from rich.table import Table as RichTable
 
-    bold_note = (
-        [f"{'Bold' if styled else '*'}: {table.bold_note}"] if table.bold_note else []
-    )
     console = Console(
         file=io.StringIO(),
-        width=width or _UNBROKEN,
+        width=width or _UNLIMITED_WIDTH,
         force_terminal=styled,
         color_system="256" if styled else None,
         highlight=False,
     )
-    drawn = Drawn(
+    rich_table = RichTable(
         box=box.SIMPLE_HEAD,
         show_edge=False,
         padding=(0, 0 if table.numbers else 1, 0, 0),
     )
     for column, heading in enumerate(table.headings):
         is_number = table.numbers and column >= table.labels
-        # A list of lines that are not too long keeps them whole.
+        # The lines of a list are not broken, unless they are too long.
         cells = [row[column] for row in table.rows]
         lines = [line for cell in cells for line in cell.splitlines()]
-        is_list = len(lines) > len(cells) and max(map(len, lines)) <= _WIDEST_LINE
-        drawn.add_column(
+        is_list = len(lines) > len(cells) and max(map(len, lines)) <= _MAX_LIST_WIDTH
+        rich_table.add_column(
             escape(heading),
             justify="right" if is_number else "left",
             no_wrap=is_number or is_list,
             overflow="fold",
         )
 
-    def drawn_cell(text: str) -> str:
-        if isinstance(text, Bold):
-            return f"[bold]{escape(text)}[/bold]" if styled else f"{escape(text)}*"
-        return (
-            f"[on {text}]  [/] {text}"
-            if styled and _COLOUR.fullmatch(text)
-            else escape(text)
-        )
+    def marked_up(cell: str) -> str:
+        if isinstance(cell, Bold):
+            return f"[bold]{escape(cell)}[/bold]" if styled else f"{escape(cell)}*"
+        if styled and _COLOUR.fullmatch(cell):
+            return f"[on {cell}]  [/] {cell}"
+        return escape(cell)
 
     for row in table.rows:
-        drawn.add_row(*map(drawn_cell, row))
-    # Square brackets are markup.
+        rich_table.add_row(*map(marked_up, row))
+    # `escape`, because square brackets are markup.
     title = [f"[bold]{escape(table.title)}[/bold]"] if table.title else []
-    console.print(*title, drawn, *map(escape, (*table.notes, *bold_note)), sep="\n")
+    notes = [escape(note) for note in table.notes]
+    if table.bold_note:
+        mark = "Bold" if styled else "*"
+        notes.append(escape(f"{mark}: {table.bold_note}"))
+    console.print(*title, rich_table, *notes, sep="\n")
     return console.file.getvalue()  # type: ignore[attr-defined]
 
 
 def print_table(table: Table) -> None:
-    """Prints a table as wide as the terminal, or unbroken where none is."""
+    """Print a table at the width of the terminal, or without limit elsewhere."""
     is_terminal = sys.stdout.isatty()
     width = shutil.get_terminal_size().columns if is_terminal else None
     print(to_terminal(table, width, styled=is_terminal).rstrip())

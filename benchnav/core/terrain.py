@@ -1,6 +1,6 @@
-"""Terrain value types: what is true of the ground, and what a robot may see of it.
+"""Terrain value types: the true terrain and its observation.
 
-Traversability is in [0, 1] and higher is better. Letters in shapes: B maps, H×W cells.
+Traversability is in [0, 1]; higher is better. Letters in shapes: B maps, H×W cells.
 """
 
 from collections.abc import Callable, Mapping
@@ -18,15 +18,15 @@ from benchnav.core.mixture import TraversabilityMixture
 
 @dataclass(frozen=True)
 class Observation(Batch):
-    """The paper's o: all that a traversability model may see.
+    """Observation o of the paper: the complete input of a traversability model.
 
     Args:
         rgb: top-down colour image, uint8, shape [B, 3, H, W].
-        elevation_m: shape [B, H, W].
-        slope_deg: inclination by Horn's method, shape [B, H, W].
-        grid: size and resolution.
-        layers: what else there is of the ground, by name, such as `vegetation_m`;
-            float32, NaN where nothing is known, each of shape [B, H, W].
+        elevation_m: elevation in metres, shape [B, H, W].
+        slope_deg: inclination in degrees by Horn's method, shape [B, H, W].
+        grid: size and resolution of the maps.
+        layers: optional layers by name, such as `vegetation_m`; float32, NaN where
+            missing, each of shape [B, H, W].
     """
 
     rgb: Tensor
@@ -36,7 +36,7 @@ class Observation(Batch):
     layers: Mapping[str, Tensor] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Checks that the layers fit the grid and one another."""
+        """Check dtypes and shapes against the grid."""
         batch = self.rgb.shape[0]
         maps = {"elevation_m": self.elevation_m, "slope_deg": self.slope_deg}
         _check_shapes(self.grid, batch, maps, self.layers)
@@ -50,23 +50,23 @@ class Observation(Batch):
 
 @dataclass(frozen=True, kw_only=True)
 class Terrain(Batch):
-    """The ground as it is. Only the simulation and the `oracle` model are given this.
+    """True terrain, which only the simulation and the `oracle` model receive.
 
     Args:
-        rgb: uint8, shape [B, 3, H, W].
-        class_id: index into the dataset's class table, 255 where the class is not
-            known, shape [B, H, W].
-        elevation_m: shape [B, H, W].
-        slope_deg: shape [B, H, W].
-        truth: the true distribution of λ in each cell, parameters of shape [B, K, H,
-            W]: of the cell's own class at its slope, and of its soft spots where the
-            class has them. Means are NaN where the class is not known.
-        traversability: one realised λ, shape [B, H, W].
-        grid: size and resolution.
-        look_alikes: gives what colours can tell of a terrain at best: in each cell the
-            truth of all classes that look like the cell's own, weighted by how often
-            they do; None where no two classes look alike, so that it is the truth.
-        layers: optional fields, by name, as an `Observation` has them.
+        rgb: top-down colour image, uint8, shape [B, 3, H, W].
+        class_id: index into the dataset's class table, 255 where the cell is
+            unlabelled, shape [B, H, W].
+        elevation_m: elevation in metres, shape [B, H, W].
+        slope_deg: inclination in degrees, shape [B, H, W].
+        truth: true distribution of λ in each cell, for its class and slope, with the
+            soft spots of the class; parameters of shape [B, K, H, W]. Means are NaN in
+            unlabelled cells.
+        traversability: one realisation of λ, shape [B, H, W].
+        grid: size and resolution of the maps.
+        look_alikes: returns the best prediction of λ from colour. In each cell it mixes
+            the distributions of the look-alike classes, weighted by their frequency.
+            None if no classes are look-alikes; the best prediction is then `truth`.
+        layers: optional layers by name, as in `Observation`.
     """
 
     rgb: Tensor
@@ -80,7 +80,7 @@ class Terrain(Batch):
     layers: Mapping[str, Tensor] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Checks that the layers fit the grid and one another."""
+        """Check dtypes and shapes against the grid."""
         maps = {
             "class_id": self.class_id,
             "elevation_m": self.elevation_m,
@@ -91,35 +91,38 @@ class Terrain(Batch):
         _check_shapes(self.grid, self.rgb.shape[0], maps, self.layers)
 
     def __len__(self) -> int:
-        """Number of maps B."""
+        """Return the number of maps B."""
         return self.rgb.shape[0]
 
     def observe(self) -> Observation:
-        """Gives the Observation of these maps: colour, elevation, slope, grid, layers,
-        and nothing else.
-        """
+        """Return the observation of these maps, without class, truth and λ."""
         return Observation(
             self.rgb, self.elevation_m, self.slope_deg, self.grid, self.layers
         )
 
 
 def take_cells(observation: Observation, rows: Any, columns: Any) -> Observation:
-    """Cells of an observation as a map of their own, by slices or by indices that
-    broadcast to [h, w].
+    """Return selected cells of an observation as a map.
+
+    Args:
+        observation: maps of shape [B, H, W].
+        rows: slice or indices; indices of rows and columns broadcast to [h, w].
+        columns: slice or indices.
+
+    Returns:
+        An observation with maps of shape [B, h, w].
     """
 
-    def change(value: Any) -> Any:
+    def select(value: Any) -> Any:
         if isinstance(value, Mapping):
-            return {name: change(layer) for name, layer in value.items()}
+            return {name: select(layer) for name, layer in value.items()}
         return value[..., rows, columns] if isinstance(value, Tensor) else value
 
-    taken = {
-        each.name: change(getattr(observation, each.name))
-        for each in fields(observation)
-    }
-    height, width = taken["rgb"].shape[-2:]
-    grid = Grid(height, width, observation.grid.resolution_m)
-    return replace(observation, **taken | {"grid": grid})
+    names = [attribute.name for attribute in fields(observation)]
+    selected = {name: select(getattr(observation, name)) for name in names}
+    height, width = selected["rgb"].shape[-2:]
+    selected["grid"] = Grid(height, width, observation.grid.resolution_m)
+    return replace(observation, **selected)
 
 
 def _check_shapes(
@@ -135,5 +138,5 @@ def _check_shapes(
     for name, values in layers.items():
         expect(
             name not in maps and name != "rgb" and values.dtype == torch.float32,
-            f"layer `{name}` as float32 under a name of its own, got {values.dtype}.",
+            f"layer `{name}` as float32 with a unique name, got {values.dtype}.",
         )

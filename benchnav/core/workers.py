@@ -1,6 +1,6 @@
-"""Calls made elsewhere: in processes of this machine, or on a Dask cluster.
+"""Parallel calls in processes of this machine or on a Dask cluster.
 
-`distributed` is an extra of this package, imported when a cluster is asked for.
+`distributed` is an optional dependency, imported only for a cluster.
 """
 
 import os
@@ -25,9 +25,9 @@ from joblib.externals.loky.backend.utils import kill_process_tree
 from benchnav.core.errors import BenchnavError, ConfigError, quiet
 from benchnav.core.touched import THREADS
 
-_LOOK_S = 0.5
-_REACH_S = 5
-_WORKERS_S = 10
+_POLL_S = 0.5
+_REACH_S = 5  # time limit of a connection to the scheduler
+_WORKERS_S = 10  # time limit of workers to appear or return a result
 
 Result = TypeVar("Result")
 
@@ -35,24 +35,23 @@ Result = TypeVar("Result")
 def run_calls(
     calls: Sequence[Callable[[], Result]], jobs: int = 1, scheduler: str = ""
 ) -> Iterator[Result]:
-    """Makes calls and yields what they return, each as it is done, in any order; the
-    first error ends it.
+    """Run calls in parallel and yield their results in order of completion.
 
-    Worker processes outlive the calls for some minutes, so that the next ones find them
-    ready. So what they need to know of this process, such as its folder, belongs into
-    the calls.
+    The first error ends the iteration. Worker processes remain for some minutes, so
+    that later calls start quickly. Calls must therefore contain all state of this
+    process that they need, such as its working directory.
 
     Args:
-        calls: what is done, such as `functools.partial` of a function; sent to other
+        calls: functions without arguments, such as `functools.partial`; sent to other
             processes with cloudpickle.
-        jobs: processes of this machine; 1 makes the calls in this one, one after the
-            other.
-        scheduler: address of a Dask cluster's scheduler, whose workers take their
-            place; empty for none.
+        jobs: number of worker processes on this machine; 1 runs the calls sequentially
+            in this process.
+        scheduler: address of a Dask cluster's scheduler, whose workers replace those of
+            this machine; empty without a cluster.
 
     Raises:
-        ConfigError: the cluster cannot be reached, or has no worker.
-        BenchnavError: a worker was killed, or the cluster was lost.
+        ConfigError: If the cluster cannot be reached, or has no worker.
+        BenchnavError: If a worker was killed, or the cluster was lost.
     """
     if scheduler:
         yield from _run_on_cluster(calls, scheduler)
@@ -64,18 +63,18 @@ def run_calls(
 
 @cache
 def end_with(parent: int) -> None:
-    """Ends this process when its parent is gone, which a kill tells no worker; once a
-    process is enough.
+    """End this process when its parent ends, even if the parent is killed.
+
+    Further calls in the same process have no effect.
 
     Args:
-        parent: number of the process that started this one. It is given, since a worker
-            that is still on its way up when its parent is killed would take the process
-            that adopts it for its parent.
+        parent: ID of the process that started this one. A worker cannot read it: if the
+            parent is killed during start-up, the worker has another parent already.
     """
 
     def watch() -> None:
         while os.getppid() == parent:
-            time.sleep(_LOOK_S)
+            time.sleep(_POLL_S)
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
@@ -84,39 +83,37 @@ def end_with(parent: int) -> None:
 def _run_in_processes(
     calls: Sequence[Callable[[], Result]], jobs: int
 ) -> Iterator[Result]:
-    # Processes that share the processors should not each take all of them.
+    # By default, each process would start one thread per processor.
     threads = {name: os.environ.get(name, "1") for name in THREADS}
     executor = get_reusable_executor(
         jobs, timeout=300, initializer=end_with, initargs=(os.getpid(),), env=threads
     )
-    # A worker whose memory has grown is replaced; that is no concern of a user's.
+    # A worker whose memory has grown is replaced, which needs no action of users.
     warnings.filterwarnings(
         "ignore", message="A worker stopped while some jobs were given"
     )
-    # Not `concurrent.futures.wait`: an interruption in the midst of it would leave a
-    # future locked for good.
-    waiting, pending, done = (
-        iter(calls),
-        set[Future[Result]](),
-        SimpleQueue[Future[Result]](),
-    )
+    # `concurrent.futures.wait` would leave a future locked after an interruption.
+    remaining = iter(calls)
+    pending = set[Future[Result]]()
+    done = SimpleQueue[Future[Result]]()
     try:
-        # Few at a time, so that results do not pile up.
-        while pending := pending | _submit(
-            executor, islice(waiting, jobs + 1 - len(pending)), done.put
-        ):
+        while True:
+            # Only a few at a time, so that results do not accumulate.
+            next_calls = islice(remaining, jobs + 1 - len(pending))
+            pending |= _submit(executor, next_calls, done.put)
+            if not pending:
+                break
             future = _wait_for_one(executor, done)
             pending.remove(future)
             yield future.result()
     except BrokenProcessPool as error:
         raise BenchnavError(
             "A worker was killed, perhaps for lack of memory. Finished work is kept: "
-            "give the same command again, "
-            "if need be with fewer `jobs`."
+            "give the same command again, if necessary with fewer `jobs`."
         ) from error
     finally:
-        # nobody waits for them; the library's own way to end them fails while it hands
-        # a call over
+        # Their results are not needed. The executor's own method to end processes fails
+        # while it sends a call.
         if pending:
             for process in list(executor._processes.values()):
                 kill_process_tree(process)
@@ -126,8 +123,8 @@ def _run_in_processes(
 def _wait_for_one(executor: Any, done: SimpleQueue[Future[Result]]) -> Future[Result]:
     """Return the next future that is done.
 
-    The executor usually notices that a worker was killed. On a loaded machine it was
-    seen to wait for results after its last worker had gone, which this notices.
+    The executor usually detects a killed worker. On a loaded machine, it was observed
+    to wait for results after its last worker had ended, which this function detects.
 
     Raises:
         BrokenProcessPool: If no worker is alive.
@@ -139,7 +136,7 @@ def _wait_for_one(executor: Any, done: SimpleQueue[Future[Result]]) -> Future[Re
             workers = list(executor._processes.values())
             if any(worker.is_alive() for worker in workers):
                 continue
-        # A result may have come between the two looks.
+        # A result may have arrived since the timeout.
         if done.empty():
             raise BrokenProcessPool("no worker is alive")
 
@@ -147,20 +144,20 @@ def _wait_for_one(executor: Any, done: SimpleQueue[Future[Result]]) -> Future[Re
 def _submit(
     executor: Any,
     calls: Iterable[Callable[[], Result]],
-    tell: Callable[[Future[Result]], None],
+    on_done: Callable[[Future[Result]], None],
 ) -> set[Future[Result]]:
-    """Hands calls over, each to be told of when it is done.
+    """Submit calls and return their futures, each with a callback on completion.
 
-    Processes that are started for them inherit that they hear no interruption: it is
-    for this process to act on, and would find them in the middle of their imports.
+    Processes that start for them inherit that interruptions are blocked. Only this
+    process reacts to an interruption, which would otherwise break their imports.
     """
-    # its start, which the first process would need, ends the blocking
+    # The tracker's start ends the blocking, so it comes first.
     resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         futures = {executor.submit(call) for call in calls}
         for future in futures:
-            future.add_done_callback(tell)
+            future.add_done_callback(on_done)
         return futures
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
@@ -173,10 +170,9 @@ def _run_on_cluster(
         from distributed import CancelledError, KilledWorker, as_completed
 
         try:
-            # All at once, so that workers that join later have their share.
-            for future in as_completed(
-                (client.submit(call, pure=False) for call in calls), client.loop
-            ):
+            # All at once, so that workers that join later also receive calls.
+            futures = (client.submit(call, pure=False) for call in calls)
+            for future in as_completed(futures, client.loop):
                 yield future.result()
         except CancelledError as error:
             raise BenchnavError(
@@ -186,20 +182,21 @@ def _run_on_cluster(
         except KilledWorker as error:
             raise BenchnavError(
                 "A task was dropped; it killed several workers, the last at "
-                f"{error.last_worker.address}: "
-                "see their logs, perhaps for lack of memory. Finished work is kept."
+                f"{error.last_worker.address}, perhaps for lack of memory. Finished "
+                "work is kept. See the logs of the workers."
             ) from error
 
 
 @contextmanager
 def connected(scheduler: str) -> Iterator[Any]:
-    """A client of a cluster that has workers.
+    """Yield a client of a cluster that has workers.
 
     Args:
         scheduler: address, such as tcp://127.0.0.1:8786.
 
     Raises:
-        ConfigError: the scheduler cannot be reached, or has no worker.
+        ConfigError: If Dask is not installed, or the scheduler cannot be reached or has
+            no worker.
     """
     try:
         from distributed import Client
@@ -208,12 +205,12 @@ def connected(scheduler: str) -> Iterator[Any]:
             f"Expected Dask for a cluster, got: {error}. Install it: pip install "
             "'benchnav[dask]'"
         ) from error
-    place = urlparse(scheduler)
+    address = urlparse(scheduler)
     try:
-        known = place.scheme in ("tcp", "tls") and place.hostname and place.port
-    except ValueError:  # a port that is no number
-        known = False
-    if not known:
+        has_host = address.hostname and address.port
+    except ValueError:  # the port is not a number
+        has_host = False
+    if not has_host or address.scheme not in ("tcp", "tls"):
         raise ConfigError(f"Expected `scheduler` tcp://HOST:PORT, got {scheduler!r}.")
     with ExitStack() as stack:
         stack.enter_context(quiet("distributed", "distributed.client"))
@@ -224,14 +221,14 @@ def connected(scheduler: str) -> Iterator[Any]:
         except (OSError, ValueError) as error:
             raise ConfigError(
                 "Expected `scheduler` to be the address of a running Dask scheduler, "
-                f"got {scheduler}, which gave "
-                f"no answer within {_REACH_S} s. Start one with `dask scheduler`."
+                f"got {scheduler} and no answer within {_REACH_S} s. Start one with "
+                "`dask scheduler`."
             ) from error
         try:
             client.wait_for_workers(1, timeout=_WORKERS_S)
         except TimeoutError as error:
             raise ConfigError(
-                f"Expected a cluster with workers, got {scheduler} with none for "
+                f"Expected a cluster with workers, got {scheduler} without any for "
                 f"{_WORKERS_S} s. Start some with "
                 f"`dask worker {scheduler} --nworkers N --nthreads 1`."
             ) from error

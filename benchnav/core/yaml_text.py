@@ -1,9 +1,8 @@
-"""YAML that users write: plain data in one reading, or one line that says what is wrong
-with it.
+"""Plain data from YAML that users write, with errors of one line.
 
-YAML allows what no setting means: a key twice, a list in itself, a page that stands for
-a billion values. Such text is refused before it is built. Numbers are as in YAML 1.2,
-so that 1e-3 is one, and a date is text.
+YAML allows duplicate keys, a list that contains itself, and a page whose aliases stand
+for a billion values. Such text is rejected before any value is built. Numbers follow
+YAML 1.2, so that 1e-3 is a number, and a date is text.
 """
 
 import re
@@ -15,9 +14,9 @@ from typing import Any
 
 from benchnav.core.errors import ConfigError, check_text
 
-MAX_DEPTH = 100  # mappings and lists within one another
+MAX_DEPTH = 100  # of nested mappings and lists
 MAX_DIGITS = 100
-MAX_VALUES = 100_000  # with what aliases stand for
+MAX_VALUES = 100_000  # with aliases expanded
 
 _TAG = "tag:yaml.org,2002:"
 _NOT_PLAIN = ("timestamp", "binary", "set", "omap", "pairs")
@@ -32,193 +31,191 @@ _FLOAT = re.compile(
 )
 
 
-def load_yaml(text: str, place: str = "") -> Any:
-    """Reads YAML in which 1e-3 is a number.
+def load_yaml(text: str, source: str = "") -> Any:
+    """Return the value of YAML, in which 1e-3 is a number.
 
     Args:
         text: the YAML.
-        place: where it stands, for messages.
+        source: path or name of the text, for messages.
 
     Raises:
-        ConfigError: If it is no YAML, holds a key twice, an alias within what it stands
-            for, or values that are not plain, or more than `MAX_VALUES` values or
-            `MAX_DEPTH` levels.
+        ConfigError: If `text` is invalid YAML, or has a duplicate key, an alias within
+            its own anchor, a value that is not plain data, more than `MAX_VALUES`
+            values or more than `MAX_DEPTH` levels.
     """
     import yaml
 
     try:
-        loader, node = _composed(text, place)
+        loader, node = _compose(text, source)
         return None if node is None else loader.construct_document(node)
     except ConfigError:
         raise
-    except (
-        yaml.YAMLError,
-        ValueError,
-        KeyError,
-    ) as error:  # `!!int many`, `!!bool perhaps`
-        mark, problem = (
-            getattr(error, "problem_mark", None),
-            getattr(error, "problem", None),
-        )
-        raise _refusal(text, place, problem or str(error), mark) from error
+    # `!!int many` raises ValueError, `!!bool perhaps` KeyError.
+    except (yaml.YAMLError, ValueError, KeyError) as error:
+        mark = getattr(error, "problem_mark", None)
+        problem = getattr(error, "problem", None)
+        raise _error(text, source, problem or str(error), mark) from error
 
 
 def read_yaml(path: Path) -> Any:
-    """Reads a YAML file; see `load_yaml`.
+    """Return the value of a YAML file; see `load_yaml`.
 
     Raises:
-        ConfigError: If it cannot be read, or is no YAML.
+        ConfigError: If the file cannot be read, or `load_yaml` rejects its text.
     """
     try:
         return load_yaml(path.read_text(), str(path))
     except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is no text"
+        reason = error.strerror if isinstance(error, OSError) else "it is not text"
         raise ConfigError(
             f"Expected a YAML file, got {str(path)!r}: {reason}."
         ) from error
 
 
 def check_yaml(text: str) -> None:
-    """Raises where text is YAML that `load_yaml` would not build; text that is no YAML
-    passes.
+    """Check valid YAML for the limits of `load_yaml`; invalid YAML passes.
 
     Raises:
-        ConfigError: If it holds a key twice, an alias within what it stands for, or too
-            much.
+        ConfigError: If `text` has a duplicate key, an alias within its own anchor, or
+            too many values or levels.
     """
     import yaml
 
     try:
-        _composed(text, "")
+        _compose(text, "")
     except ConfigError:
         raise
     except (yaml.YAMLError, ValueError, KeyError):
         return
 
 
-def _composed(text: str, place: str) -> tuple[Any, Any]:
-    """A loader, and the node that it has composed of text; None where there is nothing."""
+def _compose(text: str, source: str) -> tuple[Any, Any]:
+    """Return a loader and its root node; the node of empty text is None."""
     import yaml
 
-    _check_nesting(text, place)
+    _check_nesting(text, source)
     loader = _loader()(text)
     node = loader.get_single_node()
     for inner in _nodes(node) if node is not None else ():
         if isinstance(inner, yaml.ScalarNode):
-            check_text(inner.value, place)
+            check_text(inner.value, source)
             if inner.tag == f"{_TAG}int" and len(inner.value) > MAX_DIGITS:
-                raise _refusal(
+                raise _error(
                     text,
-                    place,
+                    source,
                     f"a number of more than {MAX_DIGITS} digits",
                     inner.start_mark,
                 )
         elif isinstance(inner, yaml.MappingNode):
-            _check_keys(loader, inner, text, place)
+            _check_keys(loader, inner, text, source)
     return loader, node
 
 
-def _check_nesting(text: str, place: str) -> None:
-    """Reads events, which build nothing, so that no text is too deep or stands for too
-    much.
+def _check_nesting(text: str, source: str) -> None:
+    """Check the numbers of levels and values from parser events.
+
+    Events build no values, so that the check itself needs little memory.
     """
     import yaml
 
-    open_anchors: list[str | None] = []  # of what an event is in
-    starts: list[int] = []  # values before each of these
-    values, sizes = 0, Counter[str]()
+    open_anchors: list[str | None] = []  # of the collections around an event
+    starts: list[int] = []  # number of values before each of these
+    n_values = 0
+    sizes = Counter[str]()  # of anchored values, with aliases expanded
     for event in yaml.parse(text, Loader=_loader()):
         if isinstance(event, yaml.AliasEvent):
             if event.anchor in open_anchors:
-                raise _refusal(
+                raise _error(
                     text,
-                    place,
+                    source,
                     f"*{event.anchor} is within &{event.anchor}",
                     event.start_mark,
                 )
-            values += sizes[event.anchor or ""]
+            n_values += sizes[event.anchor or ""]
         elif isinstance(event, yaml.CollectionEndEvent):
-            anchor, start = open_anchors.pop(), starts.pop()
-            sizes[anchor or ""] = values - start
+            anchor = open_anchors.pop()
+            sizes[anchor or ""] = n_values - starts.pop()
         elif isinstance(event, yaml.NodeEvent):
-            values += 1
+            n_values += 1
             if isinstance(event, yaml.CollectionStartEvent):
                 open_anchors.append(event.anchor)
-                starts.append(values - 1)
+                starts.append(n_values - 1)
             else:
                 sizes[event.anchor or ""] = 1
         if len(open_anchors) > MAX_DEPTH:
-            raise _refusal(
+            raise _error(
                 text,
-                place,
+                source,
                 f"more than {MAX_DEPTH} levels of nesting",
                 event.start_mark,
             )
-        if values > MAX_VALUES:
-            raise _refusal(
-                text, place, f"more than {MAX_VALUES} values", event.start_mark
+        if n_values > MAX_VALUES:
+            raise _error(
+                text, source, f"more than {MAX_VALUES} values", event.start_mark
             )
 
 
 def _nodes(root: Any) -> Iterator[Any]:
-    """Yields each node once, the root among them."""
+    """Iterate over all nodes below a root and the root, each once."""
     import yaml
 
-    seen, waiting = set(), [root]
-    while waiting:
-        node = waiting.pop()
+    seen = set()
+    pending = [root]
+    while pending:
+        node = pending.pop()
         if id(node) in seen:
             continue
         seen.add(id(node))
         yield node
         if isinstance(node, yaml.MappingNode):
-            waiting += [inner for pair in node.value for inner in pair]
+            pending += [inner for pair in node.value for inner in pair]
         elif isinstance(node, yaml.SequenceNode):
-            waiting += node.value
+            pending += node.value
 
 
-def _check_keys(loader: Any, mapping: Any, text: str, place: str) -> None:
+def _check_keys(loader: Any, mapping: Any, text: str, source: str) -> None:
     import yaml
 
     keys = set()
     for node, _ in mapping.value:
         if not isinstance(node, yaml.ScalarNode):
-            continue  # which the loader refuses
-        key = (
-            node.value if node.tag == f"{_TAG}merge" else loader.construct_object(node)
-        )
+            continue  # the loader rejects it
+        is_merge = node.tag == f"{_TAG}merge"
+        key = node.value if is_merge else loader.construct_object(node)
         if key in keys:
-            raise _refusal(
-                text, place, f"the key {key!r} is there twice", node.start_mark
-            )
+            problem = f"the key {key!r} occurs twice"
+            raise _error(text, source, problem, node.start_mark)
         keys.add(key)
 
 
-def _refusal(text: str, place: str, problem: str, mark: Any) -> ConfigError:
-    line = f", line {mark.line + 1}" if place and mark else ""
-    return ConfigError(f"Expected YAML, got {place or repr(text)}{line}: {problem}.")
+def _error(text: str, source: str, problem: str, mark: Any) -> ConfigError:
+    line = f", line {mark.line + 1}" if source and mark else ""
+    return ConfigError(f"Expected YAML, got {source or repr(text)}{line}: {problem}.")
 
 
 @cache
 def _loader() -> Any:
-    """The loader of plain data, as `jsonargparse` reads the words of a command line."""
+    """Return the loader class of plain data, as `jsonargparse` reads options."""
     import yaml
 
     base = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     resolvers = {
         first: [
             (tag, pattern)
-            for tag, pattern in known
+            for tag, pattern in tagged_patterns
             if tag not in (f"{_TAG}timestamp", f"{_TAG}float")
         ]
-        for first, known in base.yaml_implicit_resolvers.items()
+        for first, tagged_patterns in base.yaml_implicit_resolvers.items()
     }
     constructors = {
-        tag: make
-        for tag, make in base.yaml_constructors.items()
+        tag: construct
+        for tag, construct in base.yaml_constructors.items()
         if tag is None or tag.removeprefix(_TAG) not in _NOT_PLAIN
     }
-    members = {"yaml_implicit_resolvers": resolvers, "yaml_constructors": constructors}
-    loader: Any = type("PlainLoader", (base,), members)
+    attributes = {
+        "yaml_implicit_resolvers": resolvers,
+        "yaml_constructors": constructors,
+    }
+    loader: Any = type("PlainLoader", (base,), attributes)
     loader.add_implicit_resolver(f"{_TAG}float", _FLOAT, list("-+0123456789."))
     return loader

@@ -254,7 +254,7 @@ BAD: list[tuple[str, str]] = [
     ('train gp --data d --out o --gp.likelihood gausian', "Expected --gp.likelihood as 'censored' or 'gaussian', got 'gausian'. Did you mean 'gaussian'?"),
     ('eval run --config s.yml', "Expected --config as a YAML file, or one of demo, full, paper, risk, severity, got 's.yml', which is not there. Did you mean 's.yaml'?"),
     ('eval run --config folder.yaml', "Expected a YAML file, got 'folder.yaml': Is a directory."),
-    ('eval run --config binary.yaml', "Expected a YAML file, got 'binary.yaml': it is no text."),
+    ('eval run --config binary.yaml', "Expected a YAML file, got 'binary.yaml': it is not text."),
     ('eval run --config broken.yaml', "Expected YAML, got broken.yaml, line 3: did not find expected ',' or ']'."),
     ('eval run --config list.yaml', 'Expected list.yaml to hold settings as `name: value`, got list.'),
     ('eval run --config unknown.yaml', "Expected keys of unknown.yaml among data, scenarios, model, models, planners, risks, robots, objectives, sensors, grounds, beliefs, world, task, maps, seed, seeds, realisations, record, conditions, hypotheses, metrics, figures, out, jobs, overwrite, planner_limit_s, shard, backend, scheduler, device, reuse_code, check_determinism, got 'risk'. Did you mean 'risks'?"),

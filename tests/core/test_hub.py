@@ -183,8 +183,8 @@ def test_what_a_hub_lacks_is_one_line(
     (tmp_path / "empty").mkdir()
     (tmp_path / "empty" / "README.md").write_text("nothing")
     cases = {
-        "me/none@main": "is not there or is private",
-        "me/empty@v9": "got 'v9', which it has not",
+        "me/none@main": "does not exist or is private",
+        "me/empty@v9": "got 'v9', which does not exist",
         "me/empty@main": "got 0 files .h5",
     }
     for name, said in cases.items():

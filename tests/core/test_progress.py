@@ -92,8 +92,8 @@ def test_a_duration_is_said_as_people_say_it(seconds: float, words: str) -> None
 def test_plain_lines_tell_of_work_that_makes_no_step(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(progress, "_LOOK_S", 0.001)
-    monkeypatch.setattr(progress, "_QUIET_S", 0.0)
+    monkeypatch.setattr(progress, "_POLL_S", 0.001)
+    monkeypatch.setattr(progress, "_MIN_SILENCE_S", 0.0)
     said = progress.tell
     lines: list[str] = []
     monkeypatch.setattr(progress, "tell", lambda line: (lines.append(line), said(line)))

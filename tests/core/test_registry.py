@@ -591,7 +591,7 @@ def test_an_unknown_kind_is_refused() -> None:
         ),
         (
             "import absent_helper\n",
-            "No module named 'absent_helper' (line 1). A file stands alone",
+            "No module named 'absent_helper' (line 1). A file must not depend on its folder",
         ),
         ("class :\n", "SyntaxError"),
         ("import sys\nsys.exit('done')\n", "SystemExit: done (line 2)"),

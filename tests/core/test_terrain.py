@@ -106,11 +106,11 @@ def test_several_batches_are_changed_together_layer_by_layer() -> None:
         ({"moss": torch.zeros(3, 16, 16).double()}, "layer `moss` as float32"),
         (
             {"slope_deg": torch.zeros(3, 16, 16)},
-            "layer `slope_deg` as float32 under a name of its own",
+            "layer `slope_deg` as float32 with a unique name",
         ),
         (
             {"rgb": torch.zeros(3, 16, 16)},
-            "layer `rgb` as float32 under a name of its own",
+            "layer `rgb` as float32 with a unique name",
         ),
     ],
 )

@@ -38,7 +38,7 @@ def test_yaml_has_numbers_with_exponents_and_mappings_without_values(
     ):
         read_yaml(path)
     path.write_bytes(b"\xff\xfe")
-    with pytest.raises(ConfigError, match=r"a\.yaml': it is no text"):
+    with pytest.raises(ConfigError, match=r"a\.yaml': it is not text"):
         read_yaml(path)
     with pytest.raises(ConfigError, match="Is a directory"):
         read_yaml(tmp_path)
@@ -58,10 +58,10 @@ def test_a_key_twice_is_refused_wherever_it_stands(
     lines = yaml.safe_dump(data).splitlines()
     again = draw.draw(st.sampled_from(lines))
     lines.insert(draw.draw(st.integers(0, len(lines))), again)
-    with pytest.raises(ConfigError, match="is there twice"):
+    with pytest.raises(ConfigError, match="occurs twice"):
         load_yaml("\n".join(lines))
     inner = "\n".join(f"    {line}" for line in lines)
-    with pytest.raises(ConfigError, match="is there twice"):
+    with pytest.raises(ConfigError, match="occurs twice"):
         load_yaml(f"a:\n- b:\n{inner}\n")
 
 
@@ -69,7 +69,7 @@ def test_a_mapping_that_is_merged_into_others_has_its_keys_changed() -> None:
     text = "a: &a {k: 1, l: 2}\nb: &b {<<: *a, k: 3}\nc: {<<: *b, l: 4}\n"
     assert load_yaml(text)["c"] == {"k": 3, "l": 4}
     assert load_yaml("[&a [1, 2], *a, *a]") == [[1, 2]] * 3
-    with pytest.raises(ConfigError, match="'<<' is there twice"):
+    with pytest.raises(ConfigError, match="'<<' occurs twice"):
         load_yaml("a: &a {k: 1}\nb: {<<: *a, <<: *a}\n")
 
 
