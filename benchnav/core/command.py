@@ -1,13 +1,13 @@
-"""How the commands read their words and report errors: one way for all three.
+"""Command lines: parsing of arguments, help and error reports of all three commands.
 
-Words and YAML files make one plain mapping, which `benchnav.core.settings` reads by the
-types of the function's parameters; the help is jsonargparse's. `--contact-sheet` is
-`--contact_sheet true`, `--maps 3` is `--maps [3]`; a flag whose value is a name or a
-mapping may be given as both, `--world paper --world.noise stored`. Bad input ends in
-one line on standard error and exit status 2; an interruption in status 130.
+Command lines and YAML files are merged into one plain mapping.
+`benchnav.core.settings` converts its values to the types of the function's parameters;
+jsonargparse prints the help. `--contact-sheet` means `--contact_sheet true`, and
+`--maps 3` means `--maps [3]`. A flag whose value is a name or a mapping accepts both:
+`--world paper --world.noise stored`. Bad input ends in one line on standard error and
+exit status 2, an interruption in status 130. `benchnav.core.failures` words the errors.
 """
 
-import errno
 import inspect
 import os
 import signal
@@ -26,8 +26,9 @@ from benchnav.core.errors import (
     ConfigError,
     check_text,
     expect,
-    out_of_memory,
 )
+from benchnav.core.failures import describe_failure, report_failure
+from benchnav.core.failures import tell as tell
 from benchnav.core.registry import KINDS
 from benchnav.core.settings import (
     NO_DEFAULT,
@@ -47,35 +48,32 @@ from benchnav.core.yaml_text import load_yaml, read_yaml
 
 INTERRUPTED = 130
 
-# Options that name what a command writes, of all commands.
+# Options of all commands that name an output.
 OUTPUTS = ("out", "json", "onnx", "video")
-_LONGEST = (
-    2000  # characters of a message, of which the middle of a longer one is left out
-)
 
-_Flag = tuple[
-    list[str], str
-]  # the option that a flag stands for, keys within its value; and its text
+_SWITCH_VALUES = ("true", "false", "yes", "no")
 
-Device = Literal[
-    "auto", "cpu", "cuda"
-]  # of the flag --device; see `benchnav.core.device`
+# A flag's option followed by keys within its value, and the text of the value.
+_Flag = tuple[list[str], str]
+
+# Type of the flag --device; see `benchnav.core.device`.
+Device = Literal["auto", "cpu", "cuda"]
 
 
 @dataclass(frozen=True)
 class Command:
-    """One subcommand.
+    """A subcommand.
 
     Args:
-        function: does the work; its type hints and docstring become flags and help. Of
-            a dataclass without a default each field becomes a flag. It returns the exit
-            status, or None for success.
-        positionals: names of its parameters that are given by place rather than by
-            flag; one that is a list takes what is left.
-        repeated: names of lists whose flag may be given again, which adds to the list;
-            of others the last one holds.
-        configs: folder of shipped YAML files, which `--config NAME` finds where there
-            is no such file.
+        function: its type hints and docstring become flags and help. Each field of a
+            dataclass without a default becomes a flag. It returns the exit status, or
+            None for success.
+        positionals: names of its positional parameters; one that is a list takes all
+            remaining arguments.
+        repeated: names of lists whose flag appends to the list when repeated; any other
+            flag replaces the earlier value.
+        configs: folder of shipped YAML files, which `--config NAME` finds if no such
+            file exists.
     """
 
     function: Callable[..., int | None]
@@ -86,31 +84,27 @@ class Command:
     @cached_property
     def settings(self) -> dict[str, type]:
         """Dataclasses whose fields are flags, by the function's parameter."""
-        known = list_options(self.function).items()
         kinds = {
             name: dataclass_in(option.kind)
-            for name, option in known
+            for name, option in list_options(self.function).items()
             if option.default is NO_DEFAULT
         }
         return {name: kind for name, kind in kinds.items() if kind}
 
     @cached_property
     def options(self) -> dict[str, Option]:
-        """What can be given, by name."""
+        """Options by name, positional ones included."""
         options: dict[str, Option] = {}
         for name, option in list_options(self.function).items():
-            options |= (
-                list_options(self.settings[name])
-                if name in self.settings
-                else {name: option}
-            )
+            if name in self.settings:
+                options |= list_options(self.settings[name])
+            else:
+                options[name] = option
         return options
 
     @cached_property
     def flags(self) -> dict[str, Any]:
-        """Types by flag; flags for the fields of a dataclass have a dot, those of a
-        dataclass in it two.
-        """
+        """Types by flag, with one dot for each level of nested dataclasses."""
         kinds = {
             name: option.kind
             for name, option in self.options.items()
@@ -118,23 +112,23 @@ class Command:
         }
         level = kinds
         while level:
-            level = {
-                f"{name}.{field}": option.kind
-                for name, kind in level.items()
-                if (group := dataclass_in(kind))
-                for field, option in list_options(group).items()
-            }
-            kinds |= level
+            next_level: dict[str, Any] = {}
+            for name, kind in level.items():
+                group = dataclass_in(kind)
+                if not group:
+                    continue
+                for field, option in list_options(group).items():
+                    next_level[f"{name}.{field}"] = option.kind
+            kinds |= next_level
+            level = next_level
         return kinds | {"config": str, "print_config": bool}
 
     @cached_property
     def shipped(self) -> dict[str, Path]:
         """Shipped YAML files by name."""
-        return (
-            {path.stem: path for path in sorted(self.configs.glob("*.yaml"))}
-            if self.configs
-            else {}
-        )
+        if not self.configs:
+            return {}
+        return {path.stem: path for path in sorted(self.configs.glob("*.yaml"))}
 
 
 def run(
@@ -143,111 +137,105 @@ def run(
     commands: dict[str, Command],
     argv: Sequence[str] | None = None,
 ) -> int:
-    """Reads a command line and runs the subcommand it names; without one it prints the
-    help.
+    """Run the subcommand that a command line names, or print the help without one.
 
     Args:
         program: name of the command.
         description: one line for `--help`.
         commands: subcommands by name.
-        argv: arguments, or None for the process's own.
+        argv: arguments; None for those of the process.
 
     Returns:
-        Exit status: 0, 1 where the command or its error says so, 2 for bad input, 130
-            when interrupted.
+        Exit status: 0 for success, 1 if the command or its error sets it, 2 for bad
+            input, 130 when interrupted.
     """
-    # Notices of libraries to their own developers would bury what a user has to read.
+    # Warnings to developers of libraries would hide messages to the user.
     warnings.filterwarnings("ignore", category=FutureWarning, module=r"torch\..*")
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.default_int_handler)
-    asked, *words = list(sys.argv[1:] if argv is None else argv) or ["--help"]
-    command = commands.get(asked)
+    arguments = list(sys.argv[1:] if argv is None else argv) or ["--help"]
+    command_name, *words = arguments
+    command = commands.get(command_name)
     try:
-        if asked in ("-h", "--help"):
+        if command_name in ("-h", "--help"):
             _print_help(program, description, commands)
             return 0
         if command is None:
             raise ConfigError(
                 f"Expected a command among {', '.join(commands)}, got "
-                f"{asked!r}.{hint(asked, commands)}"
+                f"{command_name!r}.{hint(command_name, commands)}"
             )
-        return _call(f"{program} {asked}", command, words) or 0
+        return _call(f"{program} {command_name}", command, words) or 0
     except BrokenPipeError:
         sys.stderr.close()
         return 0
     except Exception as error:
-        line = _said(error, command)
-        if line is None:
+        has_out = command is not None and "out" in command.flags
+        message = describe_failure(error, has_out)
+        if message is None:
             raise
-        return _refuse(
-            program, line, error.status if isinstance(error, BenchnavError) else 2
-        )
-    except KeyboardInterrupt as stopped:  # by Ctrl-C, or by a scheduler's SIGTERM
-        # A command that knows what it has kept says so by the interruption's text.
-        print(
-            "; ".join([f"{program}: interrupted", *map(str, stopped.args)]),
-            file=sys.stderr,
-        )
+        status = error.status if isinstance(error, BenchnavError) else 2
+        report_failure(program, message)
+        return status
+    except KeyboardInterrupt as stopped:  # Ctrl-C, or SIGTERM from a scheduler
+        # Commands that save partial results describe them in the interruption's text.
+        parts = [f"{program}: interrupted", *map(str, stopped.args)]
+        print("; ".join(parts), file=sys.stderr)
         return INTERRUPTED
 
 
-def tell(line: str) -> None:
-    """Prints a line on standard error; where no one reads it any more, the work goes on
-    without.
-    """
-    try:
-        print(line, file=sys.stderr, flush=True)
-    except BrokenPipeError:
-        sys.stderr = open(os.devnull, "w")  # noqa: SIM115
-
-
 def _call(program: str, command: Command, words: Sequence[str]) -> int | None:
-    """Calls the function of a subcommand with what its words say, or prints its help or
-    settings.
-    """
+    """Call the function of a subcommand, or print its help or settings."""
     import yaml
 
     for word in words:
         check_text(word)
     if {"-h", "--help"} & set(words):
         return _print_help_of(program, command)
-    flags, places = _read_words(program, command, words)
-    arguments = _read_arguments(program, command, flags, places)
-    known = {
+    flags, positionals = _read_words(program, command, words)
+    arguments = _read_arguments(program, command, flags, positionals)
+    defaults = {
         name: option.default
         for name, option in command.options.items()
         if option.default is not NO_DEFAULT
     }
-    if printed := [value for path, value in flags if path == ["print_config"]]:
-        settings = plain(arguments if "skip_default" in printed else known | arguments)
-        print(yaml.safe_dump(settings, sort_keys=False, allow_unicode=True), end="")
+    print_modes = [text for path, text in flags if path == ["print_config"]]
+    if print_modes:
+        settings = arguments
+        if "skip_default" not in print_modes:
+            settings = defaults | arguments
+        text = yaml.safe_dump(plain(settings), sort_keys=False, allow_unicode=True)
+        print(text, end="")
         return 0
-    if lacking := [name for name in command.options if name not in known | arguments]:
-        named = [
-            name.upper() if name in command.positionals else f"--{name}"
-            for name in lacking
-        ]
+    available = defaults | arguments
+    missing = [
+        _shown_name(command, name) for name in command.options if name not in available
+    ]
+    if missing:
         raise ConfigError(
-            f"Expected {' and '.join(named)}, got none. See `{program} --help`."
+            f"Expected {' and '.join(missing)}, got none. See `{program} --help`."
         )
     _check_texts(command, arguments)
     for parameter, kind in command.settings.items():
-        own = {
+        field_values = {
             name: arguments.pop(name)
             for name in list_options(kind)
             if name in arguments
         }
-        arguments[parameter] = kind(**own)
+        arguments[parameter] = kind(**field_values)
     return command.function(**arguments)
 
 
+def _shown_name(command: Command, name: str) -> str:
+    """Return an option's name as in the help: `NAME` if positional, else `--name`."""
+    return name.upper() if name in command.positionals else f"--{name}"
+
+
 def _check_texts(command: Command, arguments: dict[str, Any]) -> None:
-    """Refuse text that is empty where that means nothing, and outputs that are no paths
-    here; fill in `~` in these.
-    """
+    """Reject invalid empty texts and output paths; expand `~` in output paths."""
     for name, value in arguments.items():
         option = command.options[name]
-        shown = name.upper() if name in command.positionals else f"--{name}"
+        shown = _shown_name(command, name)
         texts = value if option.kind == list[str] else [value]
         expect(option.default == "" or "" not in texts, f"{shown} as text, got ''.")
         if name in OUTPUTS and option.kind is str and value:
@@ -256,108 +244,105 @@ def _check_texts(command: Command, arguments: dict[str, Any]) -> None:
 
 
 def _read_arguments(
-    program: str, command: Command, flags: Sequence[_Flag], places: Sequence[str]
+    program: str, command: Command, flags: Sequence[_Flag], positionals: Sequence[str]
 ) -> dict[str, Any]:
-    """Makes arguments by name of flags and of what is given by place.
+    """Return arguments by name from flags and positional words.
 
-    YAML files come first, then flags, then keys within the value of a flag, wherever
-    they stand.
+    YAML files are read first, then flags, then keys within the value of a flag,
+    regardless of their order.
 
     Raises:
-        ConfigError: something given is unknown or of another type.
+        ConfigError: If an argument is unknown or has a different type.
     """
     options = command.options
-    arguments: dict[str, Any] = {}  # from which later ones begin
-    for file in [value for path, value in flags if path == ["config"]]:
-        arguments |= read_options(
-            options, _read_config(command, file), of(file), now=arguments
-        )
-    given: dict[str, Any] = {}
-    for (name, *keys), value in sorted(flags, key=lambda flag: len(flag[0])):
-        if name in options:
-            kind, now = (
-                options[name].kind,
-                given.get(name, arguments.get(name, options[name].default)),
-            )
-            again = name in given and name in command.repeated
-            given[name] = (
-                _appended(now, value)
-                if again
-                else _merged(name, kind, now, keys, value)
-            )
+    arguments: dict[str, Any] = {}
+    for file in [text for path, text in flags if path == ["config"]]:
+        config = _read_config(command, file)
+        arguments |= read_options(options, config, of(file), now=arguments)
+    values: dict[str, Any] = {}
+    for (name, *keys), text in sorted(flags, key=lambda flag: len(flag[0])):
+        if name not in options:
+            continue
+        option = options[name]
+        now = values.get(name, arguments.get(name, option.default))
+        if name in values and name in command.repeated:
+            values[name] = _appended(now, text)
+        else:
+            values[name] = _merged(name, option.kind, now, keys, text)
+    remaining = list(positionals)
     for name in command.positionals:
-        if options[name].kind == list[str] and (places or name not in arguments):
-            given[name], places = list(places), []
-        elif places:
-            given[name], *places = places
-    if places:
+        if options[name].kind == list[str] and (remaining or name not in arguments):
+            values[name] = remaining
+            remaining = []
+        elif remaining:
+            values[name] = remaining.pop(0)
+    if remaining:
         raise ConfigError(
-            f"Expected nothing more, got {' '.join(places)!r}. See `{program} --help`."
+            f"Expected no more arguments, got {' '.join(remaining)!r}. See `{program} "
+            "--help`."
         )
-    return arguments | read_options(options, given, "--{}".format, now=arguments)
+    return arguments | read_options(options, values, "--{}".format, now=arguments)
 
 
 def _read_words(
     program: str, command: Command, words: Sequence[str]
 ) -> tuple[list[_Flag], list[str]]:
-    """Reads words as flags, each with the keys that it stands for and its value; and
-    what is given by place.
-    """
+    """Split the words of a command line into flags and positional words."""
     flags: list[_Flag] = []
-    places: list[str] = []
-    rest = deque(words)
-    while rest:
-        word = rest.popleft()
+    positionals: list[str] = []
+    remaining = deque(words)
+    while remaining:
+        word = remaining.popleft()
         if not word.startswith("-") or word == "-":
-            places.append(word)
+            positionals.append(word)
             continue
         flag, equals, value = word.partition("=")
         path = _path_of(program, command, flag)
         kind = command.flags.get(".".join(path), Any)
-        has_value = bool(rest) and not rest[0].startswith("--")
+        has_value = bool(remaining) and not remaining[0].startswith("--")
         is_switch = bool in members_of(kind)
         if is_switch:
-            has_value = has_value and rest[0].lower() in ("true", "false", "yes", "no")
+            has_value = has_value and remaining[0].lower() in _SWITCH_VALUES
         if not equals and not has_value and not is_switch:
             raise ConfigError(
                 f"Expected a value after {flag} ({in_words(kind)}), got none."
             )
         if not equals:
-            value = rest.popleft() if has_value else "true"
+            value = remaining.popleft() if has_value else "true"
         flags.append((path, value))
-    return flags, places
+    return flags, positionals
 
 
 def _path_of(program: str, command: Command, flag: str) -> list[str]:
-    """The option that a flag stands for, and keys within its value.
+    """Return a flag's option, followed by keys within its value.
 
     Raises:
-        ConfigError: there is no such option.
+        ConfigError: If there is no such option.
     """
-    name, *keys = flag.removeprefix("--").split(".")
-    name, whole = name.replace("-", "_"), flag.removeprefix("--").replace("-", "_")
-    if whole in command.flags:
-        return whole.split(".")
+    full_name = flag.removeprefix("--")
+    name, *keys = full_name.split(".")
+    name = name.replace("-", "_")
+    full_name = full_name.replace("-", "_")
+    if full_name in command.flags:
+        return full_name.split(".")
     if keys and _takes_mapping(command.flags.get(name)):
-        return [name, *keys]  # which stay as they are
-    near = hint(whole, command.flags, "--")
+        return [name, *keys]  # Keys of a mapping may contain hyphens.
+    remedy = hint(full_name, command.flags, "--")
     raise ConfigError(
-        f"Expected flags that `{program}` has, got {flag}.{near} See `{program} "
+        f"Expected flags that `{program}` has, got {flag}.{remedy} See `{program} "
         "--help`."
     )
 
 
 def _merged(name: str, kind: Any, now: Any, keys: Sequence[str], text: str) -> Any:
-    """The value of an option when the text of a flag is added to it: of the whole, or
-    of a key in it.
-    """
-    is_group, value = dataclass_in(kind) is not None, text
-    if (keys and not is_group) or (
-        text.lstrip().startswith("{") and (is_group or _takes_mapping(kind))
-    ):
+    """Return the value of an option after a flag has set it, or a key within it."""
+    value = text
+    is_group = dataclass_in(kind) is not None
+    is_mapping = text.lstrip().startswith("{") and (is_group or _takes_mapping(kind))
+    if (keys and not is_group) or is_mapping:
         value = load_yaml(text)
     if is_group and not isinstance(now, dict):
-        now = {}  # what is not given stays as it is
+        now = {}  # Fields that are not set keep their values.
     if not keys:
         return value
     if isinstance(now, str) and str in members_of(kind):
@@ -366,24 +351,23 @@ def _merged(name: str, kind: Any, now: Any, keys: Sequence[str], text: str) -> A
 
 
 def _read_config(command: Command, value: str) -> dict[str, Any]:
-    """Reads a YAML file of settings, by path or by the name of a shipped one."""
+    """Read a YAML file of settings, by path or by the name of a shipped file."""
     path = Path(os.path.expanduser(value))
     if not path.is_file():
         path = command.shipped.get(value, path)
     if not path.exists():
         among = f", or one of {', '.join(command.shipped)}" if command.shipped else ""
-        near = [
-            *command.shipped,
-            *(str(path.parent / other.name) for other in path.parent.glob("*.y*ml")),
-        ]
+        candidates = list(command.shipped)
+        for sibling in path.parent.glob("*.y*ml"):
+            candidates.append(str(path.parent / sibling.name))
         raise ConfigError(
-            f"Expected --config as a YAML file{among}, got {value!r}, which is not "
-            f"there.{hint(str(path), near)}"
+            f"Expected --config as a YAML file{among}, got {value!r}, which does not "
+            f"exist.{hint(str(path), candidates)}"
         )
     content = read_yaml(path)
     if not isinstance(content, dict | None):
         raise ConfigError(
-            f"Expected {path} to hold settings as `name: value`, got "
+            f"Expected {path} to contain settings as `name: value`, got "
             f"{type(content).__name__}."
         )
     settings: dict[str, Any] = {}
@@ -398,7 +382,7 @@ def _read_config(command: Command, value: str) -> dict[str, Any]:
 
 
 def _is_set(settings: Any, keys: Sequence[str]) -> bool:
-    """Whether settings have a value, or values within it, where keys lead to."""
+    """Return whether nested settings contain a value at the path of keys."""
     for key in keys:
         if not isinstance(settings, Mapping) or key not in settings:
             return False
@@ -410,8 +394,8 @@ def _print_help(
     program: str, description: str, commands: Mapping[str, Command]
 ) -> None:
     print(
-        f"usage: {program} COMMAND …\n\n{description}\n\ncommands, each with a --help "
-        "of its own:"
+        f"usage: {program} COMMAND …\n\n{description}\n\ncommands, each with its "
+        "own --help:"
     )
     width = max(map(len, commands))
     for name, command in commands.items():
@@ -424,8 +408,8 @@ def _print_help_of(program: str, command: Command) -> int:
 
     parser = ArgumentParser(prog=program, description=_summary(command.function))
     shipped = f", or one of {', '.join(command.shipped)}" if command.shipped else ""
-    about = f"Path of a YAML file with these settings{shipped}."
-    parser.add_argument("--config", action="config", help=about)
+    config_help = f"Path of a YAML file with these settings{shipped}."
+    parser.add_argument("--config", action="config", help=config_help)
     documented = {
         p.arg_name: p.description
         for p in parse(inspect.getdoc(command.function) or "").params
@@ -435,9 +419,8 @@ def _print_help_of(program: str, command: Command) -> int:
         action = parser.add_argument(
             name, help=documented.get(name), nargs="*" if is_list else None
         )
-        action.required = (
-            not is_list
-        )  # whether an empty list will do is the function's to say
+        # The function checks whether a list may be empty.
+        action.required = not is_list
     skip: set[str | int] = set(command.positionals)
     for kind in command.settings.values():
         parser.add_class_arguments(kind, as_group=False)
@@ -448,58 +431,17 @@ def _print_help_of(program: str, command: Command) -> int:
     return 0
 
 
-def _appended(one: str, other: str) -> str:
-    """Two lists, each as text with or without brackets, as one."""
+def _appended(first: str, second: str) -> str:
+    """Return two lists, as text with or without brackets, as one list in brackets."""
     inner = (
         text.strip().removeprefix("[").removesuffix("]").strip()
-        for text in (one, other)
+        for text in (first, second)
     )
     return f"[{', '.join(text for text in inner if text)}]"
 
 
 def _takes_mapping(kind: Any) -> bool:
     return any(get_origin(member) is dict for member in members_of(kind))
-
-
-def _refuse(program: str, message: str, status: int) -> int:
-    line = " ".join(message.split())
-    if len(line) > _LONGEST:
-        line = f"{line[: _LONGEST // 2]} … {line[-_LONGEST // 2 :]}"
-    print(f"{program}: error: {line}", file=sys.stderr)
-    return status
-
-
-def _said(error: Exception, command: Command | None) -> str | None:
-    """A line on what a user can mend; None of a fault of ours."""
-    if no_memory := out_of_memory(error):
-        return str(no_memory)
-    if isinstance(error, BenchnavError | UnicodeDecodeError):
-        return str(error)
-    return _unusable(error, command) if isinstance(error, OSError) else None
-
-
-def _unusable(error: OSError, command: Command | None) -> str:
-    """Says which file or folder the system refused, and what to do."""
-    reason = error.strerror or str(error)
-    if not error.filename:
-        return f"could not use a file: {reason}"
-    path = Path(str(error.filename))
-    if error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS):
-        return f"could not use {path}: {reason}"
-    existing = next(
-        place
-        for place in (path.absolute(), *path.absolute().parents)
-        if os.path.exists(place)
-    )
-    remedy = (
-        "Choose another place with --out, or change"
-        if command and "out" in command.flags
-        else "Change"
-    )
-    return (
-        f"could not use {path.absolute()}: {reason}. {remedy} the permissions of "
-        f"{existing}."
-    )
 
 
 def _summary(function: Callable[..., Any]) -> str:

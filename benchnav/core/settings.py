@@ -1,10 +1,10 @@
-"""Settings by type: plain data of YAML, JSON and command lines becomes dataclasses and
-options of parts, and back.
+"""Conversion of plain data into typed settings, and back.
 
-The options of a class or function are its keyword parameters; where its one parameter
-is a dataclass named `config`, the fields of that are. A value is read by its annotated
-type: a dataclass here, key by key, so that a message can say which key is wrong;
-anything else by jsonargparse.
+Plain data comes from YAML, JSON and command lines. It becomes dataclasses and options of
+parts. The options of a class or function are its keyword parameters. If its only
+parameter is a dataclass named `config`, the fields of `config` are the options. A value
+is read by its annotated type. Dataclasses are read here, key by key, because messages
+name the wrong key; jsonargparse reads all other types.
 """
 
 import difflib
@@ -16,34 +16,30 @@ from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from enum import Enum
 from functools import cache, partial
 from pathlib import PurePath
-from types import NoneType, SimpleNamespace, UnionType
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from types import NoneType, SimpleNamespace
+from typing import Any, get_args, get_origin, get_type_hints
 
+from benchnav.core.annotations import dataclass_in as dataclass_in
+from benchnav.core.annotations import in_words as in_words
+from benchnav.core.annotations import members_of as members_of
 from benchnav.core.errors import BenchnavError, ConfigError, out_of_memory
 from benchnav.core.yaml_text import MAX_DEPTH, check_yaml
 
 NO_DEFAULT = inspect.Parameter.empty
 
-Naming = Callable[[str], str]  # what users call a key; of an empty one, the whole
+# From a key with dots to its name in messages; an empty key stands for all settings.
+Naming = Callable[[str], str]
 
 _UNNAMED = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-_WORDS = {
-    int: "a whole number",
-    float: "a number",
-    str: "text",
-    bool: "true or false",
-    NoneType: "null",
-    Any: "anything",
-}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Option:
-    """One option.
+    """Type and default of an option.
 
     Args:
-        kind: its type, as annotated; `Any` where it is not.
-        default: `NO_DEFAULT` where it has to be given.
+        kind: annotated type; `Any` without an annotation.
+        default: `NO_DEFAULT` if the option is required.
     """
 
     kind: Any
@@ -57,54 +53,52 @@ class Option:
 def list_options(
     target: Callable[..., Any], skipped: Iterable[str] = ()
 ) -> dict[str, Option]:
-    """Lists options by name, in order.
+    """Return options by name, in the order of their parameters.
 
     Args:
-        target: a class, or a function.
-        skipped: names of parameters that are no options.
+        target: a class or function.
+        skipped: names of parameters that are not options.
     """
+    skipped = set(skipped)
     target = config_class(target, skipped) or target
     types = _types(target)
-    made: dict[str, Any] = (
-        {f.name: f.default_factory for f in fields(target)}
-        if is_dataclass(target)
-        else {}
-    )
-    return {
-        name: Option(
-            kind=types.get(name, Any),
-            default=parameter.default
-            if made.get(name, MISSING) is MISSING
-            else made[name](),
-        )
-        for name, parameter in parameters(target).items()
-        if name not in set(skipped)
-    }
+    factories: dict[str, Any] = {}
+    if is_dataclass(target):
+        factories = {field.name: field.default_factory for field in fields(target)}
+    options = {}
+    for name, parameter in parameters(target).items():
+        if name in skipped:
+            continue
+        default = parameter.default
+        factory = factories.get(name, MISSING)
+        if factory is not MISSING:
+            default = factory()
+        options[name] = Option(kind=types.get(name, Any), default=default)
+    return options
 
 
 def config_class(target: Callable[..., Any], skipped: Iterable[str] = ()) -> Any:
-    """The dataclass of a sole parameter `config`; None where there is no such
-    parameter.
-    """
-    if [name for name in parameters(target) if name not in set(skipped)] != ["config"]:
+    """Return the dataclass of `config` if this is the only parameter, else None."""
+    if set(parameters(target)) - set(skipped) != {"config"}:
         return None
     return dataclass_in(_types(target).get("config"))
 
 
 def parameters(target: Callable[..., Any]) -> dict[str, inspect.Parameter]:
-    """Parameters that have names of their own; a class without a constructor has none."""
+    """Return named parameters: no `*args` or `**kwargs`; empty without a constructor."""
     if inspect.isclass(target) and target.__init__ is object.__init__:
         return {}
     return {
-        n: p
-        for n, p in inspect.signature(target).parameters.items()
-        if p.kind not in _UNNAMED
+        name: parameter
+        for name, parameter in inspect.signature(target).parameters.items()
+        if parameter.kind not in _UNNAMED
     }
 
 
 def _types(target: Any) -> dict[str, Any]:
-    """Types of parameters; one that cannot be told, such as a name imported for type
-    checkers, is left out.
+    """Return types of parameters by name, without those that cannot be resolved.
+
+    A name that is imported only for type checkers cannot be resolved.
     """
     if inspect.isclass(target) and not is_dataclass(target):
         target = target.__init__
@@ -114,20 +108,24 @@ def _types(target: Any) -> dict[str, Any]:
         names = getattr(target, "__globals__", None) or vars(
             sys.modules.get(target.__module__, target)
         )
-        found: dict[str, Any] = {}
+        types: dict[str, Any] = {}
         for name, annotation in inspect.get_annotations(target).items():
+            annotated = SimpleNamespace(__annotations__={name: annotation})
             with suppress(Exception):
-                found |= get_type_hints(
-                    SimpleNamespace(__annotations__={name: annotation}), names
-                )
-        return found
+                types |= get_type_hints(annotated, names)
+        return types
 
 
 def call(what: str, target: Callable[..., Any], arguments: Mapping[str, Any]) -> Any:
-    """Calls a user's class or function; whatever it raises ends in one line.
+    """Call a user's class or function, and convert its exceptions.
+
+    Args:
+        what: name of the result in messages.
+        target: the class or function.
+        arguments: keyword arguments.
 
     Raises:
-        ConfigError: it refuses its arguments.
+        ConfigError: If the call raises an exception that is not BenchNav's own.
     """
     try:
         return target(**arguments)
@@ -135,7 +133,7 @@ def call(what: str, target: Callable[..., Any], arguments: Mapping[str, Any]) ->
         raise
     except Exception as error:
         raise out_of_memory(error) or ConfigError(
-            f"{what} could not be made: {one_line(error)}"
+            f"{what} could not be created: {one_line(error)}"
         ) from error
 
 
@@ -144,27 +142,26 @@ def call(what: str, target: Callable[..., Any], arguments: Mapping[str, Any]) ->
 
 
 def of(owner: str) -> Naming:
-    """Names keys as those of an owner, such as "planner 'mppi'"."""
+    """Return a naming of keys as those of an owner, such as "planner 'mppi'"."""
     return lambda key: f"`{key}` of {owner}" if key else owner
 
 
 def read(
     kind: Any, value: Any, name: Naming, key: str = "", now: Any = NO_DEFAULT
 ) -> Any:
-    """Gives a value of a type.
+    """Return a value converted to a type.
 
     Args:
-        kind: the type, as annotated.
-        value: plain data, or a value of the type; text is read as the command line
-            reads it.
-        name: what users call a key.
-        key: where it stands, with dots; empty for the whole.
-        now: a value that this one takes the place of. Of a dataclass, what is not given
-            stays as it is there.
+        kind: annotated type.
+        value: plain data, or a value of the type; text is parsed as on the command line.
+        name: name of a key in messages.
+        key: key of the value, with dots; empty for all settings.
+        now: present value, which `value` replaces; for a dataclass, only the fields in
+            `value` are replaced.
 
     Raises:
-        ConfigError: a key is unknown or missing, or a value is of another type or
-            refused by its dataclass.
+        ConfigError: If a key is unknown or missing, a value has a different type, or the
+            dataclass rejects it.
     """
     _check_size(value, name(key))
     if (
@@ -173,16 +170,17 @@ def read(
         or (value is None and now is None)
     ):
         return value
-    config, origin, members = dataclass_in(kind), get_origin(kind), get_args(kind)
+    config = dataclass_in(kind)
+    origin = get_origin(kind)
+    members = get_args(kind)
     if config and isinstance(value, Mapping):
         base = now if isinstance(now, config) else None
-        before = (
-            {f.name: getattr(base, f.name) for f in fields(base)}
-            if base is not None
-            else None
-        )
-        given = read_options(list_options(config), value, name, key, before)
-        return call(name(key), partial(replace, base) if base else config, given)
+        before = None
+        if base is not None:
+            before = {field.name: getattr(base, field.name) for field in fields(base)}
+        arguments = read_options(list_options(config), value, name, key, before)
+        create = partial(replace, base) if base else config
+        return call(name(key), create, arguments)
     if origin is dict and dataclass_in(members[1]) and isinstance(value, Mapping):
         if not all(isinstance(inner, str) for inner in value):
             raise ConfigError(
@@ -211,24 +209,22 @@ def read(
         )
         if is_list and not value.lstrip().startswith(("[", "(")):
             data = f"[{value}]"
-        check_yaml(data)  # which the parser reads without a look at keys and nesting
+        check_yaml(data)  # The parser checks neither keys nor nesting.
     try:
         parsed = _parsed(kind, data)
     except ValueError as error:
         got = "null" if value is None else repr(value)
-        near = hint(
-            str(value),
-            [member for member in members_of(kind) if isinstance(member, str)],
-        )
+        choices = [member for member in members_of(kind) if isinstance(member, str)]
+        remedy = hint(str(value), choices)
         raise ConfigError(
-            f"Expected {name(key)} as {in_words(kind)}, got {got}.{near}"
+            f"Expected {name(key)} as {in_words(kind)}, got {got}.{remedy}"
         ) from error
     _check_size(parsed, name(key))
     return parsed
 
 
 def _check_size(value: Any, what: str) -> None:
-    """Refuse whole numbers that no array and no generator takes."""
+    """Reject integers of more than 64 bits, which no array or generator accepts."""
     if type(value) is int and abs(value) >= 2**64:
         raise ConfigError(
             f"Expected {what} as a whole number of at most 64 bits, got one of "
@@ -237,57 +233,62 @@ def _check_size(value: Any, what: str) -> None:
 
 
 def read_options(
-    known: Mapping[str, Option],
-    given: Mapping[str, Any],
+    options: Mapping[str, Option],
+    values: Mapping[str, Any],
     name: Naming,
     key: str = "",
     now: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Gives options of their types, by name.
+    """Return values converted to the types of their options, by name.
 
     Args:
-        known: what there is.
-        given: plain data by option.
-        name: what users call a key.
-        key: where they stand, with dots; empty for the whole.
-        now: what is not given, by name; without it an option that has no default is to
-            be given.
+        options: available options by name.
+        values: plain data by option.
+        name: name of a key in messages.
+        key: key of the options, with dots; empty for all settings.
+        now: present values by name; if None, options without a default are required.
 
     Raises:
-        ConfigError: as of `read`.
+        ConfigError: If an option is unknown or missing, or `read` rejects its value.
     """
     inner = f"{key}." if key else ""
-    for option in map(str, given):
-        if option not in known:
-            among = f"among {', '.join(known)}" if known else "none: it has none"
+    for option_name in map(str, values):
+        if option_name in options:
+            continue
+        if not options:
             raise ConfigError(
-                f"Expected keys of {name(key)} {among}, got "
-                f"{option!r}.{hint(option, known)}"
+                f"Expected no options for {name(key)}, got {option_name!r}."
             )
-    for option, about in known.items():
-        if about.default is NO_DEFAULT and option not in given and now is None:
-            raise ConfigError(
-                f"Expected {name(inner + option)} as {in_words(about.kind)}, got none."
-            )
-    before = {option: about.default for option, about in known.items()} | dict(
-        now or {}
-    )
-    return {
-        option: read(known[option].kind, value, name, inner + option, before[option])
-        for option, value in given.items()
-    }
+        raise ConfigError(
+            f"Expected keys of {name(key)} among {', '.join(options)}, got "
+            f"{option_name!r}.{hint(option_name, options)}"
+        )
+    for option_name, option in options.items():
+        is_required = option.default is NO_DEFAULT and now is None
+        if is_required and option_name not in values:
+            expected = f"{name(inner + option_name)} as {in_words(option.kind)}"
+            raise ConfigError(f"Expected {expected}, got none.")
+    before = {option_name: option.default for option_name, option in options.items()}
+    before |= now or {}
+    converted = {}
+    for option_name, value in values.items():
+        kind = options[option_name].kind
+        full_key = inner + option_name
+        converted[option_name] = read(kind, value, name, full_key, before[option_name])
+    return converted
 
 
 def changed(data: Any, path: Sequence[str], value: Any) -> Any:
-    """A copy of plain data with one value set.
+    """Return a copy of plain data with one value set.
 
     Args:
-        data: mappings, and lists whose items go by their `name`, as of terrain classes.
-        path: keys that lead to the value; mappings that are not there are made.
+        data: mappings, and lists whose items are identified by `name`, such as terrain
+            classes.
+        path: keys that lead to the value; missing mappings are created.
         value: plain data.
 
     Raises:
-        ConfigError: on the way is something that has no keys.
+        ConfigError: If `path` is too long or leads through a value without keys.
     """
     if len(path) > MAX_DEPTH:
         raise ConfigError(
@@ -295,7 +296,8 @@ def changed(data: Any, path: Sequence[str], value: Any) -> Any:
         )
     if not path:
         return value
-    key, rest = path[0], path[1:]
+    key = path[0]
+    remaining = path[1:]
     if isinstance(data, list):
         names = _names(data)
         if key not in names:
@@ -304,21 +306,22 @@ def changed(data: Any, path: Sequence[str], value: Any) -> Any:
                 f"{key!r}.{hint(key, names)}"
             )
         return [
-            changed(item, rest, value) if n == key else item
-            for n, item in zip(names, data, strict=True)
+            changed(item, remaining, value) if name == key else item
+            for name, item in zip(names, data, strict=True)
         ]
     if not isinstance(data, Mapping | None):
         raise ConfigError(
             f"Expected a mapping in which {'.'.join(path)!r} can be set, got {data!r}."
         )
-    return {**(data or {}), key: changed((data or {}).get(key), rest, value)}
+    mapping = data or {}
+    return {**mapping, key: changed(mapping.get(key), remaining, value)}
 
 
 def _names(items: Sequence[Any]) -> list[str]:
-    """What items of a list go by: their `name`, or their number."""
+    """Return the identifier of each item of a list: its `name`, or its index."""
     return [
-        str(item.get("name", n)) if isinstance(item, Mapping) else str(n)
-        for n, item in enumerate(items)
+        str(item.get("name", index)) if isinstance(item, Mapping) else str(index)
+        for index, item in enumerate(items)
     ]
 
 
@@ -327,8 +330,8 @@ def _parsed(kind: Any, value: Any) -> Any:
 
     try:
         parser = _parser(kind)
-        # The parser takes null, and anything but a mapping for a dataclass, for nothing
-        # given.
+        # The parser treats null as a missing value; for a dataclass, it does so with
+        # anything but a mapping.
         if value is None or is_dataclass(kind):
             raise ValueError
         return parser.instantiate(parser.parse_object({"value": value})).value
@@ -345,28 +348,26 @@ def _parser(kind: Any) -> Any:
     return parser
 
 
-# --- to plain data, and to words
+# --- to plain data, and messages
 # --------------------------------------------------------------------
 
 
 def plain(value: Any) -> Any:
-    """Gives a value as plain data for JSON; fields that a dataclass lists as `added`
-    are left out at their default.
+    """Return a value as plain data for JSON.
+
+    Fields that a dataclass lists as `added` are omitted at their default.
 
     Raises:
-        ConfigError: it is something else.
+        ConfigError: If a value cannot be expressed as plain data.
     """
     if is_dataclass(value) and not isinstance(value, type):
-        added, every = (
-            getattr(value, "added", ()),
-            {each.name: each for each in fields(value)},
-        )
-        given = {name: getattr(value, name) for name in every}
-        value = {
-            n: own
-            for n, own in given.items()
-            if n not in added or own != every[n].default
-        }
+        added = getattr(value, "added", ())
+        field_values = {}
+        for field in fields(value):
+            field_value = getattr(value, field.name)
+            if field.name not in added or field_value != field.default:
+                field_values[field.name] = field_value
+        value = field_values
     if isinstance(value, Mapping):
         return {str(name): plain(item) for name, item in value.items()}
     if isinstance(value, tuple | list):
@@ -382,63 +383,24 @@ def plain(value: Any) -> Any:
     )
 
 
-def dataclass_in(kind: Any) -> Any:
-    """The dataclass that a type is or, as in `Config | None`, holds; None where there
-    is none.
-    """
-    return next(
-        (m for m in members_of(kind) if isinstance(m, type) and is_dataclass(m)), None
-    )
+def hint(name: str, names: Iterable[str], prefix: str = "") -> str:
+    """Return a sentence with the most similar name, with a space first, or ''."""
+    similar = difflib.get_close_matches(name, list(names), n=1)
+    return f" Did you mean {prefix + similar[0]!r}?" if similar else ""
 
 
-def members_of(kind: Any) -> tuple[Any, ...]:
-    """What a type allows: the types of a union, the values of a literal, or the type
-    itself.
-    """
-    if get_origin(kind) in (Union, UnionType):
-        return tuple(inner for member in get_args(kind) for inner in members_of(member))
-    return get_args(kind) if get_origin(kind) is Literal else (kind,)
-
-
-def in_words(kind: Any) -> str:
-    """A type as people call it."""
-    members, origin = get_args(kind), get_origin(kind)
-    if origin in (Union, UnionType):
-        return " or ".join(dict.fromkeys(map(in_words, members)))
-    if origin is Literal:
-        return " or ".join(map(repr, members))
-    if origin in (list, tuple):
-        inner = [in_words(member) for member in members if member is not ...]
-        return (
-            f"a list, each {inner[0]}"
-            if len(inner) == 1
-            else f"a list [{', '.join(inner)}]"
-        )
-    if origin is dict or dataclass_in(kind):
-        return "a mapping"
-    return _WORDS.get(kind, getattr(kind, "__name__", str(kind)))
-
-
-def hint(name: str, known: Iterable[str], prefix: str = "") -> str:
-    """Return a sentence with the nearest known name, beginning with a space; empty if
-    none is near.
-    """
-    close = difflib.get_close_matches(name, list(known), n=1)
-    return f" Did you mean {prefix + close[0]!r}?" if close else ""
-
-
-def check_known(what: str, value: Any, known: Iterable[str]) -> None:
-    """Refuses what is not among known names, and gives the nearest.
+def check_known(what: str, value: Any, names: Iterable[str]) -> None:
+    """Check that a value is among names; the message suggests a similar one.
 
     Args:
-        what: what is expected to be known, for the message.
-        value: what was given.
-        known: the names.
+        what: name of the value in the message.
+        value: value to check.
+        names: valid values.
 
     Raises:
-        ConfigError: it is not among them.
+        ConfigError: If the value is not among `names`.
     """
-    names = list(known)
+    names = list(names)
     if value not in names:
         raise ConfigError(
             f"Expected {what} among {', '.join(names)}, got "
@@ -447,14 +409,12 @@ def check_known(what: str, value: Any, known: Iterable[str]) -> None:
 
 
 def one_line(error: BaseException) -> str:
-    """An error as one line."""
+    """Return the type and text of an exception in one line."""
     return " ".join(f"{type(error).__name__}: {error}".split())
 
 
 def fault(error: BaseException) -> str:
-    """An error of a part as one line; our own errors speak for themselves."""
-    return (
-        " ".join(str(error).split())
-        if isinstance(error, BenchnavError)
-        else one_line(error)
-    )
+    """Return the error of a part in one line; BenchNav's own errors without a type."""
+    if isinstance(error, BenchnavError):
+        return " ".join(str(error).split())
+    return one_line(error)

@@ -225,11 +225,11 @@ def test_each_program_prints_its_help_when_bare(program: str) -> None:
         ),
         (["go", "--options", "3"], "Expected --options as a mapping, got '3'."),
         (["go", "--risks", "{a: b}"], "Expected --risks as a list, each text, got"),
-        (["go", "more"], "Expected nothing more, got 'more'. See `x go --help`."),
+        (["go", "more"], "Expected no more arguments, got 'more'. See `x go --help`."),
         (["work"], "Expected PLACE, got none. See `x work --help`."),
         (
             ["go", "--config", "nope.yaml"],
-            "or one of demo, paper, got 'nope.yaml', which is not there.",
+            "or one of demo, paper, got 'nope.yaml', which does not exist.",
         ),
         (["go", "--config", "papr"], "Did you mean 'paper'?"),
         (
@@ -261,7 +261,7 @@ def test_mistakes_on_the_line_are_told_in_the_users_words(
             "depth: {epochs: x}\n",
             "Expected `depth.epochs` of s.yaml as a whole number, got 'x'.",
         ),
-        ("- a\n", "Expected s.yaml to hold settings as `name: value`, got list."),
+        ("- a\n", "Expected s.yaml to contain settings as `name: value`, got list."),
         ("a: [1\n", "Expected YAML, got s.yaml, line 2: did not find"),
     ],
 )
@@ -384,7 +384,7 @@ def test_keys_of_mappings_stay_as_they_are() -> None:
     [
         (
             PermissionError(13, "Permission denied", "runs/new/run.json"),
-            "could not use {here}/runs/new/run.json: Permission denied. Choose another place with --out, or "
+            "could not use {here}/runs/new/run.json: Permission denied. Choose another path with --out, or "
             "change the permissions of {here}.",
         ),
         (

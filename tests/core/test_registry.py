@@ -501,7 +501,7 @@ def test_options_that_came_later_are_left_out_at_their_default(tmp_path: Path) -
         ("Planner", {"second": {"corner": 1}}, "Did you mean 'corners'?"),
         ("Planner", {"reach": 1}, "among reach_m, follower, second, widths, got 'reach'. Did you mean 'reach_m'?"),
         ("Planner", {3: 1}, "got '3'"),
-        ("NoOptions", {"reach": 1}, "none: it has none"),
+        ("NoOptions", {"reach": 1}, "Expected no options for"),
         ("Odd", {}, "Option 'act' of planner './mine.py:Odd' cannot be recorded"),
     ],
 )  # fmt: skip
@@ -517,7 +517,7 @@ def test_what_a_part_says_of_its_options_is_told_in_one_line(file: str) -> None:
     message = refusal(lambda: make("planner", f"{file}:Planner:-1"))
     assert (
         message
-        == "options of planner './mine.py:Planner' could not be made: ValueError: reach is not positive"
+        == "options of planner './mine.py:Planner' could not be created: ValueError: reach is not positive"
     )
     assert "Expected `dt_s` > 0" in refusal(
         lambda: make("robot", {"part": "unicycle", "options": {"dt_s": 0}})

@@ -463,7 +463,7 @@ def test_a_model_is_measured_by_its_file_and_a_folder_without_rights_is_named(
         in message
     )
     assert (
-        f"Choose another place with --out, or change the permissions of {tmp_path}."
+        f"Choose another path with --out, or change the permissions of {tmp_path}."
         in message
     )
 
