@@ -11,7 +11,8 @@ import pytest
 
 from benchnav.core import sources
 from benchnav.core.errors import ConfigError
-from benchnav.core.touched import _is_installed, _is_own, changes_since, snapshot, watch
+from benchnav.core.ownership import is_installed, is_own
+from benchnav.core.touched import changes_since, snapshot, watch
 from benchnav.core.workers import run_calls
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.folder.provenance import code_differences
@@ -21,7 +22,7 @@ from benchnav.eval.run import runner
 from benchnav.eval.run.runner import run_suite
 from benchnav.eval.run.unit import Settings
 
-CACHES: tuple[Any, ...] = (sources.installed_folders, _is_own, _is_installed)
+CACHES: tuple[Any, ...] = (sources.installed_folders, is_own, is_installed)
 
 PART = """
 import importlib, json, os
