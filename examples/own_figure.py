@@ -1,6 +1,4 @@
-"""A figure for reports of your own: when episodes failed, a panel a scenario and a line
-a planner.
-"""
+"""A figure for reports: when episodes failed, by scenario and planner."""
 
 import matplotlib.figure
 import numpy as np

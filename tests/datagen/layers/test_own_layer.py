@@ -162,7 +162,7 @@ def test_other_code_than_was_recorded_is_rejected(
             "values of `draw` of layer 'wetness' of shape",
         ),
         (
-            ("np.clip(0.5", "np.slip(0.5"),
+            ("np.clip(", "np.slip("),
             "`draw` of layer 'wetness' failed: AttributeError",
         ),
         (
