@@ -9,7 +9,7 @@ episode, its ratio to `static` in the same turn, and how much of
 it is learning and planning: medians of three turns. `copula` is given λ within 1 m and
 may replan each 0.5 s. Another table has the milliseconds of an update of one episode,
 on the first and the last 4 m of 24 m: they grow with the cells that a probe reaches,
-    and not with the path. Some two minutes.
+and not with the path. Some two minutes.
 """
 
 import time

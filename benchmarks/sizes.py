@@ -1,8 +1,7 @@
 """Do large things work in little memory? A map of 1024 × 1024 cells, 100 000 maps, a
 raster of 30 000 × 30 000 cells.
 
-    python -m benchmarks.sizes                # 10 minutes and 10 GB of disk, in a
-    temporary folder
+    python -m benchmarks.sizes                # 10 minutes and 10 GB of disk, in a temporary folder
 
 Every line is the command that it names, in processes of its own; the time is from start
 to end, the memory the maximum that one process held. The two processes that make 100

@@ -1,9 +1,8 @@
 """How long a large map takes tile by tile, and how much memory: that of the whole
 process at its most.
 
-    python -m benchmarks.tiles                       # 4096 × 4096 cells, the shipped
-    checkpoint stakes-v1 python -m benchmarks.tiles paper-v1 2048 512     # another
-    checkpoint, side of the map and of a tile
+    python -m benchmarks.tiles                       # 4096 × 4096 cells, the shipped checkpoint stakes-v1
+    python -m benchmarks.tiles paper-v1 2048 512     # another checkpoint, side of the map and of a tile
 
 The map is laid out of shipped maps, drawn at random. What is written is its CVaR at
 level 0.9 and its mean. Times are those of one core.

@@ -1,10 +1,9 @@
 """A traversability model of one's own: a small network with a loss of its own, trained
 as ours are.
 
-    benchnav-train fit examples/own_model.py:CellModel --data DATASET --out
-    checkpoints/mine --members 3 benchnav-train evaluate
-    examples/own_model.py:CellModel@checkpoints/mine --data DATASET benchnav-eval run
-    --model examples/own_model.py:CellModel@checkpoints/mine --data DATASET
+    benchnav-train fit examples/own_model.py:CellModel --data DATASET --out checkpoints/mine --members 3
+    benchnav-train evaluate examples/own_model.py:CellModel@checkpoints/mine --data DATASET
+    benchnav-eval run --model examples/own_model.py:CellModel@checkpoints/mine --data DATASET
 
 The network looks at one cell at a time, at the layers that `inputs` names, and gives
 one Gaussian, clipped to [0, 1]. Its loss is the continuous ranked probability score of

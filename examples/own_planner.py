@@ -1,7 +1,6 @@
 """A planner of one's own: full speed ahead along the best of a fan of arcs.
 
-    benchnav-eval run --planners '[straight,examples/own_planner.py:Fan]' --risks
-    '[mean,cvar:0.9]' --out runs/fan
+    benchnav-eval run --planners '[straight,examples/own_planner.py:Fan]' --risks '[mean,cvar:0.9]' --out runs/fan
 
 It is found by its file; its constructor's parameters are its options, as in
 `{part: examples/own_planner.py:Fan, label: wide fan, options: {arcs: 31}}`. Its tests

@@ -4,7 +4,7 @@ model, its measures, planners.
 Real drives come from a robot's log; see `read_bag.py`. Here robots drive in this
 package's own simulation, over ground that is drawn and written as GeoTIFFs, as a survey
 gives them: elevation, photo, land cover. They log their position and two speeds. All
-    else is done by commands, as for real ground:
+else is done by commands, as for real ground:
 
     python examples/own_site.py [FOLDER]
 

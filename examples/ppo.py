@@ -1,10 +1,9 @@
 """A policy by PPO of stable-baselines3, trained in `benchnav/OffRoad-v1`, and as a
 planner.
 
-    benchnav-datagen create stakes-v1 --splits '[train]' --first 64 --out
-    datasets/stakes-train.h5 python examples/ppo.py datasets/stakes-train.h5 ppo.zip
-    --steps 100000 benchnav-eval run --data stakes-v1 --model stakes-v1 --planners
-    '[straight,examples/ppo.py:Policy]' --out runs/ppo
+    benchnav-datagen create stakes-v1 --splits '[train]' --first 64 --out datasets/stakes-train.h5
+    python examples/ppo.py datasets/stakes-train.h5 ppo.zip --steps 100000
+    benchnav-eval run --data stakes-v1 --model stakes-v1 --planners '[straight,examples/ppo.py:Policy]' --out runs/ppo
 
 `Batched` gives stable-baselines3 all sub-environments as one batch: 16 take a tenth of
 the time of one after the other.

@@ -2,9 +2,8 @@
 log that `import-drives` takes.
 
     pip install rosbags
-    python examples/read_bag.py monday.mcap tuesday/ --odometry /odometry/gnss --command
-    /cmd_vel --out drives.csv benchnav-datagen import-drives drives.csv --dem dem.tif
-    --photo photo.tif --out site.h5
+    python examples/read_bag.py monday.mcap tuesday/ --odometry /odometry/gnss --command /cmd_vel --out drives.csv
+    benchnav-datagen import-drives drives.csv --dem dem.tif --photo photo.tif --out site.h5
 
 A bag is a drive. Odometry (`nav_msgs/Odometry`) has to know the ground: fused with
 GNSS, vision or lidar. That of wheels alone turns with them where they slip, and λ would

@@ -2,13 +2,12 @@
 page.
 
     python -m studies knowledge                    # maps, runs, report
-    python -m studies knowledge maps               # make the maps, or check the digests
-    of those there python -m studies knowledge develop            # the hypotheses on
-    maps to develop on; then their power python -m studies knowledge power
+    python -m studies knowledge maps               # make the maps, or check the digests of those there
+    python -m studies knowledge develop            # the hypotheses on maps to develop on; then their power
+    python -m studies knowledge power
     python -m studies knowledge run primary known  # resumes if it was interrupted
     python -m studies knowledge report             # tables and figures of the page
-    python -m studies knowledge keep               # summaries and rows of finished runs
-    into the study's folder
+    python -m studies knowledge keep               # summaries and rows of finished runs into the study's folder
 
 Maps and runs lie in the folders `--maps_in` and `--out`. With `--maps` only the first
 maps are driven.

@@ -3,7 +3,7 @@
 A study has parts. A part is a suite, which is run into a folder, or a script of the
 study, which computes tables and figures. Suites whose digest stands on a page keep
 their bytes: paths in them are those of the day when they were fixed. `moved` says where
-    such a file is today, and the suite that is run names that.
+such a file is today, and the suite that is run names that.
 """
 
 import importlib

@@ -1,8 +1,7 @@
 """Count the tokens of Python code, without comments, docstrings and layout.
 
     python tools/size.py                    # by package, and by area
-    python tools/size.py --against REVISION # next to those of a revision of the
-    repository
+    python tools/size.py --against REVISION # next to those of a revision of the repository
 
 Run it with Python 3.11: later versions split f-strings into tokens.
 """

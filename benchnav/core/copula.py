@@ -6,7 +6,7 @@ exp(−d²/2ℓ²), and divided by the kernel's norm, so that every cell is stan
 It is made on twice the extent, as a torus, and cropped. Another ℓ or kernel filters the
 same white noise. Each cell's own quantile function then makes λ
 of it, so that marginals are exact: a Gaussian copula (Nelsen 2006, "An introduction to
-    copulas").
+copulas").
 
 Batched NumPy in float64, the same on every machine. Letters in shapes: B fields, H×W
 cells.

@@ -2,7 +2,7 @@
 
 λ is a Gaussian mixture X clipped to [0, 1]; F is the CDF of X. Risk is the *lower* tail
 of λ: at level α both VaR and CVaR speak of the worst share p = 1 − α, the tail. All
-    rests on
+rests on
 
     G(x) = ∫_{−∞}^x F(t) dt = Σ_k w_k s_k (z Φ(z) + φ(z)),  z = (x − m_k) / s_k,
 
@@ -26,7 +26,7 @@ the search, so that none waits for the worst; on other devices all cells take al
 so that nothing waits for the device.
 
 Sources: equation (1) of the paper; Rockafellar and Uryasev (2000), "Optimization of
-    conditional value-at-risk".
+conditional value-at-risk".
 Letters in shapes: K components, N cells.
 """
 

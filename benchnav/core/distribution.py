@@ -20,7 +20,7 @@ smooth. Cells where parabolas still bow much, as with many atoms, are done again
 more halvings. All is in float64; results have the distribution's dtype.
 
 Letters in shapes: H×W cells, *B any leading dimensions, b×h×w cells of a piece, M
-    nodes, S intervals.
+nodes, S intervals.
 """
 
 import math

@@ -15,7 +15,7 @@ where each integrand is 0 well below m_k and 1 / x² well above, and is integrat
 between by Gauss-Legendre quadrature over log x.
 
 Sources: equation (1) of the paper; Gneiting and Raftery (2007), "Strictly proper
-    scoring rules" (CRPS).
+scoring rules" (CRPS).
 Letters in shapes: K components, H×W cells, N cells of a map, *B any leading dimensions.
 """
 

@@ -8,7 +8,7 @@ order or worker asks for them. The transforms from raw bits are ours: libraries 
 theirs between versions, while a bit generator's raw output is specified.
 
 Source: Salmon et al. (2011), "Parallel random numbers: as easy as 1, 2, 3"
-    (Philox4x64-10).
+(Philox4x64-10).
 """
 
 import hashlib

@@ -4,7 +4,7 @@ options of parts, and back.
 The options of a class or function are its keyword parameters; where its one parameter
 is a dataclass named `config`, the fields of that are. A value is read by its annotated
 type: a dataclass here, key by key, so that a message can say which key is wrong;
-    anything else by jsonargparse.
+anything else by jsonargparse.
 """
 
 import difflib

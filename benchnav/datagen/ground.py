@@ -4,7 +4,7 @@ where they are found.
 They say what is known of a cell that nobody has seen: one mixture of λ, never keyed by
 environment, and the mean of every layer; and how strongly two classes of one colour
 hang together. Letters in shapes: B maps, H×W cells, N bins, K components, P pairs of
-    classes.
+classes.
 
 Sources: Dempster et al. (1977), "Maximum likelihood from incomplete data via the EM
 algorithm"; Besag (1975), "Statistical analysis of non-lattice data"

@@ -60,7 +60,7 @@ def import_dem(
     """Make a dataset from a real elevation model; needs the extra benchnav[geo].
 
     Rasters may be anything that GDAL opens: files, https:// and s3:// addresses, zip://
-        archives, mosaics (.vrt).
+    archives, mosaics (.vrt).
 
     Args:
         rasters: What there is of the ground beside its elevation.

@@ -3,7 +3,7 @@ learns on its way.
 
 Observations hold what the robot knows by now, seen from where it stands; never the
 truth. Letters in shapes: B sub-environments, N×N cells of the crop, S state and A
-    action dimensions.
+action dimensions.
 """
 
 from collections.abc import Sequence

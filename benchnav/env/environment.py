@@ -2,9 +2,9 @@
 versions share.
 
 Observations hold what a robot may know: where it is, its goal, and the paper's
-    Observation of the map;
+Observation of the map;
 never the truth. Letters in shapes: B sub-environments, H×W cells, S state and A action
-    dimensions.
+dimensions.
 """
 
 from typing import Any

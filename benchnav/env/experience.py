@@ -3,9 +3,9 @@ way.
 
 A shell over `benchnav.planning.sensing.knowledge`, by which robots learn in evaluations
 too: λ is sensed at each step, and what is known is updated every `replan_every_s` of an
-    episode. Here episodes begin at different times. Letters
+episode. Here episodes begin at different times. Letters
 in shapes: B episodes, M of them, S state dimensions, H×W cells, N cells of all maps
-    together.
+together.
 """
 
 from collections import OrderedDict

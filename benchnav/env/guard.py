@@ -27,7 +27,7 @@ def limit_threads() -> None:
     another number.
 
     Threads do not survive a fork: an operation that waits for those of the parent never
-        ends.
+    ends.
     """
     _limit_threads(os.getpid())
 

@@ -2,7 +2,7 @@
 and reports say of it.
 
 Letters in shapes: N steps, S state and A action dimensions. A state begins with (x, y,
-    θ) in metres and radians.
+θ) in metres and radians.
 """
 
 import math

@@ -13,7 +13,7 @@ class Energy(Metric):
     robot moves at v = λ·u, since slip is 1 − λ, so that P = F·v = λ·F·u of it moves the
     robot and the rest is lost in slip. A drive that keeps P draws P/λ. It cannot draw
     without limit: λ counts as at least `min_traversability`, and the greatest power is
-        P/`min_traversability`. Steps whose action commands no motion draw nothing.
+    P/`min_traversability`. Steps whose action commands no motion draw nothing.
 
     Args:
         power_w: P, the power that moves the robot over ground, in watts; constant.

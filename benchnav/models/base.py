@@ -4,7 +4,7 @@ prediction.
 A model sees an `Observation` and gives a `TraversabilityDistribution`; privileged
 models alone are given the
 Terrain. Source: paper III-B. Letters in shapes: M members, B maps, H×W cells, C
-    classes.
+classes.
 """
 
 import inspect

@@ -4,8 +4,8 @@ the same kind.
 Maps that no part of a model has seen give scores: the PIT values s = F(λ) of their
 cells, drawn within the jump where λ has an atom. Cells of one map are alike, so maps
 are the unit: each counts the same, whatever its cells, and one more map counts as if
-    all of its scores were 0. With n maps, and G_j(t) the share of the scores of map j
-    that are under t,
+all of its scores were 0. With n maps, and G_j(t) the share of the scores of map j
+that are under t,
 
     t(u) = sup {t : (G_1(t) + … + G_n(t) + 1) / (n + 1) ≤ u},    Q_conf(u) = Q(t(u)).
 

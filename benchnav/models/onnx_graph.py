@@ -320,7 +320,7 @@ def _normal_cdf(z: Tensor) -> Tensor:
     """Φ in float64 to 10⁻⁷ of itself, also far below 0.
 
     Source: Hart's approximation as of West (2005), "Better approximations to cumulative
-        normal functions".
+    normal functions".
     """
     x = z.abs().clamp(max=_FARTHEST)
     beyond = x + 0.65
@@ -339,7 +339,7 @@ def _normal_score(share: Tensor) -> Tensor:
     """Φ⁻¹, which ONNX has not, to 10⁻⁸ of itself.
 
     Source: Acklam (2003), "An algorithm for computing the inverse normal cumulative
-        distribution function".
+    distribution function".
     """
     share = share.clamp(_LEAST_SHARE, 1 - 2**-53)
     centre = share - 0.5

@@ -6,8 +6,8 @@ is the goal, or a local planner's way-point; traversability is read at the state
 the move, as the risk setting gives it: the least λ̂ that motion is given does not bound
 it. In the Gymnasium environment J is given the λ that the robot met. Ground that is not
 free is no concern of J: the `Problem` adds its penalty. An objective whose constructor
-    has a parameter `robot` or `goal_radius_m` is given the task's. Source: paper III-C
-    and IV-A. Letters in
+has a parameter `robot` or `goal_radius_m` is given the task's. Source: paper III-C
+and IV-A. Letters in
 shapes: *B any leading dimensions, S state and A action dimensions.
 """
 

@@ -2,7 +2,7 @@
 
 It holds what is *predicted* alone: the truth stays with the simulation. Letters in
 shapes: B episodes, H×W cells, S state and A action dimensions, *K any further
-    dimensions.
+dimensions.
 """
 
 from dataclasses import dataclass, field, replace

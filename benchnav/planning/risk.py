@@ -83,7 +83,7 @@ class ExpectedTime(RiskMeasure):
 
     A risk-neutral robot plans with it where the λ field stays the same during an
     episode: unlike the mean it counts the time that is lost on slow terrain, and it
-        considers no tail. A lower floor makes immobilising terrain dearer.
+    considers no tail. A lower floor makes immobilising terrain dearer.
 
     Args:
         floor: minimum speed, as a fraction of the commanded one, in (0, 1].

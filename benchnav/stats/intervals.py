@@ -165,11 +165,11 @@ def total_time_interval(
     Few maps seldom show a rare failure, so that neither a bootstrap nor Student's
     interval of T_total knows what it
     would cost: where 19 in 20 arrive, a bootstrap over 20 maps covers 85 % in place of
-        95 %. So the interval is put
+    95 %. So the interval is put
     together from two: that of the share of failures, times what a failure costs, and
     Student's of the time without it (the method of variance estimates recovery).
     Source: Zou and Donner (2008), "Construction of confidence limits about effect
-        measures: a general approach".
+    measures: a general approach".
 
     Args:
         time_s: mean of T_total by map, a failure counted as T, or its difference, shape

@@ -4,7 +4,7 @@ is from some twenty maps on.
 A difference d with standard deviation σ is significant with probability `POWER` if
 d·√M/σ is the quantile of 1 − α/2
 plus that of `POWER`. Source: Chow, Shao and Wang (2008), "Sample Size Calculations in
-    Clinical Research", 3.1.
+Clinical Research", 3.1.
 """
 
 import math

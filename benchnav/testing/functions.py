@@ -2,7 +2,7 @@
 tried on random arguments.
 
 Letters in shapes: *B leading, S state and A action dimensions; of maps B, H×W cells, K
-    components.
+components.
 """
 
 import itertools

@@ -55,8 +55,8 @@ def check_model(
     PyTorch; the same answer when asked again, and for a map alone what it is in a
     batch; `class_names`, where given, one a class, whose probabilities the distribution
     gives: of a mixture a component, or what `group` sums up; `member_probabilities`,
-        where given, of shape [M, B, C, H, W], and the class probabilities, in each
-        cell, in the order of their average, which may have been calibrated as a whole.
+    where given, of shape [M, B, C, H, W], and the class probabilities, in each
+    cell, in the order of their average, which may have been calibrated as a whole.
 
     A class of trainable models is tried as training uses it: its hooks fit, a step
     changes its weights, cells whose λ was not observed are left out of a finite loss,

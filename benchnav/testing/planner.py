@@ -45,10 +45,10 @@ def check_planner(
 
     For the tests of whoever writes a planner, as Gymnasium's `check_env` is for those
     of an environment: one that passes can be evaluated like any other, and its rows do
-        not hang on the batch, the order or what is drawn.
+    not hang on the batch, the order or what is drawn.
 
     The maps: free ground, a closed wall, a start on ground predicted to immobilise the
-        robot, a wall with a gap.
+    robot, a wall with a gap.
     The contract: finite actions within the robot's bounds, of shape [B, A], in the
     states' dtype and on their device; a `Plan` with a `PlanStatus` for each episode,
     and layers of the shapes that it names; the problem, the step and the plan state

@@ -10,7 +10,7 @@ less own cost over maps and moments with its 95 % interval by maps (Student's t)
 seconds, and how long a solve takes for one robot of a batch. CVaR of few fields is too
 low for
 any actions: so it has the same of those of the step before, which these fields did not
-    choose.
+choose.
 """
 
 import time

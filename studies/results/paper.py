@@ -2,7 +2,7 @@
 
 Theirs: Wilson's interval of 20 episodes, and Student's of a mean of 20 by its standard
 deviation. p: Fisher's exact test of success, Welch's of T_total, Holm's correction over
-    the scenarios, each of the two apart.
+the scenarios, each of the two apart.
 """
 
 from collections.abc import Mapping

@@ -77,7 +77,7 @@ def advance_pair(
 
     The motion of `ROVER` and the cost of `TimeAndDistance` are written out, with x, y
     and θ apart: by `robot` and `objective`, which take whole states, a step takes three
-        times as long.
+    times as long.
 
     Args:
         padded_ground: a linear field and then an angular one, shape [B·M, 2·N]; the

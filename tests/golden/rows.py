@@ -1,8 +1,7 @@
 """Freeze the rows of whole runs as digests, and compare runs of later code with them.
 
-    python -m tests.golden.rows freeze --work FOLDER    # runs the suites, writes
-    tests/golden/rows.json python -m tests.golden.rows check --work FOLDER     # runs
-    them again, names each column that differs
+    python -m tests.golden.rows freeze --work FOLDER    # runs the suites, writes tests/golden/rows.json
+    python -m tests.golden.rows check --work FOLDER     # runs them again, names each column that differs
 
 A row is the same on one kind of machine with one version of PyTorch; `rows.json` says
 which.

@@ -5,7 +5,7 @@ Splits have strips of the ground, with ground between them that no map shows (`t
 A drive belongs to the split on whose strip most of its rows lie, and its rows on the
 strip of another are left out. So no cell and no drive tells two
 splits anything. Letters in shapes: N rows, D drives, S splits, M cells that were driven
-    over.
+over.
 """
 
 from collections.abc import Sequence

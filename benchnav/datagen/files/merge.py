@@ -2,7 +2,7 @@
 of one dataset.
 
 What is merged is packed already: files are copied into a folder, or their chunks into
-    one file.
+one file.
 """
 
 import json

@@ -63,7 +63,7 @@ def open_fractal(
         float64, shape [B, H, W].
 
     Source: von Kármán (1948), "Progress in the statistical theory of turbulence", for
-        the spectrum.
+    the spectrum.
     """
     tiles_y, tiles_x = (-(-cells // reference_cells) for cells in shape)
     covered = tiles_y * reference_cells, tiles_x * reference_cells

@@ -49,7 +49,7 @@ class Suite:
     A planner, model, risk measure, robot, objective, sensor, belief, metric or figure
     is given as NAME, package.module:Name, path/to/file.py:Name, or {part: NAME, label:
     LABEL, options: {...}}; in a program also as an object, which is replaced by the
-        description that creates it again.
+    description that creates it again.
 
     Args:
         data: Path or id of a dataset with splits test/SCENARIO.

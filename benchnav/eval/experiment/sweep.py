@@ -74,7 +74,7 @@ def each_part(kind: str, part: Part) -> list[Part]:
     A list that the option itself takes, such as a pair of bounds, is one value. Each
     part is labelled by its
     values: `cvar:0.9` for the first option, which stands behind a colon, `astar_dwa
-        lookahead_m=4` for others.
+    lookahead_m=4` for others.
 
     Args:
         kind: of the part, as in `registry.KINDS`.

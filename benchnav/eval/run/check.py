@@ -3,7 +3,7 @@ rejected before anything is run.
 
 Nothing is predicted and nothing is planned. A suite is a product, and some of its
 combinations make no sense: a planner that cannot steer a robot, `single-class` with a
-    model that knows no classes. They are left out, each with its reason.
+model that knows no classes. They are left out, each with its reason.
 """
 
 import json

@@ -4,7 +4,7 @@ A GPU works through what it is given while the next is prepared, as long as nobo
 for its numbers. So on devices other than the CPU the loop looks at which episodes still
 run at every few steps only, and faults are kept as
 tensors until the end. Letters in shapes: B episodes, N steps, S state and A action
-    dimensions.
+dimensions.
 """
 
 import itertools

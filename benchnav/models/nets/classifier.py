@@ -7,7 +7,7 @@ Cells whose class is not known count neither in losses nor in measures.
 
 Sources: Ronneberger et al. (2015), "U-Net"; He et al. (2016), "Deep residual learning".
 Letters in shapes: B maps, H×W cells, C classes, N channels of the images that the
-    network is given.
+network is given.
 """
 
 import inspect
@@ -79,7 +79,7 @@ class TerrainClassifier(TrainableNetwork):
 
         A soft Dice loss may be added, which weighs rare classes as much as frequent
         ones. Source: Milletari et al. (2016), "V-Net". The focal loss weighs cells that
-            are classified well less than others.
+        are classified well less than others.
         """
         smoothing, dice, focal = (
             self.config.label_smoothing,

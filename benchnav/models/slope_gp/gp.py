@@ -22,7 +22,7 @@ The likelihood is that of the censored Gaussian: observed traversability is the 
 plus Gaussian noise, clipped to [0, 1]. Inside (0, 1) an observation has the Gaussian
 density; at 0 and 1 it has the probability mass of all that was
 clipped there. Source: Tobin (1958), "Estimation of relationships for limited dependent
-    variables".
+variables".
 """
 
 import math

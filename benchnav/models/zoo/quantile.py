@@ -8,7 +8,7 @@ monotone. No loss
 tells the ends of a distribution: of what is beyond the outermost levels half is put on
 0 and on 1, so that no observation is impossible.
 Sources: Koenker and Bassett (1978), "Regression quantiles"; Powell (1986), "Censored
-    regression quantiles". Letters in
+regression quantiles". Letters in
 shapes: B maps, H×W cells, Q inner levels.
 """
 

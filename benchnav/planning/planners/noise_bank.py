@@ -1,7 +1,7 @@
 """The noise of MPPI: normal numbers that are drawn once and read anew at each step.
 
 Letters in shapes: A action dimensions, T horizon steps, K samples, N numbers of a part
-    of the bank.
+of the bank.
 """
 
 from dataclasses import dataclass

@@ -1,7 +1,7 @@
 """What a planner is and what it returns, and what a local planner is.
 
 A planner is stateless: `init` makes a plan state, `plan` takes one and returns the
-    next. Both are
+next. Both are
 pure: the same arguments give the same result. Letters in shapes: B episodes, N points,
 M samples, E edges, S state and A action dimensions.
 """
@@ -100,7 +100,7 @@ class Planner(Specified, ABC, Generic[State]):
 
     `init` and `plan` are to be written, all else has a default. A planner holds its
     settings alone: whatever evolves is in the plan state, so that one planner serves
-        any batch in any order.
+    any batch in any order.
     """
 
     steers: tuple[tuple[str, ...], ...] | None = None

@@ -1,7 +1,7 @@
 """Driving straight at the goal: the baseline that a planner has to beat.
 
 `Straight` is blind: it uses the goal alone. Planners with a global path recover by the
-    same control law.
+same control law.
 Letters in shapes: B episodes, S state and A action dimensions.
 """
 

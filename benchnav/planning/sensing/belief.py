@@ -4,7 +4,7 @@ told, and the static one.
 A belief begins with a model's prediction and the law of the ground, is told what is
 sensed, and gives the distribution
 of λ in each cell. It is pure: what it knows is in a state that it is given and gives
-    back.
+back.
 Letters in shapes: B episodes, H×W cells, M drawn fields.
 """
 

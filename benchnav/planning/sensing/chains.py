@@ -10,7 +10,7 @@ place, of expectation propagation at the more probable label of its cell. Only c
 near what is new are drawn (`sites`). A labelling that none of the chains holds comes
 back by these moves alone.
 Letters in shapes: B episodes, H×W cells, R×C cells of a block, N observed cells, S
-    chains.
+chains.
 """
 
 from dataclasses import replace

@@ -14,7 +14,7 @@ within `_BEYOND` ℓ more, and only where mean or standard deviation of the scor
 by `_LEAST_CHANGE` or more. λ that a prediction holds impossible is taken for the end of
 what it allows, `_FARTHEST` standard deviations off.
 Letters in shapes: B episodes, H×W cells, N observations, R×C cells of a block, K values
-    of λ.
+of λ.
 """
 
 import math
@@ -230,7 +230,7 @@ class Copula(Belief[CopulaState]):
         """Makes of what was noted in one episode what is known; writes into the state.
 
         Episodes go one by one: as many observations as each has, so that none depends
-            on the others.
+        on the others.
         """
         maps = {name: getattr(state, name)[own].numpy() for name in _MAPS}
         observed = ~np.isnan(maps["value"])
@@ -459,7 +459,7 @@ def _condition(
 
     Cells are rewritten within `_REACH` ℓ of what is new, from all that was observed
     within `_BEYOND` ℓ more: nothing that bears on them is left out, so that nothing is
-        forgotten.
+    forgotten.
     """
     length = float(field.length[own])
     reach = math.ceil(_REACH * length)

@@ -5,7 +5,7 @@ For a belief that learns λ is sensed at each step. Now and then the robot looks
 belief is updated, after a new prediction where more was seen. A `Learner` holds how
 that is done, a `Knowledge` what is known by now; only sensors are given the `Truth`.
 Letters in shapes: B episodes, S state dimensions, H×W cells, N cells of all maps
-    together.
+together.
 """
 
 from collections.abc import Callable, Sequence

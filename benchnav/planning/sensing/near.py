@@ -9,10 +9,10 @@ out of range, out of the field of view or hidden under the horizon raises no hor
 which cells are seen depends on nothing but the ground that is seen, as long as what is
 hidden stays lower than its horizon.
 Letters in shapes: B episodes, S state dimensions, H×W cells, N cells of the rings, seen
-    or in them all.
+or in them all.
 
 Source: Franklin, Ray and Mehta (1994), "Geometric algorithms for siting of air defense
-    missile batteries", for XDraw.
+missile batteries", for XDraw.
 """
 
 import math

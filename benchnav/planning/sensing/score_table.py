@@ -5,7 +5,7 @@ A row is of one cell and has the normal scores of `VALUES` under the cell's pred
 which give P(λ ≤ value) where something is known of the score. Rows are made of the
 cells that are asked for alone, and kept for when they are asked for again.
 Letters in shapes: B episodes, H×W cells, *B any leading dimensions, K values of λ, R
-    rows, N cells.
+rows, N cells.
 """
 
 import math

@@ -201,7 +201,7 @@ class Probe(Sensor):
     number; the noise is added to that, so that what is sensed is in [0, 1], and ground
     beside an atom at 0 or 1 can be mistaken for it. An atom is read as
     it is: its λ does not tell where in it the rank lies, and a rank drawn for it would
-        tell neighbours what is not so.
+    tell neighbours what is not so.
 
     Args:
         radius_m: how near.

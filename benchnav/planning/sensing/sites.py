@@ -2,7 +2,7 @@
 the nearest observed ones.
 
 Letters in shapes: B episodes, H×W cells, R×C cells of a block, N observed cells, S
-    chains.
+chains.
 """
 
 import math

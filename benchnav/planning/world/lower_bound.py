@@ -30,7 +30,7 @@ augmented Lagrangian method, one Poisson equation and one projection on discs a 
 Hamilton–Jacobi equations"). How well it has converged bears on how large the bound is,
 and not on
 whether it holds: the slope of each triangle is measured in float64, and W divided by
-    the greatest excess.
+the greatest excess.
 
 λ and positions are of single precision: a step may lead farther, and be read farther
 off, by some units in the last place, which are added to steps and distances. Letters in

@@ -164,7 +164,7 @@ def search(problem: Problem, costs: Iterable[Tensor] | None = None) -> CostToGo:
     radius.
 
     Works on the host: on another device this copies the maps there and the answer back,
-        once.
+    once.
 
     Args:
         problem: B problems.

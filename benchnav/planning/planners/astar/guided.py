@@ -3,7 +3,7 @@
 A* gives the cheapest path from wherever the robot stands; the local planner heads for a
 way-point on it. A robot that its local planner holds in place is steered along the
 path. Source: paper IV-A1, after Fan et al. (2021), "STEP". Letters in shapes: B
-    episodes, A action dimensions.
+episodes, A action dimensions.
 """
 
 from dataclasses import dataclass, replace

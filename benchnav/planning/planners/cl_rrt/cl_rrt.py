@@ -48,7 +48,7 @@ plan, and from what.
   do (100 m by default); a goal farther off is approached along partial paths.
 
 Letters in shapes: B episodes, M of which plan anew, D edges of a path, R edges of a
-    round.
+round.
 """
 
 import math

@@ -8,7 +8,7 @@ Traversability that scales both velocities alike thus bears on when the robot is
 somewhere, hardly on where. The robot is driven by (v, ω), as a unicycle is. One whose
 turn rate changes within a limit would weave about a path that it looks too short a way
 ahead on: the look-ahead distance is at least what it drives while its turn rate builds
-    up.
+up.
 
 Where the robot is along the path is itself a state, its progress: an arc length that
 each step moves forward to the robot's projection on the path's tangent. It never goes

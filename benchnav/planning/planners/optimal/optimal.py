@@ -8,7 +8,7 @@ What it drives is feasible, so the least time is at most its time: it is the
 near-optimal reference, and no bound. Both plan for the paper's unicycle only, which
 drives forward, and once: a map that changes is refused.
 Letters in shapes: B episodes, H×W cells, Q headings, K ways, N points, L levels of
-    dwell time.
+dwell time.
 """
 
 import math
@@ -343,7 +343,7 @@ class NearOptimal(Optimal):
         see `Optimal`.
 
         Not T itself: the grid makes times a little too long, and a path that takes
-            little more than T may arrive.
+        little more than T may arrive.
         """
         return 2 * costs.loss
 

@@ -8,7 +8,7 @@ takes 1/λ times as long: where arcs end and which cells they pass is the same f
 cells of all maps. So a sweep over all states is a convolution of the values for each
 arc. Between cells values are interpolated, bilinearly, over those that are open.
 Source: Falcone and Ferretti (2013), "Semi-Lagrangian approximation schemes for linear
-    and Hamilton-Jacobi equations".
+and Hamilton-Jacobi equations".
 
 Where terrain immobilises a robot after some dwell time, a state has several costs to
 go: the least of all drives, and those of drives that can still be begun after more and

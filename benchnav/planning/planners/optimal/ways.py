@@ -5,7 +5,7 @@ high in it, so that a robot that looks at its next moves alone may turn to and f
 therefore end at centres, up to some cells away: a turn on the spot, along a circle at
 full speed, and straight on.
 Letters in shapes: B episodes, H×W cells, Q headings, K ways, N points, L levels of
-    dwell time.
+dwell time.
 """
 
 import math
