@@ -53,13 +53,11 @@ _LONGEST = (
     2000  # characters of a message, of which the middle of a longer one is left out
 )
 
-_Flag = tuple[
-    list[str], str
-]  # the option that a flag stands for, keys within its value; and its text
+# the option that a flag stands for, keys within its value; and its text
+_Flag = tuple[list[str], str]
 
-Device = Literal[
-    "auto", "cpu", "cuda"
-]  # of the flag --device; see `benchnav.core.device`
+# of the flag --device; see `benchnav.core.device`
+Device = Literal["auto", "cpu", "cuda"]
 
 
 @dataclass(frozen=True)
@@ -435,9 +433,8 @@ def _print_help_of(program: str, command: Command) -> int:
         action = parser.add_argument(
             name, help=documented.get(name), nargs="*" if is_list else None
         )
-        action.required = (
-            not is_list
-        )  # whether an empty list will do is the function's to say
+        # whether an empty list will do is the function's to say
+        action.required = not is_list
     skip: set[str | int] = set(command.positionals)
     for kind in command.settings.values():
         parser.add_class_arguments(kind, as_group=False)

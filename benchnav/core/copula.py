@@ -18,9 +18,8 @@ from numpy import ndarray
 from benchnav.core import rng
 
 KERNELS = ("gaussian", "matern32")
-LONGEST_CORRELATION = (
-    1 / 4
-)  # of a map's shorter side, so that the torus it is made on does not show
+# of a map's shorter side, so that the torus it is made on does not show
+LONGEST_CORRELATION = 1 / 4
 _MATERN32 = 1.3576766739458990  # solves (1 + a) exp(−a) = exp(−1/2)
 
 

@@ -43,10 +43,11 @@ _VAR_ERROR, _CVAR_ERROR = 1e-10, 1e-9  # at which a search ends
 _SHARE_ERROR = 1e-9  # of F, as a share of the tail
 _STRAIGHT = 0.1  # standard deviations within which a density hardly changes
 _LEAST_GAP = 1e-11  # between bounds
+# of √½ z, beyond which densities are too small to be normal numbers
 _REACH = {
     torch.float32: 9.0,
     torch.float64: 26.0,
-}  # of √½ z, beyond which densities are too small to be normal numbers
+}
 _MOST_ODDS = 16.0  # logarithms; beyond them float32 holds no share but 0 and 1
 _LOGISTIC_STD = math.sqrt(3) / math.pi  # standard deviations a unit of log odds
 
@@ -123,9 +124,8 @@ class Cells:
 
 def mean(cells: Cells) -> Tensor:
     """Computes E[λ], with its gradient in the parameters, shape [N]."""
-    return (1 - (cells.integral(1.0) - cells.integral(0.0))).clamp(
-        0, 1
-    )  # rounding is by up to 1e-16
+    # rounding is by up to 1e-16
+    return (1 - (cells.integral(1.0) - cells.integral(0.0))).clamp(0, 1)
 
 
 @torch.no_grad()
@@ -278,9 +278,8 @@ def _move(
     excess = share - tail
     under = excess < 0
     low, high = torch.where(under, value, low), torch.where(under, high, value)
-    step = (odds - torch.logit(share)) * (
-        share * (1 - share) / density
-    )  # not a number where F is 0 or 1
+    # not a number where F is 0 or 1
+    step = (odds - torch.logit(share)) * (share * (1 - share) / density)
     moved = (value + step).clamp(0, 1)
     inside = (moved >= low) & (moved <= high)
     if halve:

@@ -6,8 +6,8 @@ the least x with F(x) ≥ u. Risk is the *lower* tail of λ. A subclass says wha
 are and may give more in closed form; the base has all else as an integral of F:
 
     E[λ] = 1 − ∫₀¹ F,    CVaR_α = v − 1/p ∫₀^v F at p = 1 − α and v = Q(p),
-    E[1 / max(λ, ε)] = 1 + ∫₁^{1/ε} F(1/t) dt,    CRPS = ∫₀^y F² + ∫_y¹ (1 − F)² at an
-    observed y.
+    E[1 / max(λ, ε)] = 1 + ∫₁^{1/ε} F(1/t) dt,
+    CRPS = ∫₀^y F² + ∫_y¹ (1 − F)² at an observed y.
 
 The worst share p of λ has the CDF min(F / p, 1), which gives the CVaR of the time 1 /
 max(λ, ε).
@@ -551,9 +551,8 @@ def _trapezia(
         layer[:filled] = part.view(filled, *shape[1:])
     doubt[:filled] = (rise * width)[:filled].abs()
     for new in range(filled, len(begin)):
-        worst = (
-            doubt[:new].max(0, keepdim=True).indices
-        )  # several times quicker than `argmax`
+        # several times quicker than `argmax`
+        worst = doubt[:new].max(0, keepdim=True).indices
         x, whole, left, step = (layer.gather(0, worst)[0] for layer in intervals[:4])
         half = whole / 2
         middle = function(x + half)
@@ -576,7 +575,6 @@ def _trapezia(
         for layer, part in zip(intervals, added, strict=True):
             layer[new] = part.roll(1, 0)
     total = width * (value + rise / 2 + bow)
-    jumps = (
-        12 * width * bow.square() / rise.abs().clamp(min=1e-300)
-    )  # a jump's bow is a twelfth of it
+    # a jump's bow is a twelfth of it
+    jumps = 12 * width * bow.square() / rise.abs().clamp(min=1e-300)
     return total.flatten(0, 1).sum(0), jumps.flatten(0, 1).sum(0)

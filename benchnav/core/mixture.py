@@ -8,8 +8,8 @@ not depend on how many others there are.
 
 The expected time over the ground, in units of its time at λ = 1, is for a least speed ε
 
-    E[1 / max(λ, ε)] = 1 + ∫_ε^1 F(x) / x² dx = Σ_k w_k (1 + ∫_ε^1 Φ((x − m_k) / s_k) /
-    x² dx),
+    E[1 / max(λ, ε)] = 1 + ∫_ε^1 F(x) / x² dx
+                     = Σ_k w_k (1 + ∫_ε^1 Φ((x − m_k) / s_k) / x² dx),
 
 where each integrand is 0 well below m_k and 1 / x² well above, and is integrated in
 between by Gauss-Legendre quadrature over log x.
@@ -313,9 +313,8 @@ class TraversabilityMixture(TraversabilityDistribution):
         if self.group in (None, tuple(range(count))):
             return self.weights
         weights = self.weights.movedim(-3, 0)
-        total = weights.new_zeros(
-            count + 1, *weights.shape[1:]
-        )  # the last for what belongs to no class
+        # the last for what belongs to no class
+        total = weights.new_zeros(count + 1, *weights.shape[1:])
         places = [count if number < 0 else number for number in self.group]
         total.index_add_(0, torch.tensor(places, device=weights.device), weights)
         return total[:count].movedim(0, -3)

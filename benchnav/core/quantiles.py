@@ -54,9 +54,8 @@ class QuantileDistribution(TraversabilityDistribution):
         """Checks the levels and the shape; that values ascend takes a look at all of
         them, which `check_model` does.
         """
-        levels = (
-            self.levels
-        )  # plain numbers: PyTorch, as it writes a graph, would follow an array
+        # plain numbers: PyTorch, as it writes a graph, would follow an array
+        levels = self.levels
         steps = [upper - lower for lower, upper in pairwise(levels)]
         expect(
             len(levels) >= _LEAST_LEVELS
@@ -149,9 +148,8 @@ class QuantileDistribution(TraversabilityDistribution):
         tail = tail_of(level)
         check_floor(floor)
         low, high, width = self._intervals()
-        part = ((tail - self._levels()[:-1]) / width).clamp(
-            0, 1
-        )  # of each interval, that is in the tail
+        # of each interval, that is in the tail
+        part = ((tail - self._levels()[:-1]) / width).clamp(0, 1)
         high, width = torch.lerp(low, high, part), width * part / tail
         slow, fast = low.clamp(min=floor), high.clamp(min=floor)
         # Of an interval this share is under the floor, and 1 / λ has the mean log(b /
@@ -230,7 +228,6 @@ def quantiles_at(
         Of shape [*B, H, W].
     """
     values = (distribution.quantile(read).clamp(0, 1) for read in reads)
-    ascending = list(
-        accumulate(values, torch.maximum)
-    )  # rounding may have changed the order
+    # rounding may have changed the order
+    ascending = list(accumulate(values, torch.maximum))
     return QuantileDistribution(torch.stack(ascending, -3), levels)

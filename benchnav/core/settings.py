@@ -50,8 +50,7 @@ class Option:
     default: Any
 
 
-# --- options of classes and functions
-# ---------------------------------------------------------------
+# --- options of classes and functions ---
 
 
 def list_options(
@@ -139,8 +138,7 @@ def call(what: str, target: Callable[..., Any], arguments: Mapping[str, Any]) ->
         ) from error
 
 
-# --- from plain data
-# --------------------------------------------------------------------------------
+# --- from plain data ---
 
 
 def of(owner: str) -> Naming:
@@ -345,8 +343,7 @@ def _parser(kind: Any) -> Any:
     return parser
 
 
-# --- to plain data, and to words
-# --------------------------------------------------------------------
+# --- to plain data, and to words ---
 
 
 def plain(value: Any) -> Any:

@@ -50,21 +50,20 @@ from benchnav.core.sources import (
     installed_folders,
 )
 
-Touches = dict[
-    str, str
-]  # what identifies the content, by "file PATH", "package NAME" or "variable NAME"
+# what identifies the content, by "file PATH", "package NAME" or "variable NAME"
+Touches = dict[str, str]
 
+# which benchnav sets for its workers
 THREADS = (
     "OMP_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",
     "MKL_NUM_THREADS",
-)  # which benchnav sets for its workers
+)
 _SYSTEM = ("/proc/", "/sys/", "/dev/")
 
 # By the source file that the event counts for.
-_files: dict[
-    str, dict[str, str]
-] = {}  # digests by absolute path, as files were when they were last read
+# digests by absolute path, as files were when they were last read
+_files: dict[str, dict[str, str]] = {}
 _modules: dict[str, set[str]] = {}  # names of modules
 _variables: dict[str, dict[str, str]] = {}  # digests of values by name
 _written: dict[str, set[str]] = {}  # files that were opened for writing too: output
@@ -201,8 +200,7 @@ def _relative(path: str) -> str:
     return os.path.relpath(path, here) if path.startswith(f"{here}{os.sep}") else path
 
 
-# --- what happens in this process
-# ---------------------------------------------------------------------
+# --- what happens in this process ---
 
 
 def _hook(event: str, arguments: tuple[Any, ...]) -> None:
@@ -333,8 +331,7 @@ def _calling_sources() -> set[str]:
     return sources
 
 
-# --- whose a file is
-# ----------------------------------------------------------------------------------
+# --- whose a file is ---
 
 _OURS = f"{PACKAGE}{os.sep}"
 

@@ -30,11 +30,12 @@ from benchnav.datagen.schema import Maps
 
 TRAIN = "train"
 
+# which an `Observation` has beside those of the dataset
 _SEEN_LAYERS = (
     "rgb",
     "elevation_m",
     "slope_deg",
-)  # which an `Observation` has beside those of the dataset
+)
 _BINS = 1024  # of λ between 0 and 1
 _COMPONENTS = 8
 _STEPS = 1000  # of EM
@@ -145,9 +146,8 @@ def fit_mixture(inner: ndarray, ends: ndarray) -> tuple[ndarray, ndarray, ndarra
         own = weights[:_COMPONENTS, None]
         z = (centre - means[:, None]) / stds[:, None]
         density = own * _density(z) / stds[:, None]
-        inside = (
-            inner * density / density.sum(0).clip(min=1e-300)
-        )  # counts that belong to each component
+        # counts that belong to each component
+        inside = inner * density / density.sum(0).clip(min=1e-300)
         # Beyond each end, by its distance in standard deviations outwards.
         reach = np.stack([means, 1 - means], 1) / stds[:, None]
         tail = ndtr(-reach)

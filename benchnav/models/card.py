@@ -42,9 +42,8 @@ def card_of(
         "tags": ["traversability", "robotics"],
         "datasets": datasets,
     }
-    is_own = code and model not in registry.names(
-        "model"
-    )  # an installed class is found by its name
+    # an installed class is found by its name
+    is_own = code and model not in registry.names("model")
     place = f"path/to/file.py:{model}@{name}" if is_own else name
     own = (
         f"The class `{model}` is a user's own and not in this folder: name the file "

@@ -53,11 +53,12 @@ CONFIG, GROUND = "config.json", "ground.json"
 FUSED = "fused"
 CLASSIFIER, GP = "classifier", "gp"
 
+# of a part; all else is written as it is
 _APART = (
     "tensors",
     "data_id",
     "data_digest",
-)  # of a part; all else is written as it is
+)
 _PACKAGES = ("torch", "lightning", "gpytorch", "segmentation-models-pytorch", "numpy")
 
 
@@ -242,9 +243,8 @@ def open_place(folder: str | Path) -> Iterator[tuple[Path, Path]]:
         ConfigError: the name is that of something else.
     """
     check_output(str(folder))
-    place = real_place(
-        Path(os.path.normpath(folder))
-    )  # a/../b is b, whether or not there is an a
+    # a/../b is b, whether or not there is an a
+    place = real_place(Path(os.path.normpath(folder)))
     restore(place)
     refuse_taken(
         place,

@@ -214,15 +214,15 @@ def _quantile(distribution: TraversabilityDistribution, share: Tensor) -> Tensor
     # Each operation of a halving is written 40 times: what can be is computed before.
     if isinstance(distribution, TraversabilityMixture):
         weights, means, stds = _mixture(distribution)
+        # Φ = ½ (1 + erf)
         scale, sought = (
             math.sqrt(0.5) / stds,
             (2 * share - 1).unsqueeze(1),
-        )  # Φ = ½ (1 + erf)
+        )
 
         def reached(value: Tensor) -> Tensor:
-            erf = torch.erf(
-                ((value - means) * scale).float()
-            ).double()  # which is ONNX's own
+            # which is ONNX's own
+            erf = torch.erf(((value - means) * scale).float()).double()
             return (weights * erf).sum(1, keepdim=True) >= sought
 
     else:
@@ -279,9 +279,8 @@ def _integral(distribution: TraversabilityDistribution, value: Tensor) -> Tensor
     if isinstance(distribution, TraversabilityMixture):
         weights, means, stds = _mixture(distribution)
         z = torch.stack([-means, value.unsqueeze(1) - means]) / stds
-        below = z * _normal_cdf(z) + torch.exp(-z * z / 2) / math.sqrt(
-            2 * math.pi
-        )  # ∫ of Φ up to z
+        # ∫ of Φ up to z
+        below = z * _normal_cdf(z) + torch.exp(-z * z / 2) / math.sqrt(2 * math.pi)
         return (weights * stds * (below[1] - below[0])).sum(1)
     edges = _edges(distribution, value)
     low, width = edges[:-1], edges[1:] - edges[:-1]

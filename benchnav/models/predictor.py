@@ -380,9 +380,8 @@ def find_checkpoint(source: str | Path) -> Path:
         if (path / CONFIG).is_file():
             return path
     if Path(source).is_dir():
-        return Path(
-            source
-        )  # to be refused by the reader, which says what is missing there
+        # to be refused by the reader, which says what is missing there
+        return Path(source)
     for path in places:
         refuse_unfinished(path)
     if hub.is_address(source):

@@ -65,9 +65,8 @@ def best_set_p(
     # Sums of whole numbers under 2²⁴ are exact in float32, in whatever order.
     dtype = np.float32 if maps * int(size.max()) ** 2 < 2**24 else np.float64
     counts = bootstrap_counts(maps, 2 * _ADDED).astype(dtype)
-    ahead = np.full(
-        (count, count), -np.inf
-    )  # t of the row's condition before the column's
+    # t of the row's condition before the column's
+    ahead = np.full((count, count), -np.inf)
     for one in range(count - 1):
         rest = np.arange(one + 1, count)
         (t,) = seen.t_of(one, rest, 0.0)

@@ -132,9 +132,8 @@ def time_difference(rows: pd.DataFrame, confidence: float = 0.95) -> Interval:
 def budgets_differ(rows: pd.DataFrame) -> bool:
     """Return whether T of the two conditions differs on some map."""
     one, other = rows["time_budget_s"], rows["time_budget_s_other"]
-    known = (
-        one.notna() & other.notna()
-    )  # of an episode that began at its goal T is unknown
+    # of an episode that began at its goal T is unknown
+    known = one.notna() & other.notna()
     return not np.allclose(one[known], other[known], rtol=1e-6)
 
 

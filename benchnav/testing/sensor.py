@@ -188,9 +188,8 @@ class _Trial:
     def is_alike(
         self, sensed: Any, shown: tuple[Tensor, ...], tolerance: float
     ) -> bool:
-        return sensed is NOTHING or same(
-            _shown(sensed), shown, tolerance
-        )  # what raised is noted
+        # what raised is noted
+        return sensed is NOTHING or same(_shown(sensed), shown, tolerance)
 
 
 def _faults(sensed: Any, truth: _Truth) -> Iterator[str]:

@@ -46,9 +46,8 @@ from benchnav.datagen.schema import (
 from benchnav.datagen.synth.generate import class_map, complete, reference_time_s
 
 _CELLS_AT_ONCE = 2**20
-_CACHE_BYTES = (
-    2**29
-)  # of rasters that GDAL keeps; what it would choose grows with the machine
+# of rasters that GDAL keeps; what it would choose grows with the machine
+_CACHE_BYTES = 2**29
 
 # Why maps are left out, in the order of being found.
 REASONS = {

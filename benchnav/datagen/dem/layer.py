@@ -10,13 +10,14 @@ from benchnav.core.grid import is_azimuth
 from benchnav.datagen import schema
 from benchnav.datagen.layers.spec import shipped_fields
 
+# by the end of a layer's name
 _UNITS = {
     "_m": "m",
     "_deg": "deg",
     "_s": "s",
     "_mps": "m/s",
     "_k": "K",
-}  # by the end of a layer's name
+}
 
 
 class LayerRaster(NamedTuple):

@@ -48,9 +48,8 @@ _SPARE_BYTES_A_MAP = 1024
 _SHARD = re.compile(r".+-\d{8}-\d{8}\.h5")
 _HALF = re.compile(r"\..+\.partial")  # of a shard or of the manifest
 
-Source = Mapping[
-    str, Any
-]  # stored arrays, or those to be stored, by name, `ENTRY_DIGESTS` among them
+# stored arrays, or those to be stored, by name, `ENTRY_DIGESTS` among them
+Source = Mapping[str, Any]
 
 
 class Contents(NamedTuple):

@@ -32,9 +32,8 @@ if TYPE_CHECKING:
 CHUNK_CELLS = 2**17
 _MOST_OPEN = 128  # files that a process keeps open; far fewer than systems allow
 
-Opened = tuple[
-    h5py.File, dict[tuple[str, str], h5py.Dataset]
-]  # a file, and its arrays by split and name
+# a file, and its arrays by split and name
+Opened = tuple[h5py.File, dict[tuple[str, str], h5py.Dataset]]
 
 _SHOWN_SPLITS = 8
 
@@ -79,9 +78,8 @@ class TerrainDataset:
         """Reads and checks the manifest."""
         self.path, self.keep_open = Path(path), keep_open
         self.manifest: schema.Json = read_manifest(self.path)
-        self._opened: dict[
-            tuple[int, Path], Opened
-        ] = {}  # by process, since one's files are not for another
+        # by process, since one's files are not for another
+        self._opened: dict[tuple[int, Path], Opened] = {}
 
     def __getstate__(self) -> schema.Json:
         """Leaves out the open files, so that it may be sent to other processes."""

@@ -103,9 +103,8 @@ def read_log(path: Path) -> pd.DataFrame:
             f"{why[0].removesuffix('.')}{remedy}"
         ) from error
     for name in rows.columns:
-        first, dot, number = str(name).rpartition(
-            "."
-        )  # pandas numbers the second of two columns of one name
+        # pandas numbers the second of two columns of one name
+        first, dot, number = str(name).rpartition(".")
         if dot and number.isdigit() and first in rows.columns and not _is_number(first):
             raise DatasetError(
                 f"Expected one column `{first}` in {path}, got several. Rename or "

@@ -15,9 +15,8 @@ from benchnav.core.settings import one_line
 from benchnav.datagen.layers.layer import DrawnMaps, Layer, Streams
 from benchnav.datagen.recipe.classes import ClassTable
 
-Parameters = tuple[
-    ndarray, ndarray, ndarray
-]  # weights, means, standard deviations, each of shape [B, K, H, W]
+# weights, means, standard deviations, each of shape [B, K, H, W]
+Parameters = tuple[ndarray, ndarray, ndarray]
 
 
 def check_layer(

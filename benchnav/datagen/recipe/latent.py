@@ -192,8 +192,9 @@ def _bisected_quantile(parameters: tuple[ndarray, ...], rank: ndarray) -> ndarra
 
 def _probability(z: ndarray) -> ndarray:
     """Φ(z)."""
+    # imported here: a dataset is listed and shown without
     from scipy.special import (
         ndtr,
-    )  # imported here: a dataset is listed and shown without
+    )
 
     return ndtr(z)

@@ -90,9 +90,8 @@ def known_in_words(recording: Recording) -> str:
         "full",
         "static",
     )
-    return (
-        "λ̂ at the start" if learns else "λ̂ given to the planner"
-    )  # what was learnt was not recorded
+    # what was learnt was not recorded
+    return "λ̂ at the start" if learns else "λ̂ given to the planner"
 
 
 def show_truth(panel: Axes, recording: Recording) -> None:

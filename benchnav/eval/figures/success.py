@@ -37,9 +37,8 @@ class Success(Figure):
         """Draw a point a condition; a blind planner is a line through its panel, the
         baseline of all others.
         """
-        is_blind = (
-            data.summary["model"] == NOT_USED
-        )  # the clairvoyant has a model, and no risk
+        # the clairvoyant has a model, and no risk
+        is_blind = data.summary["model"] == NOT_USED
         is_marked = (
             data.summary.get("best_marked", pd.Series(False, data.summary.index))
             .fillna(False)

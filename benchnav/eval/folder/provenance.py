@@ -104,9 +104,8 @@ class Origins:
             "planner_limit_s": planner_limit_s,
         }
         self._codes: dict[str, Code] = {}
-        self._maps: dict[
-            tuple[Any, ...], tuple[str, ...]
-        ] = {}  # a digest of what they mean, and one of each
+        # a digest of what they mean, and one of each
+        self._maps: dict[tuple[Any, ...], tuple[str, ...]] = {}
 
     def of(self, unit: Unit) -> Origin:
         """The origin of a unit that is made now."""
@@ -341,9 +340,8 @@ def _commit() -> str:
         ).stdout.strip()
 
     try:
-        git(
-            "ls-files", "--error-unmatch", "__init__.py"
-        )  # else the repository is another project's
+        # else the repository is another project's
+        git("ls-files", "--error-unmatch", "__init__.py")
         return git("rev-parse", "HEAD") + (
             "+" if git("status", "--porcelain", "--", ".") else ""
         )

@@ -28,10 +28,11 @@ STEPS = "steps"
 LAST_COLUMN = "traversability"
 # RMSE of E[λ] and mean log score of what is believed of the ground ahead of a robot.
 AHEAD_COLUMNS = ("ahead_rmse", "ahead_log_score")
+# how far, and how far to either side, ground is ahead of a robot
 AHEAD_M, AHEAD_DEG = (
     5.0,
     45.0,
-)  # how far, and how far to either side, ground is ahead of a robot
+)
 _ORDER = ["condition", *DRAW, "step"]
 _REMEDY = (
     "Remove the steps, which the report can do without, or run it again with "

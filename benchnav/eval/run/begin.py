@@ -120,9 +120,8 @@ def begin(
             new, f"by {new} new conditions"
         )
         say(f"{folder} is extended {more}")
-        (folder / EPISODES).unlink(
-            missing_ok=True
-        )  # until all that is asked for is there
+        # until all that is asked for is there
+        (folder / EPISODES).unlink(missing_ok=True)
     now = _about(earlier.about, work, conditions)
     if now != earlier.about:
         write_run(folder, now)

@@ -45,9 +45,8 @@ from benchnav.planning.sensing.belief import Fields, Law, Static
 from benchnav.planning.world.realisation import check_known, draw_frozen
 
 Say = Callable[[str], None]
-LeftOut = dict[
-    str, str
-]  # the labels that do not go together, by column, and the `reason`
+# the labels that do not go together, by column, and the `reason`
+LeftOut = dict[str, str]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -228,8 +227,7 @@ def check_everywhere(
             )
 
 
-# --- each condition on one map
-# ------------------------------------------------------------------------
+# --- each condition on one map ---
 
 
 def build_each(conditions: Sequence[Condition], maps: int) -> list[str]:
@@ -338,8 +336,7 @@ def _doubts(condition: Condition, dataset: TerrainDataset) -> Iterator[str]:
         )
 
 
-# --- combinations that cannot be run
-# ------------------------------------------------------------------
+# --- combinations that cannot be run ---
 
 
 def find_left_out(conditions: Iterable[Condition]) -> dict[str, LeftOut]:
@@ -357,9 +354,8 @@ def find_left_out(conditions: Iterable[Condition]) -> dict[str, LeftOut]:
     """
     reasons: dict[tuple[Any, ...], str] = {}
     left_out: dict[str, LeftOut] = {}
-    refusals: dict[
-        str, str
-    ] = {}  # by planner; empty if it can be prepared for some condition
+    # by planner; empty if it can be prepared for some condition
+    refusals: dict[str, str] = {}
     for condition in conditions:
         for columns, rule in _RULES.items():
             labels = {column: condition.labels[column] for column in columns}

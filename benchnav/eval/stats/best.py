@@ -131,9 +131,8 @@ def _compare(
     common = on_common_draws(rivals)
     is_none = any(rows.empty for rows in common.values())
     judged = rivals if is_none else common
-    names = sorted(
-        judged
-    )  # those that are as good and as fast, in the order of their digests
+    # those that are as good and as fast, in the order of their digests
+    names = sorted(judged)
     times = np.array([judged[name]["total_time_s"].mean() for name in names])
     mean_s = dict(zip(names, alike(times, times.max()), strict=True))
     best, *others = sorted(

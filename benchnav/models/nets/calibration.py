@@ -87,10 +87,11 @@ def fit_width(lower: Tensor, upper: Tensor) -> float:
         ndtr(high) - ndtr(low) > 1e-9,
         high.clip(-_LARGEST_SCORE, _LARGEST_SCORE),
     )
+    # of which the mass is defined
     low, high = (
         np.where(is_atom, low, -1.0),
         np.where(is_atom, high, 1.0),
-    )  # of which the mass is defined
+    )
 
     def loss(temperature: float) -> float:
         density = 0.5 * (score / temperature) ** 2 + np.log(temperature)

@@ -14,9 +14,8 @@ from benchnav.core.errors import ConfigError, expect
 from benchnav.core.grid import is_azimuth
 from benchnav.core.settings import hint
 
-Maps = Mapping[
-    str, Tensor
-]  # by field, `rgb` of shape [B, 3, H, W], all others [B, H, W]
+# by field, `rgb` of shape [B, 3, H, W], all others [B, H, W]
+Maps = Mapping[str, Tensor]
 
 
 class LayerScale(NamedTuple):

@@ -72,9 +72,8 @@ class JoinedModel(TrainableModel):
         self.stack = InputStack([name for name in self.inputs if name != SLOPE], scale)
         self.network = self.configure_network(self.stack.channels)
         hidden, first = self.config.hidden, self.first_numbers()
-        torch.default_generator.manual_seed(
-            self.seed
-        )  # so that these weights do not hang on the encoder
+        # so that these weights do not hang on the encoder
+        torch.default_generator.manual_seed(self.seed)
         self.joint = nn.Sequential(
             nn.Conv2d(_FEATURES + self.has_slope, hidden, 1),
             nn.SiLU(),

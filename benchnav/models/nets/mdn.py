@@ -33,9 +33,8 @@ def to_std(widths: Tensor) -> Tensor:
 
 def first_width(count: int) -> Tensor:
     """So many numbers of which `to_std` makes 0.2."""
-    return torch.full(
-        (count,), math.log(math.expm1(_FIRST_STD - LEAST_STD))
-    )  # softplus⁻¹
+    # softplus⁻¹
+    return torch.full((count,), math.log(math.expm1(_FIRST_STD - LEAST_STD)))
 
 
 def censored_nll(

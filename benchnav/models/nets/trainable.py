@@ -318,10 +318,11 @@ class TrainableNetwork(lightning.LightningModule):
     def validation_step(self, batch: Maps, batch_index: int) -> None:
         """Measures a batch."""
         self.tally(batch)
+        # tables begin with it
         named = {
             "valid_loss": self.metrics["loss"],
             **dict(self.metrics.items()),
-        }  # tables begin with it
+        }
         self.log_dict(named, on_epoch=True, batch_size=len(batch[self.target]))
 
     def measure(self, maps: Any) -> dict[str, float]:

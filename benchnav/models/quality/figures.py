@@ -170,9 +170,8 @@ class Confusion(Figure):
             (f"{split}: accuracy {quality.accuracy:.3f}", quality)
             for split, quality in data.by_class.items()
         ]
-        ragged = (
-            len(shown) > most and len(shown) % most
-        )  # panels that end above hold the names of columns too
+        # panels that end above hold the names of columns too
+        ragged = len(shown) > most and len(shown) % most
         high = 2.2 if most == 3 else 3.1
         titles, rest = [title for title, _ in shown], 1.25 if ragged else 0.7
         figure, panels = panel_grid(

@@ -354,9 +354,10 @@ class LookAlikeTally:
             merged.argmax(1), kinds[class_id], self.size
         ).cpu()
         for group in self.groups:
+            # [B, H, W, G]
             match = class_id.unsqueeze(-1) == torch.tensor(
                 group, device=class_id.device
-            )  # [B, H, W, G]
+            )
             here = match.any(-1)
             own = probabilities[:, list(group)].movedim(1, -1)[here].double()  # [N, G]
             total = own.sum(1, keepdim=True)

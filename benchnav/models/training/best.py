@@ -12,10 +12,11 @@ from lightning.pytorch.callbacks import Callback, Checkpoint
 
 from benchnav.core.errors import ConfigError
 
+# callbacks that leave the weights as they are
 _OURS = (
     "lightning.",
     "benchnav.models.training.",
-)  # callbacks that leave the weights as they are
+)
 
 
 class KeepBest(Callback):

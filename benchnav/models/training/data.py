@@ -39,9 +39,8 @@ from benchnav.models.training.masks import RandomMasks
 
 TRAIN, VALID = "train", "valid"
 
-_SYMMETRIES = tuple(
-    range(8)
-)  # of the square: four rotations, each as it is or mirrored
+# of the square: four rotations, each as it is or mirrored
+_SYMMETRIES = tuple(range(8))
 _SYMMETRIES_OF_RECTANGLE = (0, 1, 4, 5)  # those that leave height and width as they are
 _LEAST_VARIANCE = 1e-4
 
@@ -78,9 +77,8 @@ class MapDataset(TerrainMaps):
         """Checks split and fields, and reads the maps where that is asked for."""
         stored = [name for name in fields if name != SEEN]
         if masks and "slope_deg" in fields and "elevation_m" not in fields:
-            stored.append(
-                "elevation_m"
-            )  # slopes are those of the elevation that is seen
+            # slopes are those of the elevation that is seen
+            stored.append("elevation_m")
         super().__init__(path, split, stored)
         self.crop, self.seed, self.every = crop, seed, every
         self.given, self.masks = tuple(fields), masks
@@ -97,9 +95,8 @@ class MapDataset(TerrainMaps):
 
     def __getitem__(self, key: MapKey) -> Batch:  # type: ignore[override]
         """Gives every field of the maps in `key`, shape [b, *, H, W]."""
-        which, place = key.maps.unique(
-            return_inverse=True
-        )  # squares of one map are cut from one reading
+        # squares of one map are cut from one reading
+        which, place = key.maps.unique(return_inverse=True)
         read = self.read(which.tolist())
         batch = {}
         for name, values in read.items():

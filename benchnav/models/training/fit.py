@@ -76,10 +76,11 @@ _OWN = {
     "profiler",
 }
 _DEFAULTS = inspect.signature(lightning.Trainer.__init__).parameters
+# which are made from text, see `models.training.trackers`
 _TRACKERS = (
     "logger",
     "callbacks",
-)  # which are made from text, see `models.training.trackers`
+)
 _LOSSES = ("train_loss", "valid_loss", "loss")
 _OF_NO_ACCOUNT = {"max_epochs", "log_every_n_steps", "detect_anomaly", "accelerator"}
 
@@ -112,9 +113,8 @@ class FitOptions(TrainOptions):
         )
         for name in asked:
             check_known("settings of `trainer`", name, sorted(_DEFAULTS.keys() - _OWN))
-        self.make_loggers(
-            None
-        )  # so that what cannot be made is refused before anything is trained
+        # so that what cannot be made is refused before anything is trained
+        self.make_loggers(None)
         self.make_callbacks()
         devices, processors = asked.get("devices", 1), os.cpu_count() or 1
         expect(

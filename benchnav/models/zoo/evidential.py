@@ -24,13 +24,11 @@ from benchnav.models.config import JoinedConfig
 from benchnav.models.nets.joined import JoinedModel
 from benchnav.models.nets.trainable import Loss
 
-Evidence = tuple[
-    Tensor, Tensor, Tensor, Tensor
-]  # γ, ν > 0, α > 1 and β > 0, each of shape [B, 1, H, W]
+# γ, ν > 0, α > 1 and β > 0, each of shape [B, 1, H, W]
+Evidence = tuple[Tensor, Tensor, Tensor, Tensor]
 
-_NODES = torch.linspace(
-    -7, 3.5, 20, dtype=torch.float64
-)  # of log precision, in its standard deviations
+# of log precision, in its standard deviations
+_NODES = torch.linspace(-7, 3.5, 20, dtype=torch.float64)
 _LEAST = 1e-3  # of ν and α − 1
 _LEAST_BETA = 1e-5
 _FIRST = (0.5, 0.5413, 0.5413, -2.25)  # γ = 0.5, ν = 1, α = 2, β = 0.1

@@ -24,9 +24,8 @@ from benchnav.models.nets.trainable import Loss
 
 _FIRST_MEAN = 0.5
 
-Gaussians = tuple[
-    Tensor, Tensor
-]  # means and standard deviations before clipping, each of shape [B, K, H, W]
+# means and standard deviations before clipping, each of shape [B, K, H, W]
+Gaussians = tuple[Tensor, Tensor]
 
 
 @dataclass(frozen=True, kw_only=True)

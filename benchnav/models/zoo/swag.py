@@ -95,9 +95,10 @@ class SWAGModel(MeanVarianceModel):
         for place, weights in enumerate(self.parameters()):
             self.register_buffer(f"mean_{place}", torch.zeros_like(weights.detach()))
             self.register_buffer(f"std_{place}", torch.zeros_like(weights.detach()))
+        # stays float32
         self.register_buffer(
             "statistics", torch.zeros(self.config.draws * size_of(self.norms))
-        )  # stays float32
+        )
         self.register_buffer("collected", torch.zeros((), dtype=torch.int64))
         self.register_buffer("is_drawn", torch.zeros((), dtype=torch.bool))
         self.register_buffer("draw_seed", torch.tensor(self.seed))

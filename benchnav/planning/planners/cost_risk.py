@@ -59,9 +59,8 @@ def within_reach(problem: Problem, state: Tensor, seconds: float) -> Tensor:
     row, column = (torch.arange(size, device=state.device) for size in grid.shape)
     x, y = grid.centre_of(row[:, None], column)
     away = torch.hypot(x - state[:, 0, None, None], y - state[:, 1, None, None])
-    return (
-        away <= problem.robot.top_speed_mps * seconds + grid.resolution_m
-    )  # as far as a cell's corner
+    # as far as a cell's corner
+    return away <= problem.robot.top_speed_mps * seconds + grid.resolution_m
 
 
 def tail_cost(cost: Tensor, level: float) -> Tensor:

@@ -83,13 +83,14 @@ from benchnav.planning.sensing.sensor import Step
 # A chunk of the horizon compiles in seconds and runs as fast as the whole of it
 # unrolled.
 _CHUNK_STEPS = 10
+# arguments of what is compiled: states, cost, mean, padded_ground, target
 OF_EPISODES = (
     0,
     1,
     2,
     6,
     7,
-)  # arguments of what is compiled: states, cost, mean, padded_ground, target
+)
 # states, cost, held, mean, padded_ground, target, goal, steps_left of what is compiled
 # with entrapment
 ENTRAPPED_OF_EPISODES = (0, 1, 2, 3, 7, 8, 9, 10)
@@ -247,9 +248,8 @@ class MPPI(LocalPlanner[MPPIState]):
         self._advance_entrapped = Fused(
             advance_entrapped, rollouts, least, batched=ENTRAPPED_OF_EPISODES
         )
-        self._weigh = Fused(
-            weigh, rollouts, least, batched=(*OF_EPISODES, 12, 13)
-        )  # going, to_go
+        # going, to_go
+        self._weigh = Fused(weigh, rollouts, least, batched=(*OF_EPISODES, 12, 13))
 
     @property
     def seeks_goal(self) -> bool:

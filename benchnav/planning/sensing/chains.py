@@ -32,10 +32,11 @@ from benchnav.planning.sensing.labels import (
 )
 from benchnav.planning.sensing.sites import LEAST_CHANGE, Block, Evidence, Sites
 
+# sweeps in an update, and how many of the last of them are counted
 _ROUNDS, _TOLD = (
     6,
     3,
-)  # sweeps in an update, and how many of the last of them are counted
+)
 # over observed cells, of which random numbers are kept; later ones take them from other
 # cells
 _PASSES = 8

@@ -54,10 +54,11 @@ from benchnav.planning.sensing.sensor import LEAST_STD, Sensed
 from benchnav.planning.sensing.sites import Evidence
 
 _MOST_STRENGTH = 0.88  # ln(1 + √2) is critical
+# of cells of which nothing is sensed: of whole maps, and of what is seen later
 _FIRST_SWEEPS, _MORE_SWEEPS = (
     40,
     10,
-)  # of cells of which nothing is sensed: of whole maps, and of what is seen later
+)
 _SAME_SCORE = (
     0.05  # a change of an observed score under which its label is not drawn again
 )

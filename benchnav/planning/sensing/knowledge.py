@@ -382,9 +382,8 @@ class Learner:
     def _inferred(self, known: Knowledge, changed: Tensor) -> Knowledge:
         """Tells λ̂ and what is free of the cells of which something else is believed."""
         believed = self.at(known, changed)
-        one = map_tensors(
-            believed, lambda values: values[None]
-        )  # a batch, as measures are given
+        # a batch, as measures are given
+        one = map_tensors(believed, lambda values: values[None])
         found, spread = self._measured(one)
         seen = None if known.memory is None else known.memory.seen[changed][None]
         free = call(

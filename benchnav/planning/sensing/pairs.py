@@ -16,10 +16,11 @@ from benchnav.core.ground import GroundStatistics
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.planning.sensing.belief import Law
 
+# of a cell's weight: the pair's, and each of its classes'
 _LEAST_MASS, _LEAST_CLASS = (
     0.05,
     0.01,
-)  # of a cell's weight: the pair's, and each of its classes'
+)
 
 
 def statistics_of(law: Law) -> GroundStatistics:

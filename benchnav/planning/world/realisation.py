@@ -29,9 +29,8 @@ from benchnav.planning.world.world import Places, World
 
 MOST_ATTEMPTS = 100
 
-_FIRST = np.zeros(
-    1, dtype=np.int64
-)  # of each map's stream, the one element that is drawn
+# of each map's stream, the one element that is drawn
+_FIRST = np.zeros(1, dtype=np.int64)
 
 
 class Realisation:

@@ -39,10 +39,11 @@ MOST_CONDITIONS = 6
 
 # a frame is as large as a printed figure, and letters and lines are those of one
 _DPI = 160
+# heights of what is over and below all maps, and around each row of them
 _ENDS_IN, _HEADING_IN = (
     0.8,
     0.6,
-)  # heights of what is over and below all maps, and around each row of them
+)
 _BAR_IN = 0.9  # width of the colour bar
 _LETTER_IN = 0.068
 _MOMENTS = 9  # of an episode, of which the legend names what is drawn

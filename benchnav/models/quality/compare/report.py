@@ -37,11 +37,12 @@ COSTS = {
     "parameters": ("parameters\n", "number of weights of all networks of the model."),
 }
 PRIVILEGED_MARK = " †"
+# size, decimal places and letter of a number of weights
 _UNITS = (
     (1e6, 2, "M"),
     (1e3, 1, "k"),
     (1, 0, ""),
-)  # size, decimal places and letter of a number of weights
+)
 
 
 @dataclass(frozen=True, kw_only=True)

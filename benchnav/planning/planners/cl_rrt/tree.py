@@ -42,10 +42,11 @@ from benchnav.planning.planners.cl_rrt.pursuit import SPACING_M, Tracking
 from benchnav.planning.planners.dubins import dubins_length_to_point
 from benchnav.planning.planners.planner import PlanStatus
 
+# share of choices that explore, before and after a way to the goal is known
 _EXPLORE = (
     0.7,
     0.3,
-)  # share of choices that explore, before and after a way to the goal is known
+)
 _PARTIAL_GAIN_M = (
     0.5  # a partial path that leads no further than this toward the goal is none
 )
@@ -226,9 +227,8 @@ def choose(
         distance(tree.at.state, loop.problem.goal_m[:, None])
         - loop.problem.goal_radius_m
     ).clamp(min=0)
-    closed = (
-        tree.cost + straight_m / loop.follower.speed_mps[1] >= best
-    )  # cannot improve on the best way
+    # cannot improve on the best way
+    closed = tree.cost + straight_m / loop.follower.speed_mps[1] >= best
     closed_m = torch.where(closed, math.inf, 0.0)
     # The time of the way to each node, as the length driven in it at the wanted speed.
     spent_m = torch.where(closed, 0, loop.follower.wanted_mps * tree.time_s)

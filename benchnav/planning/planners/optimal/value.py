@@ -31,9 +31,8 @@ from benchnav.planning.robots import Unicycle
 
 _POINTS = 8  # N
 UNREACHED = 1e6  # cost to go before a way is found, and where there is none
-_MIXED = (
-    UNREACHED / 100
-)  # from there on a cost to go is for the most part of what is not reached
+# from there on a cost to go is for the most part of what is not reached
+_MIXED = UNREACHED / 100
 _BARRED = 1e-9  # weight of a cell that is not free beside one that is
 _SETTLED = 1e-3  # least change that counts
 _CHECK_EVERY = 10  # sweeps
@@ -198,9 +197,8 @@ def _arcs(moves: Moves, grid: Grid, headings: int, like: Tensor) -> list[_Arc]:
     shares = torch.cat(
         ((torch.arange(_POINTS) + 0.5) / _POINTS, torch.ones(1))
     ).double()
-    offsets = (
-        moves.offsets(headings_of(headings), shares) / grid.resolution_m
-    )  # [Q, A, N + 1, 2]
+    # [Q, A, N + 1, 2]
+    offsets = moves.offsets(headings_of(headings), shares) / grid.resolution_m
     reach = max(1, math.ceil(float(offsets.abs().max()) - 1e-9))
     found = []
     for place, (seconds, turn) in enumerate(

@@ -22,10 +22,11 @@ from benchnav.planning.problem import Problem
 
 _NEAR_CELLS = 4  # how far ways lead
 _POINTS = 16  # N, along a way
+# how far beside a robot's heading a cell may lie for a circle
 _BESIDE = (
     math.pi / 4,
     math.pi / 2,
-)  # how far beside a robot's heading a cell may lie for a circle
+)
 _EVEN = 1e-4  # an arc of a whole circle but for rounding is none
 _DRAWN_WAYS = 100  # of the path that is drawn
 
