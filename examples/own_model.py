@@ -57,9 +57,8 @@ class CellModel(TrainableModel):
         return crps
 
     def to_distribution(self, outputs: Tensor) -> TraversabilityMixture:
-        mean, std = (
-            values.unsqueeze(1) for values in self.gaussian(outputs)
-        )  # [B, K = 1, H, W]
+        # [B, K = 1, H, W]
+        mean, std = (values.unsqueeze(1) for values in self.gaussian(outputs))
         return TraversabilityMixture(torch.ones_like(mean), mean, std)
 
     def gaussian(self, outputs: Tensor) -> tuple[Tensor, Tensor]:

@@ -18,9 +18,8 @@ class Tracked(Unicycle):
 
     def __call__(self, state, action, traversability):
         turning = traversability.clamp(min=0.05) ** (self.turn_loss - 1)
-        slowed = action * turning[..., None] ** action.new_tensor(
-            [0.0, 1.0]
-        )  # (v, ω): ω alone
+        # (v, ω): ω alone
+        slowed = action * turning[..., None] ** action.new_tensor([0.0, 1.0])
         return super().__call__(state, slowed, traversability)
 
 

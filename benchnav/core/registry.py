@@ -668,9 +668,8 @@ def option_files(part: Part) -> dict[str, str]:
         [value for name, value in part.options.items() if name not in written]
     ):
         path = Path(os.path.expanduser(text))
-        there = os.path.exists(
-            path
-        )  # of what cannot be a path false, where Path raises
+        # of what cannot be a path false, where Path raises
+        there = os.path.exists(path)
         if there and path.is_dir() and Path.cwd().is_relative_to(path.resolve()):
             raise ConfigError(
                 f"Expected options of {part.kind} {part.part!r} that name files or "

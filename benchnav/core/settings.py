@@ -46,8 +46,7 @@ class Option:
     default: Any
 
 
-# --- options of classes and functions
-# ---------------------------------------------------------------
+# --- options of classes and functions ---
 
 
 def list_options(
@@ -137,8 +136,7 @@ def call(what: str, target: Callable[..., Any], arguments: Mapping[str, Any]) ->
         ) from error
 
 
-# --- from plain data
-# --------------------------------------------------------------------------------
+# --- from plain data ---
 
 
 def of(owner: str) -> Naming:

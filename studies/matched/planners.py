@@ -242,9 +242,8 @@ def coloured_noise(
     Source: Timmer and König (1995), "On generating power law noise".
     """
     frequencies = torch.fft.rfftfreq(steps)
-    frequencies[0] = frequencies[
-        1
-    ]  # as the lowest that a sequence of this length can tell
+    # as the lowest that a sequence of this length can tell
+    frequencies[0] = frequencies[1]
     scale = frequencies ** (-colour / 2)
     real, imaginary = torch.randn((2, len(scale), *shape), generator=generator)
     imaginary[0] = 0

@@ -54,8 +54,7 @@ _BLOCK = 10  # worlds of one wall
 _LIMIT_S = 60.0
 
 
-# --- the gap on shipped fields
-# ------------------------------------------------------------------------
+# --- the gap on shipped fields ---
 
 
 @contextmanager
@@ -131,8 +130,7 @@ def gap(work: Work, folder: Path, maps: int = 50) -> dict[str, Rows]:
     return {"gap": rows}
 
 
-# --- planners in worlds with walls
-# --------------------------------------------------------------------
+# --- planners in worlds with walls ---
 
 
 def walled(

@@ -19,6 +19,7 @@ from benchnav.stats.intervals import mean_interval
 from benchnav.viz import legend_outside, line_looks, panel_grid, risk_name, styled
 
 RISKS, SPLIT = ("expected-time", "cvar:0.8"), "test/std"
+# of each the minimum is the best
 SCORES = (
     "rmse_expected",
     "nll",
@@ -26,7 +27,7 @@ SCORES = (
     "pinball",
     "tail_error",
     "ause",
-)  # of each the minimum is the best
+)
 SHOWN = (
     "accuracy",
     "miou",

@@ -154,9 +154,8 @@ def test_a_dataset_is_downloaded_once_and_read_without_a_connection(
     )
     assert done.returncode == 0, done.stderr
     assert f"me/ground@main is {COMMIT} now and may move" in done.stderr
-    assert not any(
-        "evil.py" in path for path in handler.asked
-    )  # data alone is downloaded
+    # data alone is downloaded
+    assert not any("evil.py" in path for path in handler.asked)
     local = run(tmp_path, "benchnav-datagen", "show", str(dataset_path))
     assert done.stdout.splitlines()[1:] == local.stdout.splitlines()[1:]
     handler.asked.clear()

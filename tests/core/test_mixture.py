@@ -94,9 +94,8 @@ def test_value_at_risk_is_the_root_that_another_library_finds(level: float) -> N
     shape, tail = (5, 60), 1 - level
     weights = torch.rand(shape, generator=generator, dtype=torch.float64) ** 4
     means = 2 * torch.rand(shape, generator=generator, dtype=torch.float64) - 0.5
-    stds = 10 ** (
-        -6 * torch.rand(shape, generator=generator, dtype=torch.float64)
-    )  # from steps to planes
+    # from steps to planes
+    stds = 10 ** (-6 * torch.rand(shape, generator=generator, dtype=torch.float64))
     weights = weights / weights.sum(0)
     found = TraversabilityMixture(
         *(values.unsqueeze(1) for values in (weights, means, stds))

@@ -174,8 +174,7 @@ def refusal(call: Callable[[], object]) -> str:
     return message
 
 
-# --- the four forms
-# ---------------------------------------------------------------------------------
+# --- the four forms ---
 
 
 def test_a_shipped_name_is_found_and_its_value_sets_its_first_option() -> None:
@@ -324,8 +323,7 @@ def test_anything_else_is_no_part(given: object) -> None:
     assert "{part: NAME, label: LABEL" in refusal(lambda: read_part("planner", given))  # type: ignore[arg-type]
 
 
-# --- options
-# ----------------------------------------------------------------------------------------
+# --- options ---
 
 
 def test_options_are_parameters_of_a_function_class_or_dataclass_and_fields_of_a_config(
@@ -547,8 +545,7 @@ def test_an_option_given_twice_is_refused() -> None:
     )
 
 
-# --- what is not there
-# ------------------------------------------------------------------------------
+# --- what is not there ---
 
 
 @pytest.mark.parametrize(
@@ -610,8 +607,7 @@ def test_a_file_or_module_that_raises_is_told_in_one_line(
     assert expected.split(" (")[0] in refusal(lambda: find("planner", "broken"))
 
 
-# --- files change, and their digests with them
-# --------------------------------------------------------
+# --- files change, and their digests with them ---
 
 
 def test_a_file_that_changed_is_loaded_anew_even_within_a_second(file: str) -> None:
@@ -689,8 +685,7 @@ def test_the_digest_of_what_is_registered_is_that_of_its_source(file: str) -> No
     assert find("robot", "none").digest == ""
 
 
-# --- other processes, and weight
-# ----------------------------------------------------------------------
+# --- other processes, and weight ---
 
 
 def test_workers_find_parts_of_files_and_modules(

@@ -69,9 +69,8 @@ def test_shares_are_of_the_cells_whose_class_is_known() -> None:
 
 
 def test_lambda_stuck_is_the_recipe_s_and_still_stuck() -> None:
-    class_id = np.full(
-        (1, 8, 10), 2
-    )  # E[λ] is 0.9 · 0.9 + 0.1 · 0.05, but for clipping
+    # E[λ] is 0.9 · 0.9 + 0.1 · 0.05, but for clipping
+    class_id = np.full((1, 8, 10), 2)
     exact = float(
         latent.expected_of(
             latent.truth(class_id, np.zeros(class_id.shape), CLASSES)

@@ -25,9 +25,8 @@ def smaller(program: str, words: list[str], maps: int) -> list[str]:
             split: max(maps, 4) if split == "valid" else maps
             for split in shipped_sizes(rest[0])
         }
-        fewer = [
-            f"splits.{split}.maps={count}" for split, count in sizes.items()
-        ]  # a half of `valid` needs two
+        # a half of `valid` needs two
+        fewer = [f"splits.{split}.maps={count}" for split, count in sizes.items()]
         named = [] if "id" in given else [f"id={rest[0]}-small"]
         out = (
             []

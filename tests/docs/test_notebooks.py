@@ -75,9 +75,8 @@ def test_a_notebook_runs(path: Path, folder: Path, environment: dict[str, str]) 
     import nbclient
     import nbformat
 
-    place = (
-        folder / "examples" / "notebooks"
-    )  # a link to ours, until it is a folder to write in
+    # a link to ours, until it is a folder to write in
+    place = folder / "examples" / "notebooks"
     place.unlink()
     place.mkdir()
     shutil.copy(path, place)

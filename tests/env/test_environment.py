@@ -429,9 +429,8 @@ def test_maps_without_the_reference_times_that_stakes_need_are_one_line_with_the
     ) as told:
         make(path, world="stakes")
     assert "\n" not in str(told.value)
-    made = make(
-        path, world={"preset": "stakes", "time_budget_s": 60}
-    )  # as the line says
+    # as the line says
+    made = make(path, world={"preset": "stakes", "time_budget_s": 60})
     made.reset(seed=0)
 
 

@@ -43,8 +43,7 @@ def make_vector(name: str, path: Path, **changes: Any) -> Any:
     )
 
 
-# --- worker processes
-# ------------------------------------------------------------------------------
+# --- worker processes ---
 
 WORKERS = """
 import multiprocessing, os, sys
@@ -128,8 +127,7 @@ def test_an_environment_with_a_checkpoint_is_pickled_in_the_midst_of_an_episode(
     np.testing.assert_array_equal(other.reset()[0]["crop"], env.reset()[0]["crop"])
 
 
-# --- actions
-# ---------------------------------------------------------------------------------------
+# --- actions ---
 
 
 @pytest.mark.parametrize(
@@ -234,8 +232,7 @@ def test_a_step_after_the_end_raises_until_a_reset(
         env.step(AHEAD)
 
 
-# --- options of a reset
-# ----------------------------------------------------------------------------
+# --- options of a reset ---
 
 
 @EACH
@@ -281,8 +278,7 @@ def test_names_of_options_are_those_of_the_environment(
         vector.reset(options={"reset_maks": np.ones(3, bool)})
 
 
-# --- rendering
-# -------------------------------------------------------------------------------------
+# --- rendering ---
 
 
 @pytest.mark.filterwarnings(
@@ -311,8 +307,7 @@ def test_the_checker_of_gymnasium_passes_without_a_display(
     )
 
 
-# --- choices that were not made
-# --------------------------------------------------------------------
+# --- choices that were not made ---
 
 
 @pytest.mark.parametrize(

@@ -44,9 +44,8 @@ def test_run_report_and_replay(
     assert call("eval", *again, "--seed", "1") == 0
     assert f"{out} is extended by more episodes" in capsys.readouterr().err
     # A suite that cannot be run drops nothing.
-    monkeypatch.setattr(
-        eval_cli, "_finish", eval_cli._failed
-    )  # a report takes longer than a run
+    # a report takes longer than a run
+    monkeypatch.setattr(eval_cli, "_finish", eval_cli._failed)
     assert call("eval", *again, "--overwrite", "true", "--maps", "99") == 2
     assert (out / "episodes.parquet").exists()
     assert call("eval", *again, "--overwrite") == 0

@@ -38,9 +38,10 @@ def test_where_and_on_what_failures_ended(tmp_path: Path) -> None:
         made.row(a, 1, None, outcome="immobilised", end_time_s=3.0),
         made.row(b, 1, None),
     )
+    # not a number
     rows["condition"] = rows["condition"].where(
         rows["condition"] != rows["condition"].iloc[0], "0123456789012345"
-    )  # not a number
+    )
     names = list(dict.fromkeys(rows["condition"]))
     keep(
         tmp_path,

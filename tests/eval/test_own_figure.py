@@ -61,9 +61,8 @@ def test_the_figure_shows_each_failure_once(folder: Path) -> None:
     (figure,) = registry.make("figure", f"{OWN}:WhenFailed").variants(report)
     (panel,) = figure(report).axes
     corners = np.concatenate([patch.get_xy() for patch in panel.patches])
-    assert (
-        corners[:, 1].max() == len(report.failures) == 4
-    )  # all of one planner, at one time
+    # all of one planner, at one time
+    assert corners[:, 1].max() == len(report.failures) == 4
 
 
 def test_a_suite_names_figures_of_its_report(tmp_path: Path) -> None:

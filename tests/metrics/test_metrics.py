@@ -169,8 +169,7 @@ def test_energy_rejects_options_without_meaning(
         registry.make("metric", {"part": "energy", "options": options})
 
 
-# --- the contract
-# -----------------------------------------------------------------------------------
+# --- the contract ---
 
 
 @pytest.mark.parametrize("name", registry.names("metric"))

@@ -123,9 +123,8 @@ def test_the_runtime_gives_what_the_model_gives(name: str, tmp_path: Path) -> No
         assert set(found) == {*own, "mean", "cvar"}
         for parameter, values in own.items():
             np.testing.assert_allclose(found[parameter], values.numpy(), atol=1e-5)
-        assert (
-            np.abs(found["cvar"] - predicted.cvar(0.5).numpy()).max() > 1e-3
-        )  # the level counts
+        # the level counts
+        assert np.abs(found["cvar"] - predicted.cvar(0.5).numpy()).max() > 1e-3
 
 
 def test_the_command_writes_what_its_flags_say(

@@ -351,9 +351,8 @@ def test_statistics_of_the_ground_are_the_checkpoints_own_first(
     assert find_ground_statistics({"part": "oracle"}, moved) == beside
     assert find_ground_statistics("somewhere.py:Mine", moved) == beside
     (tmp_path / "d.ground.json").unlink()
-    shipped = find_ground_statistics(
-        "ideal", moved
-    )  # of tiny-v1, of more maps than these
+    # of tiny-v1, of more maps than these
+    shipped = find_ground_statistics("ideal", moved)
     assert shipped not in (own, beside)
     assert shipped.layer_means["rgb"] == pytest.approx(own.layer_means["rgb"], rel=0.1)
 

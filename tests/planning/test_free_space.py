@@ -197,9 +197,8 @@ def test_dwa_minimises_a_cost_of_ground_below_the_least_traversability_of_motion
     )
     low = steps_on_low_ground(plain, paths, 50)
     assert extra[0].tolist() == pytest.approx((50 * low[0]).tolist(), rel=1e-5)
-    assert (
-        low[0, 0] == 50 > low[0, 2] > 0
-    )  # one that stands pays at each step, one that drives until it is out
+    # one that stands pays at each step, one that drives until it is out
+    assert low[0, 0] == 50 > low[0, 2] > 0
 
 
 def test_mppi_minimises_a_cost_of_ground_below_the_least_traversability_of_motion() -> (

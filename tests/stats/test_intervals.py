@@ -194,9 +194,8 @@ def test_design_effect_by_hand() -> None:
 
 def test_design_effect_at_its_ends() -> None:
     both = np.array([True, False, True, True])
-    assert design_effect(both, np.arange(4)) == pytest.approx(
-        1
-    )  # each episode on a map of its own
+    # each episode on a map of its own
+    assert design_effect(both, np.arange(4)) == pytest.approx(1)
     assert design_effect(
         np.repeat(both, 3), np.repeat(np.arange(4), 3)
     ) == pytest.approx(3)  # all alike

@@ -86,9 +86,8 @@ def test_elsewhere_is_one_draw_an_episode_by_its_key_and_looks_at_no_field(
     sensor, (terrain, field) = elsewhere(radius_m=2.0, noise_std=0.001), ground
     told = sense(sensor, ground).traversability
     later = sense(sensor, ground, step=7).traversability
-    torch.testing.assert_close(
-        told, later, atol=0.01, rtol=0, equal_nan=True
-    )  # but for the noise
+    # but for the noise
+    torch.testing.assert_close(told, later, atol=0.01, rtol=0, equal_nan=True)
     other = sense(sensor, (terrain, torch.rand_like(field)))
     assert torch.equal(other.traversability.nan_to_num(-1), told.nan_to_num(-1))
     # One episode alone meets what it met among all, another key another draw.

@@ -86,7 +86,6 @@ def test_what_is_simulated_has_the_rates_and_the_likeness_asked_for(
     )
     taken = studies.times(generator, np.ones((*hard.shape, 1), dtype=bool), hard)
     assert taken.mean() == pytest.approx(33 * np.exp(0.045), abs=0.3)
-    np.testing.assert_allclose(
-        10 * taken, np.rint(10 * taken), atol=1e-9
-    )  # whole steps
+    # whole steps
+    np.testing.assert_allclose(10 * taken, np.rint(10 * taken), atol=1e-9)
     assert np.corrcoef(taken.ravel(), chance.ravel())[0, 1] < -0.4

@@ -302,9 +302,8 @@ def test_the_families_whose_checkpoints_are_tried_here_are_all_that_the_package_
 
 @pytest.mark.parametrize("name", ZOO)
 def test_models_of_the_zoo_are_found_by_name(name: str) -> None:
-    assert (
-        registry.find("model", name).target is ZOO[name][0]
-    )  # which tests/models/zoo/test_zoo.py tries
+    # which tests/models/zoo/test_zoo.py tries
+    assert registry.find("model", name).target is ZOO[name][0]
 
 
 @pytest.mark.parametrize("members", [1, 2])

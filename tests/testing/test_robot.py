@@ -49,9 +49,8 @@ def standing(change: Callable[[Tensor], Any]) -> Unicycle:
 def having(**attributes: Any) -> Unicycle:
     made = type("Bad", (Unicycle,), attributes)()
     for name, value in attributes.items():
-        object.__setattr__(
-            made, name, value
-        )  # also where it is a field of the frozen robot
+        # also where it is a field of the frozen robot
+        object.__setattr__(made, name, value)
     return made
 
 
@@ -74,9 +73,8 @@ class Gathering(Unicycle):
         return torch.cat((pose, torch.zeros_like(pose[..., :1])), dim=-1)
 
     def __call__(self, state: Tensor, action: Tensor, traversability: Tensor) -> Tensor:
-        speed = (
-            0.95 * state[..., 3:] + 0.08 * action[..., :1]
-        )  # up to 1.6 times what is commanded
+        # up to 1.6 times what is commanded
+        speed = 0.95 * state[..., 3:] + 0.08 * action[..., :1]
         moved = super().__call__(
             state[..., :3], torch.cat((speed, action[..., 1:]), dim=-1), traversability
         )

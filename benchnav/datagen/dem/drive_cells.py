@@ -168,10 +168,11 @@ def elevation_under(
         cells = layer.read(
             range(start, min(start + _BLOCK_CELLS, height)), range(width)
         )[0]
+        # cells are padded by one
         positions = (
             row[is_in_block] - start + 1,
             column[is_in_block] + 1,
-        )  # cells are padded by one
+        )
         elevation_m[is_in_block] = ndimage.map_coordinates(
             cells, positions, order=1, cval=np.nan
         )

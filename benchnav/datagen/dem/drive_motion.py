@@ -45,10 +45,11 @@ from benchnav.datagen.dem.drive_units import (
 )
 
 # Thresholds that are someone's choice are marked (choice).
+# of the distance of positions to that of the measured speed (choice)
 PACE_LIMITS = (
     0.85,
     1.15,
-)  # of the distance of positions to that of the measured speed (choice)
+)
 _TOP_QUANTILE = 0.99  # of commands, since single ones may be wrong (choice)
 MAX_AGAINST = 0.05  # of the rows, with a measured speed of the other sign (choice)
 MAX_FAULTY = 0.1  # of the rows, with faults of one kind (choice)

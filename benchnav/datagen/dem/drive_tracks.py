@@ -21,12 +21,10 @@ _GAP_S = 1.0  # without a row, after which nothing is said of the motion between
 _FREEZE_FIXES = 3  # periods of positions that one may stay the same (choice)
 # between neighbouring spans, so that a chord is at most 1 % shorter than its arc
 _STRAIGHT_COS = 0.9
-_MAX_BEND = math.radians(
-    150
-)  # between neighbouring spans of an arc; more is a reversal (choice)
-_SLIDES_COS = (
-    -0.5
-)  # between rows of one command; no robot turns by over 120° at once (choice)
+# between neighbouring spans of an arc; more is a reversal (choice)
+_MAX_BEND = math.radians(150)
+# between rows of one command; no robot turns by over 120° at once (choice)
+_SLIDES_COS = -0.5
 MAX_PERIOD_S = (
     0.8  # between fixes, in which no robot turns by over 120°, at 2.5 rad/s (choice)
 )
@@ -77,9 +75,8 @@ def track_of(rows: pd.DataFrame) -> pd.DataFrame:
     track = rows.sort_values(["drive", "time_s"], kind="stable")
     step_s = track.groupby("drive")["time_s"].diff()
     usual_s = step_s.groupby(track["drive"]).transform("median")
-    starts = ~(
-        step_s <= np.maximum(_GAP_S, 3 * usual_s)
-    )  # the first row of a drive too
+    # the first row of a drive too
+    starts = ~(step_s <= np.maximum(_GAP_S, 3 * usual_s))
     changes = (track[["drive", "x", "y"]].diff() != 0).any(axis=1)
     return track.assign(
         step_s=step_s.where(~starts, 0.0), segment=starts.cumsum(), fix=changes.cumsum()
@@ -242,9 +239,8 @@ def spans_of(
         sums[name] = (
             (track[column] * track["step_s"]).groupby(track["segment"]).cumsum()
         )
-    span = (
-        np.floor(knots["time_s"] / window_s).reindex(track.index).ffill()
-    )  # of the last position
+    # of the last position
+    span = np.floor(knots["time_s"] / window_s).reindex(track.index).ffill()
     table = track.assign(span=span, command=track["commanded"], **sums)
     # A span reaches from its first measured position to that of the next one.
     firsts = table.loc[knots.index].groupby(["segment", "span"]).first()
@@ -278,9 +274,8 @@ def _angle_between(vectors: pd.DataFrame, others: pd.DataFrame) -> pd.Series:
     """Return signed angles in (-π, π] from vectors to others, in columns `x`, `y`."""
     cross = vectors["x"] * others["y"] - vectors["y"] * others["x"]
     dot = vectors["x"] * others["x"] + vectors["y"] * others["y"]
-    return np.arctan2(
-        cross + 0.0, dot + 0.0
-    )  # of a vector of 0 it is 0, which -0.0 would make π
+    # of a vector of 0 it is 0, which -0.0 would make π
+    return np.arctan2(cross + 0.0, dot + 0.0)
 
 
 def velocity_of(track: pd.DataFrame, columns: list[str]) -> pd.DataFrame:

@@ -8,10 +8,11 @@ from benchnav.datagen.dem.drive_tracks import MIN_SPANS, spans_of, track_of
 
 _UNIT_TOLERANCE = 0.08  # of a ratio to that of a unit (choice)
 _PLAUSIBLE = (0.05, 1.3)  # λ of a whole log (choice)
+# of positions to the command, beyond which a time is in another unit (choice)
 _COMMAND_LIMITS = (
     _PLAUSIBLE[0],
     5.0,
-)  # of positions to the command, beyond which a time is in another unit (choice)
+)
 # quantile of the spans of a log, some of which may show an immobilised robot (choice)
 _FASTEST = 0.95
 _SLIPS = 0.9  # of measured to commanded speed, which is not that of wheels (choice)

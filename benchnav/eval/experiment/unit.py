@@ -12,6 +12,7 @@ from benchnav.eval.experiment.condition import Condition, condition_names
 from benchnav.eval.experiment.suite import Record
 
 BLOCK_MAPS = 50
+# columns by which an episode of a condition is known
 DRAW = [
     "seed",
     "realisation",

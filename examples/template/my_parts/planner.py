@@ -32,16 +32,13 @@ class Rays(Planner[Problem]):
         to_goal = problem.goal_m - here
         turns = torch.arange(self.rays, device=here.device) * (2 * math.pi / self.rays)
         angles = torch.atan2(to_goal[:, 1], to_goal[:, 0])[:, None] + turns  # [B, R]
-        far = to_goal.norm(dim=1).clamp(max=self.length_m)[
-            :, None
-        ]  # no further than the goal
+        # no further than the goal
+        far = to_goal.norm(dim=1).clamp(max=self.length_m)[:, None]
         shares = torch.linspace(0.1, 1, 10, device=here.device)
-        along = (
-            torch.stack((angles.cos(), angles.sin()), dim=-1) * far[..., None]
-        )  # [B, R, 2]
-        points = (
-            here[:, None, None] + shares[:, None] * along[:, :, None]
-        )  # [B, R, N, 2]
+        # [B, R, 2]
+        along = torch.stack((angles.cos(), angles.sin()), dim=-1) * far[..., None]
+        # [B, R, N, 2]
+        points = here[:, None, None] + shares[:, None] * along[:, :, None]
         pose = torch.cat(
             (points, angles[:, :, None, None].expand(*points.shape[:3], 1)), dim=-1
         )

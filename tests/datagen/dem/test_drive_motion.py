@@ -218,9 +218,8 @@ def test_curves_and_gaps_are_no_disagreement() -> None:
     log = compare_motion(log_of(drive(np.ones(600), np.full(600, 0.9), turning)))
     assert log.motion["pace"] == pytest.approx(1, abs=0.02)
     rows = drive(np.ones(600), np.full(600, 0.9))
-    paused = rows.assign(
-        time_s=rows["time_s"] + 60 * (rows.index // 12)
-    )  # stands for a minute, and logs nothing
+    # stands for a minute, and logs nothing
+    paused = rows.assign(time_s=rows["time_s"] + 60 * (rows.index // 12))
     log = compare_motion(log_of(paused))
     assert (log.motion["pace"], len(log.rows)) == (pytest.approx(1, abs=0.02), 600)
 
@@ -344,9 +343,8 @@ def test_no_ratio_to_the_command_stops_an_import(speed: str) -> None:
         ):
             compare_motion(log_of(rows, speed))
         log = compare_motion(log_of(rows.assign(commanded=2.0), speed))
-        assert (
-            len(log.rows) >= len(rows) - 2
-        )  # both ends have too few positions around them
+        # both ends have too few positions around them
+        assert len(log.rows) >= len(rows) - 2
 
 
 def skid_steer_log() -> pd.DataFrame:
@@ -492,15 +490,13 @@ def test_positions_that_never_change_are_frozen(speed: str) -> None:
 
 def test_positions_that_repeat_until_the_next_fix_are_not_frozen() -> None:
     rows = rough_drive()
-    rows[["x", "y"]] = (
-        rows[["x", "y"]].iloc[np.arange(600) // 20 * 20].to_numpy()
-    )  # every 2 s
+    # every 2 s
+    rows[["x", "y"]] = rows[["x", "y"]].iloc[np.arange(600) // 20 * 20].to_numpy()
     log = compare_motion(log_of(rows))
     assert not log.left_out["frozen"] + log.left_out["jumped"]
     assert log.motion["pace"] == pytest.approx(1, abs=0.05)
-    rows = drive(
-        np.repeat([0.2, 1.0], [500, 200]), np.ones(700)
-    )  # much faster than usual at the end
+    # much faster than usual at the end
+    rows = drive(np.repeat([0.2, 1.0], [500, 200]), np.ones(700))
     rows[["x", "y"]] = rows[["x", "y"]].iloc[np.arange(700) // 20 * 20].to_numpy()
     assert compare_motion(log_of(rows)).left_out["frozen"] == 0
 
@@ -736,9 +732,8 @@ def test_noise_does_not_turn_an_immobilised_robot(
 ) -> None:
     for seed in range(8):
         generator = np.random.default_rng(seed)
-        turn = np.repeat(
-            [0.05, 0.14 * (seed % 2), 0.05], [300, 200, 400]
-        )  # every second one turns round at rest
+        # every second one turns round at rest
+        turn = np.repeat([0.05, 0.14 * (seed % 2), 0.05], [300, 200, 400])
         rows = drive(np.ones(900), np.repeat([0.8, 0, 0.8], [300, 200, 400]), turn)
         rows[["x", "y"]] += noise_m * generator.standard_normal((900, 2))
         rows[["x", "y"]] = (

@@ -87,9 +87,8 @@ def test_with_solvable_maps_behind_a_wall_are_left_out(tmp_path: Path) -> None:
         "between_splits": 0,
     }
     times = maps_of(dataset)["reference_time_s"]
-    distance = 0.5 * (
-        14 - 6 + 6 * np.sqrt(2)
-    )  # 14 cells east and 6 north, on eight headings
+    # 14 cells east and 6 north, on eight headings
+    distance = 0.5 * (14 - 6 + 6 * np.sqrt(2))
     assert distance < times[0] < 1.1 * distance
     every = maps_of(read(dem, classes=classes))
     np.testing.assert_array_equal(
@@ -253,9 +252,8 @@ def test_maps_that_overlap_are_of_one_group_and_ground_apart_is_of_another(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str
 ) -> None:
     monkeypatch.setattr(importer, "SHARD_CELLS", 4 * 16 * 24)
-    monkeypatch.setattr(
-        importer, "_CELLS_AT_ONCE", 4 * 16 * 24
-    )  # so that a split has several files
+    # so that a split has several files
+    monkeypatch.setattr(importer, "_CELLS_AT_ONCE", 4 * 16 * 24)
     values = rough(16, 160)
     values[:, 70:80] = np.nan  # no map that shows these is kept
     dataset = read(write(tmp_path / "dem.tif", values), stride_m=1.5, suffix=suffix)
@@ -578,9 +576,8 @@ def test_an_origin_is_the_corner_of_the_first_map_around_drives_too(
         assert origin is None or source["origin_m"] == expected
         maps = dataset.read("train", fields=["drive_count"])["drive_count"]
         cells = np.argwhere(maps[0] > 0)[:, ::-1] * 0.5 + 0.25 + source["origin_m"]
-        assert (
-            np.abs(cells[:, 0] - WEST - (cells[:, 1] - SOUTH)) < 0.6
-        ).all()  # the drive is a diagonal
+        # the drive is a diagonal
+        assert (np.abs(cells[:, 0] - WEST - (cells[:, 1] - SOUTH)) < 0.6).all()
 
 
 @pytest.mark.parametrize(

@@ -107,10 +107,11 @@ def test_finer_cells_are_averaged_but_directions_are_not(tmp_path: Path) -> None
         write(tmp_path / "rows.tif", fine, 0.25),
     )
     stored = maps_of(layered(dem, f"rows_azimuth_deg={raster}", f"rows_deg={raster}"))
+    # not 180, the opposite
     assert set(np.unique(stored["rows_azimuth_deg"])) <= {
         1.0,
         359.0,
-    }  # not 180, the opposite
+    }
     np.testing.assert_allclose(stored["rows_deg"], 180.0)
 
 

@@ -103,9 +103,8 @@ def test_slopes_are_those_of_the_whole_ground_at_seams_too(
     dataset = read(dem, stride_m=stride)
     source, maps = source_of(dataset), maps_of(dataset)
     assert source["tiles"] == ([3, 2] if stride is None else [6, 5])
-    frame = (
-        1 if resampling == "cubic" else 0
-    )  # else the raster ends where the maps begin
+    # else the raster ends where the maps begin
+    frame = 1 if resampling == "cubic" else 0
     cells = (56, 56) if frame else (60, 60)
     ground = quantise(reprojected(dem, source, resampling, cells, frame), 13)
     slopes = inclination_deg(*horn_gradient(pad_missing(ground[None]), 0.5))[0]
@@ -323,9 +322,8 @@ def test_slopes_are_those_of_the_ground_wherever_the_scale_of_the_map_is_another
     formula, crs, radius, eccentricity = BODIES[body]
     north, across, along = formula(radius, eccentricity, np.radians(latitude))
     east, cells = radius * np.radians(10), np.arange(80) - 39.5
-    values = (
-        50 + 0.2 * 0.5 * cells - 0.1 * 0.5 * cells[:, None]
-    )  # rising 20 % eastward, 10 % northward
+    # rising 20 % eastward, 10 % northward
+    values = 50 + 0.2 * 0.5 * cells - 0.1 * 0.5 * cells[:, None]
     transform = rasterio.Affine(
         across * 0.5,
         0,
@@ -357,9 +355,8 @@ def test_ground_off_the_earth_may_be_in_degrees_and_its_own_metres_are_kept_wher
     tmp_path: Path,
 ) -> None:
     moon = "+proj=longlat +R=1737400 +no_defs"
-    cell = np.degrees(
-        0.5 / 1737400
-    )  # 0.5 m northward, and half of that eastward at 60°
+    # 0.5 m northward, and half of that eastward at 60°
+    cell = np.degrees(0.5 / 1737400)
     profile = {"crs": moon, "transform": rasterio.Affine(2 * cell, 0, 20, 0, -cell, 60)}
     maps = maps_of(read(write(tmp_path / "degrees.tif", plane(80, 80, 0.5), **profile)))
     np.testing.assert_allclose(

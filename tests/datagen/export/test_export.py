@@ -644,9 +644,8 @@ def test_mlcroissant_reads_the_metadata_and_the_maps(
         maps = dataset.read(split)
         for row in rows:
             for field, values in maps.items():
-                got = np.array(
-                    nested(row[f"{name}/{field}"]), values.dtype
-                )  # a number NaN comes as None
+                # a number NaN comes as None
+                got = np.array(nested(row[f"{name}/{field}"]), values.dtype)
                 np.testing.assert_array_equal(
                     got.reshape(values.shape[1:]), values[int(row[f"{name}/map"])]
                 )

@@ -65,9 +65,8 @@ def test_changed_values_with_sound_checksums_are_named_by_map_and_field(
         file["test/hs/traversability"][1, 2, 3] = 1.5
         file["train/elevation_m"][2, 0, 0] += 2.0**-13
         file["train/goal_m"][4] = [1, 1]
-        file["valid/traversability"][0, 5, 5] = (
-            np.nan
-        )  # as of a cell not observed: in range
+        # as of a cell not observed: in range
+        file["valid/traversability"][0, 5, 5] = np.nan
     found = {str(fault) for fault in find_faults(path)}
     assert found == {
         "test/hs: map 1: field 'traversability' is out of range",

@@ -40,9 +40,8 @@ def test_workers_read_what_this_process_reads(
     dataset_path: Path, context: str, in_memory: bool
 ) -> None:
     maps = TerrainMaps(dataset_path, "train", in_memory=in_memory)
-    here = torch.stack(
-        [maps[i]["rgb"] for i in range(len(maps))]
-    )  # and so the file is open already
+    # and so the file is open already
+    here = torch.stack([maps[i]["rgb"] for i in range(len(maps))])
     workers = {"fork": 2, "spawn": 1}[context]
     loader = DataLoader(
         maps, batch_size=2, num_workers=workers, multiprocessing_context=context

@@ -115,9 +115,8 @@ def test_it_hides_the_colour_of_its_cells_alone_and_changes_nothing_else(
     )
     np.testing.assert_array_equal(image[~is_grown], other[~is_grown])
     ground = np.array([item.colour for item in RECIPE.classes])[maps["class_id"]]
-    brightness = (
-        other[..., :1] / ground[..., :1]
-    )  # of the red, known to within half a level
+    # of the red, known to within half a level
+    brightness = other[..., :1] / ground[..., :1]
     for number, item in enumerate(RECIPE.classes):
         own = is_grown & (maps["class_id"] == number)
         if growth := growths_of(RECIPE).get(item.name):

@@ -68,9 +68,8 @@ def maps_in(scenario: Scenario, recipe: Recipe | None = None) -> dict[str, np.nd
 def test_a_tint_changes_the_colours_of_its_classes_and_nothing_else() -> None:
     recipe = tiny_recipe()
     tints = (Tint(classes=("gravel", "scree"), colour=(30, 20, 10), share=0.25), SNOW)
-    plain, tinted = (
-        maps_in(Scenario(tints=own, ambient=1.0)) for own in ((), tints)
-    )  # all in full light
+    # all in full light
+    plain, tinted = (maps_in(Scenario(tints=own, ambient=1.0)) for own in ((), tints))
     for name in set(plain) - {"rgb"}:
         np.testing.assert_array_equal(plain[name], tinted[name])
     own = np.array([item.colour for item in recipe.classes], dtype=float)

@@ -126,9 +126,8 @@ def test_a_forest_has_a_panel_a_metric_with_points_intervals_and_margins() -> No
     assert {(-0.25, 0.45), (-0.2, 0.4)} <= spans
     bands = [band.get_paths()[0].get_extents() for band in time.collections]
     assert (bands[0].x0, bands[0].x1) == (-0.5, 0.5)
-    assert (
-        bands[1].x0 == time.get_xlim()[0]
-    )  # of what is better the lower all below the margin is
+    # of what is better the lower all below the margin is
+    assert bands[1].x0 == time.get_xlim()[0]
     assert bands[1].x1 == 0.5
     assert (bands[2].x0, bands[2].x1) == (time.get_xlim()[0], -0.5)
     assert (bands[3].x0, bands[3].x1) == (0.5, time.get_xlim()[1])

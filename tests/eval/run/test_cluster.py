@@ -216,9 +216,8 @@ def test_planners_with_a_time_limit_have_processes_of_their_own_on_workers_too(
     }
     list(run_suite(suite, tmp_path / "here"))
     assert log.read_text().split() == [*begun, str(os.getpid()), str(os.getpid())]
-    same(
-        tmp_path / "here", tmp_path / "cluster", without=("code",)
-    )  # of which a time limit is part
+    # of which a time limit is part
+    same(tmp_path / "here", tmp_path / "cluster", without=("code",))
 
 
 def test_half_of_a_run_on_a_cluster_that_is_lost_and_half_here(

@@ -57,12 +57,10 @@ WORLD = World(noise="stored", immobile=IMMOBILE, time_budget_s=24.0)
 RULES = Rules(free_space=FreeSpace(by="mean", above=0.1), min_traversability=0.05)
 COVARIANCE = made.covariance(SIZE, SIZE, 1.5)
 KEYS = tuple(range(BATCH))
-SHIPPED = sorted(
-    set(NAMES) - {"straight", "optimal"}
-)  # which uses no map, and which plans once
-CONFIG = AStarDWAConfig(
-    dwa=DWAConfig(speeds=5, turn_rates=11, horizon_s=4.0)
-)  # few arcs, which is quick
+# which uses no map, and which plans once
+SHIPPED = sorted(set(NAMES) - {"straight", "optimal"})
+# few arcs, which is quick
+CONFIG = AStarDWAConfig(dwa=DWAConfig(speeds=5, turn_rates=11, horizon_s=4.0))
 
 
 def astar_dwa() -> AStarDWA:
@@ -252,9 +250,8 @@ def test_what_was_not_sensed_changes_no_action(
     given = drives()
     before, posed = given.learning.truth.terrain.select(few), given.problem.select(few)
     posed = replace(posed, distribution=before.truth)
-    sensed = torch.zeros(
-        2, len(few), SIZE, SIZE, dtype=torch.bool
-    )  # what it looks like, and its λ
+    # what it looks like, and its λ
+    sensed = torch.zeros(2, len(few), SIZE, SIZE, dtype=torch.bool)
     sensed[0] = sensor.sees_all
 
     def drive(terrain: Terrain, noted: Tensor) -> Episodes:

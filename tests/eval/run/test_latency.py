@@ -66,9 +66,8 @@ def test_a_step_of_one_robot_is_timed_with_its_replanning_and_without_the_first(
         )
     }
     assert by_planner["bad"] is None
-    assert (
-        found.count(by_planner["timed"]) == 2
-    )  # one measurement for both risk settings
+    # one measurement for both risk settings
+    assert found.count(by_planner["timed"]) == 2
     timed_ms = by_planner["timed"]
     assert timed_ms["steps"] == 39
     assert 4 <= timed_ms["median_ms"] < 30

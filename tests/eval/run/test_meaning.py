@@ -186,9 +186,8 @@ def test_each_unit_meets_its_own_maps_risk_seed_noise_and_options(
         (SCENARIOS[0], "mean", (0,), SEEDS[0], 0, "resampled", gain)
         for gain in GAINS.values()
     }
-    assert (
-        set(met) == wanted | alone
-    )  # one robot alone of each planner, for its latency
+    # one robot alone of each planner, for its latency
+    assert set(met) == wanted | alone
     assert set(met.values()) == {1}
 
 

@@ -174,9 +174,8 @@ def failed(dataset_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
 
 
 def test_the_ground_is_that_of_each_episode_under_its_own_noise(failed: Path) -> None:
-    rows = read_table(
-        failed, "episodes.parquet"
-    )  # whether they failed does not matter here
+    # whether they failed does not matter here
+    rows = read_table(failed, "episodes.parquet")
     assert len(rows) == 8
     mixed = rows.sort_values("map")
     taken = record_driven(failed, mixed)

@@ -331,12 +331,13 @@ def test_a_run_is_extended_by_maps(tmp_path: Path) -> None:
     for maps in (50, 52, 0, 4):
         rows = finish(replace(suite, maps=maps), folder)
         sizes.append((len(rows), len(list(folder.glob("units/*/*")))))
+    # a last block of more maps is another unit
     assert sizes == [
         (50, 1),
         (52, 2),
         (53, 3),
         (53, 3),
-    ]  # a last block of more maps is another unit
+    ]
     same(rows, finish(replace(suite, maps=0), tmp_path / "fresh"))
 
 
@@ -969,9 +970,8 @@ def test_hypotheses_are_fixed_before_the_first_unit_and_stay(
     ]
     assert fixed["episodes"] == {test["one"]: 2, test["other"]: 2}
     list(steps)
-    finish(
-        quick(dataset_path, scenarios=("std",), seed=5), folder
-    )  # without them the run goes on
+    # without them the run goes on
+    finish(quick(dataset_path, scenarios=("std",), seed=5), folder)
     assert open_run(folder).about["hypotheses"] == fixed
     report = write_report(folder)
     assert report.tests["n_episodes"].tolist() == [4]

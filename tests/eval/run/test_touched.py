@@ -144,13 +144,15 @@ def test_what_a_part_reads_is_recorded_and_a_change_runs_its_unit_again(
     run(own, dataset_path, "run")
     nothing, touched = records(own, "run")
     assert nothing == {}
+    # neither its output nor a temporary file
     assert files_of(own, touched) == {
         "speed.json",
         "helper.py",
-    }  # neither its output nor a temporary file
+    }
+    # no copy of all
     assert [name for name in touched if name.startswith("variable ")] == [
         "variable OWN_GAIN"
-    ]  # no copy of all
+    ]
     assert touched["package ownlib"] == touched["package ownmore"] == "1.0"
     # dateutil is what pandas requires, and that what ownlib does.
     assert {"package torch", "package pandas", "package python-dateutil"} <= set(

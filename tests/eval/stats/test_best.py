@@ -118,9 +118,8 @@ def test_maps_are_paired_under_the_same_noise() -> None:
     found = compared(one, other)
     assert found.loc["two", "best_difference"] == pytest.approx(0.5)
     assert found.loc["two", "best_p"] < 0.01
-    few = [
-        made.row(made.condition(risk="three"), i, None) for i in range(4)
-    ]  # only under the first seed
+    # only under the first seed
+    few = [made.row(made.condition(risk="three"), i, None) for i in range(4)]
     assert compared(one, few).loc["three", "best_difference"] == pytest.approx(1)
 
 

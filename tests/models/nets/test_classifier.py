@@ -358,9 +358,8 @@ def test_mean_iou_is_over_the_classes_that_occur_in_truth() -> None:
     for some, true in ((found, class_id), (torch.full((50,), 4), unknown)):
         metric.update(some, true)
     assert float(metric.compute()) == pytest.approx(sum(ious) / 2)
-    logged = build().metrics(
-        found.clamp(max=3), class_id
-    )  # as it is logged in training
+    # as it is logged in training
+    logged = build().metrics(found.clamp(max=3), class_id)
     assert float(logged["valid_miou"]) == pytest.approx(sum(ious) / 2)
 
 

@@ -29,6 +29,7 @@ def test_layers_become_scaled_channels_in_the_order_of_their_names() -> None:
     stack = InputStack(("elevation_m", "rgb", "wind_azimuth_deg"), scale)
     assert stack.channels == 6
     found = stack(maps)
+    # what is missing stands at the mean
     expected = [
         [2, 0],
         [2, 2],
@@ -36,7 +37,7 @@ def test_layers_become_scaled_channels_in_the_order_of_their_names() -> None:
         [1, 1],
         [0, -1],
         [1, 0],
-    ]  # what is missing stands at the mean
+    ]
     torch.testing.assert_close(
         found[0, :, 0], torch.tensor(expected, dtype=torch.float32), rtol=0, atol=1e-6
     )

@@ -85,8 +85,7 @@ def parameters(
     )
 
 
-# --- the loss
-# ------------------------------------------------------------------------------------
+# --- the loss ---
 
 
 @settings(max_examples=60, deadline=None)
@@ -162,9 +161,8 @@ def test_the_gradient_of_the_clipped_mass_is_right_far_out() -> None:
     torch.testing.assert_close(
         value.detach().double(), torch.from_numpy(expected), rtol=1e-5, atol=1e-9
     )
-    hazard = np.exp(
-        norm.logpdf(far) - expected
-    )  # φ/Φ, which towards −∞ is −z, but for its rounding
+    # φ/Φ, which towards −∞ is −z, but for its rounding
+    hazard = np.exp(norm.logpdf(far) - expected)
     hazard[far < -1e3] = -far[far < -1e3]
     assert leaf.grad is not None
     torch.testing.assert_close(
@@ -198,8 +196,7 @@ def test_cells_that_were_not_observed_are_left_out() -> None:
     assert loss(torch.full_like(some, float("nan")), slice(None))[0] == 0
 
 
-# --- the network
-# ---------------------------------------------------------------------------------
+# --- the network ---
 
 
 @pytest.mark.parametrize("shape", [(8, 8), (33, 20)])
@@ -319,8 +316,7 @@ def test_an_unknown_network_is_refused(name: str, value: str) -> None:
         build(**{name: value})
 
 
-# --- training
-# ------------------------------------------------------------------------------------
+# --- training ---
 
 
 def draw_two_grounds(generator: torch.Generator) -> tuple[Terrain, list[Tensor]]:
@@ -503,8 +499,7 @@ def test_what_is_measured_in_validation_leaves_out_what_was_not_observed() -> No
     torch.testing.assert_close(logged["valid_loss"].compute(), nll)
 
 
-# --- checkpoints and the command
-# -----------------------------------------------------------------
+# --- checkpoints and the command ---
 
 
 def checkpoint(network: MixtureDensityModel) -> Checkpoint:

@@ -172,8 +172,7 @@ def test_of_one_classifier_the_pool_temperature_is_what_its_own_leaves_over() ->
     )
 
 
-# --- distributions of λ
-# ----------------------------------------------------------------------------
+# --- distributions of λ ---
 
 
 def scores(

@@ -380,9 +380,8 @@ def test_a_dataset_with_look_alikes_is_measured_with_them_merged(
     (measured,) = qualities["test/std"].classes
     assert measured.look_alikes is not None
     assert measured.look_alikes.look_alike_accuracy > measured.accuracy
-    assert measured.look_alikes.look_alike_share_error == pytest.approx(
-        0, abs=1e-6
-    )  # one colour, one probability
+    # one colour, one probability
+    assert measured.look_alikes.look_alike_share_error == pytest.approx(0, abs=1e-6)
     row = json.loads(quality_json({}, qualities))["splits"]["test/std"]
     assert {name: row[name] for name in LOOK_ALIKES} == pytest.approx(
         vars(measured.look_alikes)

@@ -238,9 +238,8 @@ def test_latent_metrics_read_each_cell_with_its_own_class() -> None:
     one_cell = std.clone()
     one_cell[2, 3, 4] /= 1.25
     found = measure_latent(table, [replace(terrain, truth=normal(mean, one_cell))])
-    assert found["noise_error"] == pytest.approx(
-        0.25, rel=1e-5
-    )  # the largest, not the mean
+    # the largest, not the mean
+    assert found["noise_error"] == pytest.approx(0.25, rel=1e-5)
 
 
 def test_a_second_mode_counts_in_the_nll_of_the_processes_and_not_in_their_error() -> (

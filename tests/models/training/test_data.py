@@ -163,9 +163,8 @@ def test_jitter_is_torchvisions_a_map_at_a_time() -> None:
     assert torch.equal(apply_jitter(rgb, torch.ones(2, 3)), rgb)
     changed = apply_jitter(rgb, torch.tensor([[0.5, 1, 1], [1, 1, 0]]))
     torch.testing.assert_close(changed[0].float(), rgb[0].float() / 2, rtol=0, atol=1)
-    assert torch.equal(
-        changed[1, 0], changed[1, 1]
-    )  # without saturation all channels are one grey
+    # without saturation all channels are one grey
+    assert torch.equal(changed[1, 0], changed[1, 1])
 
 
 def test_jitter_is_within_its_range_and_valid_maps_are_never_changed(
@@ -212,8 +211,7 @@ def test_processes_share_every_batch(
             assert len(torch.cat(shared)) == len(batch)
 
 
-# --- squares and directions
-# ------------------------------------------------------------------------
+# --- squares and directions ---
 
 
 def test_squares_are_cut_from_all_fields_alike_and_lie_within_their_maps(
@@ -259,9 +257,8 @@ def test_a_map_gives_as_many_squares_an_epoch_as_it_has_room_for() -> None:
     drawn = torch.cat([key.maps for key in sampler])
     assert torch.bincount(drawn).tolist() == [6] * 5
     assert len(sampler) == 8
-    assert (
-        len(MapSampler(5, 4, crop=16, shape=(32, 50))) == 2
-    )  # in validation one a map
+    # in validation one a map
+    assert len(MapSampler(5, 4, crop=16, shape=(32, 50))) == 2
 
 
 def test_validation_and_calibration_see_the_same_squares(

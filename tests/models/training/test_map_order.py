@@ -121,9 +121,8 @@ def test_batches_of_many_shards_are_the_same_however_they_are_read(
     sampler = data.train_dataloader().sampler
     assert torch.cat([index for index, *_ in sampler]).tolist() == order.tolist()
     plain = [batch["rgb"] for batch in data.train_dataloader()]
-    assert sorted(opened) == sorted(
-        piece.path for piece in dataset.pieces["train"]
-    )  # each once
+    # each once
+    assert sorted(opened) == sorted(piece.path for piece in dataset.pieces["train"])
     for how in ({"workers": 2}, {"in_memory": True}):
         other = MapData(dataset, 2, seed=4, loading=Loading(**how)).train_dataloader()
         assert all(

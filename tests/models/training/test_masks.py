@@ -232,9 +232,8 @@ def test_training_maps_are_masked_anew_each_epoch_and_valid_maps_alike(
     chunks = torch.cat([batch["rgb"] for _, batch in data.valid.chunks()])
     assert torch.equal(read[0], read[1])
     assert torch.equal(read[0], chunks)
-    assert set(next(iter(loader))) == set(
-        fields
-    )  # what was read for slopes alone is left out
+    # what was read for slopes alone is left out
+    assert set(next(iter(loader))) == set(fields)
     other = MapData(dataset, 3, 6, fields, masks=law).valid
     assert not torch.equal(
         chunks, torch.cat([batch["rgb"] for _, batch in other.chunks()])

@@ -157,9 +157,8 @@ def test_temperatures_widen_what_one_model_and_an_ensemble_predict(
         plain = model.predict(seen).cdf(0.4).double()
         model.temperature = 1.7
         wider = model.predict(seen).cdf(0.4).double()
-        expected = torch.special.ndtr(
-            torch.special.ndtri(plain) / 1.7
-        )  # Φ(Φ⁻¹(F(λ)) / T)
+        # Φ(Φ⁻¹(F(λ)) / T)
+        expected = torch.special.ndtr(torch.special.ndtri(plain) / 1.7)
         torch.testing.assert_close(wider, expected, rtol=0, atol=2e-5)
 
 

@@ -151,9 +151,8 @@ def test_a_network_is_kept_if_the_trainer_and_the_precision_are_the_same(
 
     assert holds(kept)
     assert holds(kept, log_every_n_steps=7)
-    assert holds(
-        replace(kept, trainer=None), gradient_clip_val=3
-    )  # of an earlier version
+    # of an earlier version
+    assert holds(replace(kept, trainer=None), gradient_clip_val=3)
     with pytest.raises(
         CheckpointError, match=r"another `trainer\.gradient_clip_val`\. Repeat"
     ):
@@ -164,9 +163,8 @@ def test_a_network_is_kept_if_the_trainer_and_the_precision_are_the_same(
         holds(kept, limit_train_batches=2)
     with pytest.raises(CheckpointError, match=r"another `half_precision`\. Repeat"):
         holds(kept, half_precision=False)
-    assert holds(
-        kept, False, Config, gradient_clip_val=0.6
-    )  # processes, which no such trainer trains
+    # processes, which no such trainer trains
+    assert holds(kept, False, Config, gradient_clip_val=0.6)
 
 
 def test_a_training_that_was_to_replace_a_part_is_gone_on_with_when_asked(

@@ -64,9 +64,8 @@ def test_loggers_write_what_is_measured_and_change_nothing(
     assert "hidden: 4" in told
     assert "seed: 0" in told
     assert list(logs.glob("lightning_logs/version_*/events.out.tfevents.*"))
-    assert not list(
-        logs.glob("events.out.tfevents.*")
-    )  # where loggers are named, these alone write
+    # where loggers are named, these alone write
+    assert not list(logs.glob("events.out.tfevents.*"))
     assert list(
         (tmp_path / "plain.training" / "CellModel").glob("events.out.tfevents.*")
     )

@@ -38,8 +38,7 @@ def maps(values: Tensor) -> Tensor:
     return values.view(1, 1, 1, -1)
 
 
-# --- mean and variance
-# ---------------------------------------------------------------------------
+# --- mean and variance ---
 
 
 @pytest.mark.parametrize("beta", [0.0, 0.5, 1.0])
@@ -51,10 +50,11 @@ def test_each_cell_counts_by_the_power_of_its_variance(beta: float) -> None:
     found = beta_nll(maps(means), maps(stds), OBSERVED.view(1, 1, -1), beta)
     law = stats.norm(means.numpy(), stds.numpy())
     density = law.logpdf(OBSERVED.numpy())
+    # what is clipped to 0 and to 1
     density[0], density[-1] = (
         law.logcdf(0)[0],
         law.logsf(1)[-1],
-    )  # what is clipped to 0 and to 1
+    )
     assert float(found) == pytest.approx(
         -(density * stds.numpy() ** (2 * beta)).mean(), rel=1e-5
     )
@@ -97,8 +97,7 @@ def test_several_gaussians_are_averaged_as_a_pool_is() -> None:
     )
 
 
-# --- quantiles
-# -----------------------------------------------------------------------------------
+# --- quantiles ---
 
 
 @settings(max_examples=50, deadline=None)
@@ -216,8 +215,7 @@ def test_no_observation_is_impossible() -> None:
     assert float(found.cdf(0.0)) == pytest.approx(0.0005)
 
 
-# --- evidence
-# ------------------------------------------------------------------------------------
+# --- evidence ---
 
 
 def evidence(gamma: float, nu: float, alpha: float, beta: float) -> tuple[Tensor, ...]:
@@ -280,8 +278,7 @@ def test_evidence_begins_where_it_says() -> None:
     )
 
 
-# --- settings
-# ------------------------------------------------------------------------------------
+# --- settings ---
 
 
 @pytest.mark.parametrize(

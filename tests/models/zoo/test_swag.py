@@ -152,9 +152,8 @@ def test_draws_are_normal_about_the_mean_and_of_the_seed(trained: Any) -> None:
     assert abs(float(scores.std()) - 1) < 0.1
     assert torch.equal(model.draw(1)["head.bias"], model.draw(1)["head.bias"])
     other = ZOO["swag"][0].from_tensors(model.settings(), (), model.state_dict())
-    assert torch.equal(
-        other.draw(2)["head.bias"], model.draw(2)["head.bias"]
-    )  # of the seed that is kept
+    # of the seed that is kept
+    assert torch.equal(other.draw(2)["head.bias"], model.draw(2)["head.bias"])
     other.draw_seed += 1
     assert not torch.equal(other.draw(2)["head.bias"], model.draw(2)["head.bias"])
 

@@ -373,9 +373,8 @@ def test_cells_that_rollouts_cannot_reach_are_not_looked_up_and_change_nothing(
     plan_state = planner.init(problem, generator())
     found, _, _ = planner.plan(first(problem), plan_state)
     ground = planner._ground(plan_state, problem.start)
-    assert (
-        0.5 < float((ground.abs() < 1e-20).double().mean()) < 0.9
-    )  # in 1.5 s of 8 m × 8 m
+    # in 1.5 s of 8 m × 8 m
+    assert 0.5 < float((ground.abs() < 1e-20).double().mean()) < 0.9
     monkeypatch.setattr(
         Static, "sample_cells", lambda self, *given: self.sample_fields(*given[:3])
     )

@@ -135,9 +135,8 @@ def test_path_reaches_the_point_at_its_length_forward_and_no_tighter_than_the_ra
     ahead = moved[..., 0] * middle.cos() + moved[..., 1] * middle.sin()
     aside = moved[..., 1] * middle.cos() - moved[..., 0] * middle.sin()
     assert ahead.min() >= 0
-    assert aside.abs().max() < spacing**2 / (
-        2 * radius
-    )  # where one segment gives way to the next
+    # where one segment gives way to the next
+    assert aside.abs().max() < spacing**2 / (2 * radius)
 
 
 def test_points_past_the_end_repeat_it() -> None:

@@ -573,10 +573,11 @@ def test_runs_begin_everywhere_and_parts_change_hands() -> None:
     assert (begin % 200).max() > 140
 
 
+# goals 6 m behind the robot, and in the turning circle at its left
 BEHIND, WITHIN = (
     (7.0, 10.0),
     (13.0, 11.2),
-)  # goals 6 m behind the robot, and in the turning circle at its left
+)
 
 
 @pytest.mark.parametrize(

@@ -104,9 +104,8 @@ def test_where_nothing_was_seen_are_the_training_means(seed: int, share: float) 
         grid=grid,
     )
     known = masked(memory, MEANS)
-    expected = torch.tensor(
-        [10, 100, 200], dtype=torch.uint8
-    )  # halves go to the even number
+    # halves go to the even number
+    expected = torch.tensor([10, 100, 200], dtype=torch.uint8)
     assert (known.rgb.movedim(1, -1)[~seen] == expected).all()
     assert (known.rgb.movedim(1, -1)[seen] == 7).all()
     assert (known.elevation_m[~seen] == 1.75).all()

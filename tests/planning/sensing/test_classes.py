@@ -95,9 +95,10 @@ def test_cells_for_themselves_follow_bayes_rule() -> None:
         ]
         wanted[:, row, column] += likely[0] - likely[1]
     own = state.pair > 0
+    # of intervals noise changes a little
     torch.testing.assert_close(
         state.probability()[own], torch.sigmoid(wanted)[own], rtol=0, atol=2e-3
-    )  # of intervals noise changes a little
+    )
     torch.testing.assert_close(
         state.probability()[:, 3, 3], torch.sigmoid(wanted)[:, 3, 3], rtol=0, atol=1e-5
     )

@@ -37,9 +37,8 @@ def test_published_pairs_agree_with_published_successes() -> None:
 
 
 def test_interval_of_a_difference_is_that_of_its_source() -> None:
-    assert (
-        show_difference(56, 70, 48, 80) == "+20.0 [5.2, 33.4]"
-    )  # Newcombe's first example, table II
+    # Newcombe's first example, table II
+    assert show_difference(56, 70, 48, 80) == "+20.0 [5.2, 33.4]"
 
 
 def test_success_stands_beside_the_published() -> None:

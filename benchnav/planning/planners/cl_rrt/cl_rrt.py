@@ -214,9 +214,8 @@ class CLRRT(Planner[CLRRTState]):
         again = ((partial & (now.failures < config.most_failures)) | now.doubted) & (
             ground > 0
         )
-        due = ((lost | again) & ~arrived & (ground != 0)).nonzero()[
-            :, 0
-        ]  # not off the map
+        # not off the map
+        due = ((lost | again) & ~arrived & (ground != 0)).nonzero()[:, 0]
         if len(due):
             now = self._replan(state, now, due, lost[due])
         route, follower = now.route, now.follower

@@ -222,9 +222,8 @@ def choose(
         distance(tree.at.state, loop.problem.goal_m[:, None])
         - loop.problem.goal_radius_m
     ).clamp(min=0)
-    closed = (
-        tree.cost + straight_m / loop.follower.speed_mps[1] >= best
-    )  # cannot improve on the best way
+    # cannot improve on the best way
+    closed = tree.cost + straight_m / loop.follower.speed_mps[1] >= best
     closed_m = torch.where(closed, math.inf, 0.0)
     # The time of the way to each node, as the length driven in it at the wanted speed.
     spent_m = torch.where(closed, 0, loop.follower.wanted_mps * tree.time_s)

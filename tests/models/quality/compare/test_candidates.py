@@ -49,10 +49,11 @@ def test_one_model_under_two_names_is_refused(
         find_candidates([])
     copy = shutil.copytree(checkpoint_path, tmp_path / "other" / "tiny")
     found = find_candidates([str(checkpoint_path), str(copy)])
+    # one name for both says nothing
     assert [one.label for one in found[:2]] == [
         str(checkpoint_path),
         str(copy),
-    ]  # one name for both says nothing
+    ]
 
 
 def test_models_of_files_are_called_by_their_class_or_checkpoint(

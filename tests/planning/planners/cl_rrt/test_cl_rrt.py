@@ -119,9 +119,8 @@ def test_open_map_is_crossed_as_predicted() -> None:
     torch.testing.assert_close(path[0], problem.start[0, :2])
     assert arrived(problem, path[-1:]).all()
     assert arrived(problem, states[-1]).all()
-    assert all(
-        plan.path is first.path for plan in plans
-    )  # followed to the end, without another plan
+    # followed to the end, without another plan
+    assert all(plan.path is first.path for plan in plans)
     assert off_polyline(states[:, 0, :2], path).max() < 0.05
     assert off_polyline(path, states[:, 0, :2]).max() < 0.05
     low, high = problem.action_bounds
@@ -233,9 +232,8 @@ def test_closed_wall_is_not_entered_by_chance_where_the_ground_is_other_than_pre
     )
     truth = (problem.risk_map + 0.4 * (noise - 0.5)).clamp(0.1, 1)
     states, _, plans = drive(problem, 100, truth=truth)
-    without = torch.stack(
-        [plan.path[..., 0].isnan().all(dim=1) for plan in plans]
-    )  # [N, B]
+    # [N, B]
+    without = torch.stack([plan.path[..., 0].isnan().all(dim=1) for plan in plans])
     assert without.any(dim=0).all()
     for member in range(8):
         before = states[: int(without[:, member].to(torch.uint8).argmax()) + 1, member]
@@ -302,9 +300,8 @@ def test_partial_path_is_not_changed_while_the_robot_stands_on_ground_that_is_no
     for _ in range(SMALL.most_failures - 2):
         _, plan_state, plan = planner.plan(at(beside), plan_state)
         assert plan.path is first.path
-    assert (
-        plan_state.failures == 0
-    ).all()  # once it is back on free ground it looks for a way again
+    # once it is back on free ground it looks for a way again
+    assert (plan_state.failures == 0).all()
     _, later, plan = planner.plan(at(problem.start), plan_state)
     assert ((later.failures == 1) | (plan.status == PlanStatus.OK)).all()
 
@@ -468,9 +465,8 @@ def test_layers_are_drawn_when_asked_for_whenever_that_is() -> None:
     assert plan.path.numel() == plan.reference.numel() == plan.tree.numel() == 0
     drawn, _, later = planner.plan(at(problem.start), begin(problem)[1])
     assert torch.equal(drawn, action)
-    _, _, shown = planner.plan(
-        at(problem.start), plan_state
-    )  # of a route planned when none was asked for
+    # of a route planned when none was asked for
+    _, _, shown = planner.plan(at(problem.start), plan_state)
     torch.testing.assert_close(shown.tree, later.tree, equal_nan=True)
 
 
@@ -489,9 +485,8 @@ def test_drawn_tree_is_one_of_edges_no_longer_than_the_step() -> None:
             torch.linalg.vector_norm(edge[1:] - edge[:-1], dim=1).sum()
             < SMALL.step_m + 0.2
         )
-        assert (
-            torch.linalg.vector_norm(ends - edge[0], dim=1).min() < 1e-6
-        )  # begins where another ends
+        # begins where another ends
+        assert torch.linalg.vector_norm(ends - edge[0], dim=1).min() < 1e-6
     assert known(plan.reference[0]).shape[0] > 10
     assert off_polyline(known(plan.path[0]), known(plan.reference[0])).max() < 0.5
 
@@ -625,9 +620,8 @@ def test_those_that_are_kept_go_on_as_they_would_in_the_batch() -> None:
         state = problem.robot(state, action, problem.traversability_at(state))
     few = planner.select(plan_state, members)
     for count in range(4):
-        state = state + torch.tensor([0.0, 1.5, 0.0]) * (
-            count == 2
-        )  # aside, so that it plans anew
+        # aside, so that it plans anew
+        state = state + torch.tensor([0.0, 1.5, 0.0]) * (count == 2)
         action, plan_state, plan = planner.plan(at(state), plan_state)
         few_action, few, few_plan = planner.plan(at(state[members]), few)
         torch.testing.assert_close(few_action, action[members])

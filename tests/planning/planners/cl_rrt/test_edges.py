@@ -42,9 +42,8 @@ def test_reference_turns_with_the_radius_and_then_runs_straight_on() -> None:
             loop, torch.tensor([[[8.0, 8.0, 0.0]]]), torch.tensor([[[8.0, 13.0]]])
         )
         centre = torch.tensor([8.0, 8.0 + radius_m])
-        angle = math.pi / 2 + math.asin(
-            radius_m / (5 - radius_m)
-        )  # of the tangent through the target
+        # of the tangent through the target
+        angle = math.pi / 2 + math.asin(radius_m / (5 - radius_m))
         on_arc = torch.arange(len(reference.rows)) * 0.1 < radius_m * angle
         from_centre = torch.linalg.vector_norm(reference.rows[:, :2] - centre, dim=1)
         torch.testing.assert_close(
@@ -138,9 +137,8 @@ def test_nearer_half_of_an_edge_that_would_enter_a_wall_stays() -> None:
     assert edges.exists.all()
     assert edges.at.free.all()
     assert edges.blocked_m.item() == 0
-    assert edges.at.state[0, 0, 0] == pytest.approx(
-        6.5, abs=0.1
-    )  # free from 5 m to 8 m
+    # free from 5 m to 8 m
+    assert edges.at.state[0, 0, 0] == pytest.approx(6.5, abs=0.1)
 
 
 def test_edge_that_begins_at_a_wall_is_rejected() -> None:

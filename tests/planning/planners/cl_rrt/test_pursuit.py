@@ -82,9 +82,8 @@ def test_circle_is_kept(radius_m: float, traversability: float) -> None:
     radii = torch.hypot(states[:, 0], states[:, 1] - radius_m)
     assert (radii - radius_m).abs().max() < 0.05
     assert progress[-1] > 8
-    assert (
-        progress[1:] >= progress[:-1]
-    ).all()  # though the circle passes its beginning again
+    # though the circle passes its beginning again
+    assert (progress[1:] >= progress[:-1]).all()
 
 
 def test_circle_tighter_than_the_bounds_at_full_speed_is_kept_by_slowing_down() -> None:

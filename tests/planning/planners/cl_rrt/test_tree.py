@@ -117,9 +117,8 @@ def test_nodes_that_cannot_improve_on_the_best_way_are_left_out() -> None:
         torch.tensor([[False, False, True]]),
         torch.tensor([[0.0, 18.0, 20.0]]),
     )
-    tree = replace(
-        tree, arrived=arrived, time_s=time_s
-    )  # 5 m to the goal's rim: 18 s + 5 s > 20 s
+    # 5 m to the goal's rim: 18 s + 5 s > 20 s
+    tree = replace(tree, arrived=arrived, time_s=time_s)
     chance = torch.linspace(0, 0.99, 20)
     assert (
         choose(loop, tree, torch.tensor([8.0, 8.0]).expand(20, 2), chance, 3).parent
@@ -130,9 +129,8 @@ def test_nodes_that_cannot_improve_on_the_best_way_are_left_out() -> None:
         choose(loop, soon, torch.tensor([8.0, 8.0]).expand(20, 2), chance, 0).parent
         == 1
     ).any()
-    dear = replace(
-        soon, blocked_m=torch.tensor([[0.0, 0.1, 0.0]])
-    )  # and the penalty counts
+    # and the penalty counts
+    dear = replace(soon, blocked_m=torch.tensor([[0.0, 0.1, 0.0]]))
     assert (
         choose(loop, dear, torch.tensor([8.0, 8.0]).expand(20, 2), chance, 0).parent
         == 0
