@@ -346,8 +346,7 @@ def _parser(kind: Any) -> Any:
     return parser
 
 
-# --- to plain data, and messages
-# --------------------------------------------------------------------
+# --- to plain data, and messages ---
 
 
 def plain(value: Any) -> Any:

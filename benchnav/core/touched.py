@@ -181,8 +181,7 @@ def _relative(path: str) -> str:
     return os.path.relpath(path, cwd) if path.startswith(f"{cwd}{os.sep}") else path
 
 
-# --- recording in this process
-# ---------------------------------------------------------------------
+# --- recording in this process ---
 
 
 def _hook(event: str, arguments: tuple[Any, ...]) -> None:
@@ -299,8 +298,7 @@ def _calling_sources() -> set[str]:
     return sources
 
 
-# --- digests and sources
-# ------------------------------------------------------------------------------
+# --- digests and sources ---
 
 
 def _digest_of_value(name: str, value: str | None) -> str:

@@ -13,11 +13,12 @@ from benchnav.eval.experiment.suite import Record
 
 BLOCK_MAPS = 50
 # columns by which an episode of a condition is known
+# columns that identify an episode of a condition
 DRAW = [
     "seed",
     "realisation",
     "map",
-]  # columns that identify an episode of a condition
+]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -227,9 +227,8 @@ def test_processes_beside_the_first_refuse_and_write_nothing(
     folder = there(tmp_path / "m", "gp")
     before = (folder / "config.json").read_bytes()
     monkeypatch.setattr(module, "is_first_process", lambda: False)
-    target = start(
-        folder, ["gp"]
-    )  # as the first process left it, which trains the rest with this one
+    # as the first process left it, which trains the rest with this one
+    target = start(folder, ["gp"])
     assert not target.has_part("gp", Config(), 0)
     target.add("classifier", PART)
     assert (folder / "config.json").read_bytes() == before
