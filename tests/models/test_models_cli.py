@@ -353,7 +353,7 @@ def test_classes_without_rows_are_told_before_what_was_learned_of_them_is_droppe
         f"fewer than 10 rows of 2 of 10 classes ({names[0]} 0, {names[1]} 0); their GPs"
         in first
     )
-    assert f"the GPs that {folder} held for them are dropped" in first
+    assert f"the GPs for them in {folder} are dropped" in first
     assert not any("warning" in line for line in rest)
 
     there = load_checkpoint(folder)

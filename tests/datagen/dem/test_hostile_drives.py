@@ -350,7 +350,7 @@ def reverses() -> pd.DataFrame:
         (
             reverses(),
             "",
-            r"positions reverse in 1\d\d rows, measured_m_s never does: where .* has to be negative",
+            r"positions reverse in 1\d\d rows, measured_m_s never does: where .* must be negative",
         ),
         (
             reverses(),

@@ -88,8 +88,8 @@ def test_one_half_is_every_second_map_and_the_other_is_the_rest(
 def test_weights_and_temperatures_do_not_see_the_maps_that_are_scored(
     maps: TerrainDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # a temperature is kept for the least of gains
-    monkeypatch.setattr(calibration, "_LEAST_GAIN", -1.0)
+    # a temperature is kept for the smallest gain
+    monkeypatch.setattr(calibration, "_MIN_GAIN", -1.0)
 
     def train(name: str, which: Callable[[int], bool] | None = None) -> Any:
         with monkeypatch.context() as patch:

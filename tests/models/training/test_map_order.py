@@ -108,7 +108,7 @@ def test_batches_of_many_shards_are_the_same_however_they_are_read(
     ):  # a map a shard
         pass
     monkeypatch.setattr(module, "WINDOW_SHARDS", 3)
-    monkeypatch.setattr(reader, "_MOST_OPEN", 4)
+    monkeypatch.setattr(reader, "_MAX_OPEN", 4)
     opened = []
     plainly = reader.open_file
     monkeypatch.setattr(

@@ -230,7 +230,7 @@ def test_a_class_of_a_name_that_is_ours_is_refused(
         == 2
     )
     assert (
-        f"a class with a name of its own, which its checkpoints bear, got {name!r}"
+        f"a class whose name no model of this package has, got {name!r}"
         in capfd.readouterr().err
     )
 
@@ -390,7 +390,7 @@ def test_a_loss_that_divides_by_no_cell_is_told_why(
     }
     with pytest.raises(
         ConfigError,
-        match=r"got nan\. λ, NaN where it was not observed, is so in the whole batch",
+        match=r"got nan\. λ is NaN \(not observed\) in the whole batch",
     ):
         try_network(network, unseen)
 

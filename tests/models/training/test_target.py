@@ -181,7 +181,7 @@ def test_a_training_that_was_to_replace_a_part_is_gone_on_with_when_asked(
     state.parent.mkdir(parents=True)
     state.write_text("what a kill has left")
     with pytest.raises(
-        CheckpointError, match="pass --overwrite with --resume to go on"
+        CheckpointError, match="pass --overwrite with --resume to resume"
     ):
         start(folder, ["classifier"], resume=True).has_part(
             "classifier", NetConfig(width=4), 0
