@@ -278,7 +278,7 @@ def test_a_pool_is_calibrated_on_the_device(
         target = SimpleNamespace(
             checkpoint=pair,
             options=FitOptions(device=device),
-            holds=lambda *words: True,
+            has_part=lambda *words: True,
             set_pool_temperature=lambda value: None,
         )
         networks.train_parts(

@@ -122,8 +122,8 @@ class TerrainDataset:
     @cached_property
     def fields(self) -> dict[str, schema.Field]:
         """Fields of the maps by name: `schema.FIELDS`, and others of this dataset."""
-        layers = shipped_fields()
-        layers |= {spec.name: spec.stored_field for spec in self.recipe.layers}
+        recorded = {spec.name: spec.stored_field for spec in self.recipe.layers}
+        layers = shipped_fields() | recorded
         return schema.read_field_table(self.manifest["fields"], layers)
 
     @property
