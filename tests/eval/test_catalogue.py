@@ -93,7 +93,7 @@ def test_every_known_part_is_listed_with_a_purpose_and_all_its_options(
 def test_worlds_are_listed_by_the_names_that_flags_and_suites_have() -> None:
     paper, stakes = list_entries("world")
     assert (paper.name, stakes.name) == ("paper", "stakes")
-    assert "drawn anew" in paper.purpose
+    assert "resampled" in paper.purpose
     assert "immobilises" in stakes.purpose
     assert {
         'world.noise = "resampled"',

@@ -204,7 +204,7 @@ def test_what_other_code_made_is_compared_only_when_asked_and_then_said_in_every
     refused = capsys.readouterr().err
     assert refused.count("\n") == 1
     assert (
-        f"in their risk alone, got conditions made by different code: b differs from a in {told}. "
+        f"only in their risk, got conditions made by different code: b differs from a in {told}. "
         in refused
     )
     assert not list(tmp_path.glob("table*"))

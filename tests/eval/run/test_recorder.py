@@ -320,7 +320,7 @@ def test_plans_after_the_moment_of_figures_are_thinned(stakes: Path) -> None:
     problem: Any = SimpleNamespace(dt_s=0.1)
     nothing: Any = None
     recorder = Recorder(unit, problem, nothing, nothing, [1, 3])
-    assert recorder.observer.every == 5
+    assert recorder.observer.plan_interval == 5
     samples = torch.rand(4, 40, 30, 2)
     for step in (0, 150, 155, 900):
         recorder.watch(step, Plan.empty(4, samples=samples), [0, 1, 2, 3])
