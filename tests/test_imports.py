@@ -18,13 +18,14 @@ DRAWN = ("datagen.noise", "datagen.schema")  # what all of synthesis shares
 SYNTHESIS = ("datagen.synth", "datagen.recipe", "datagen.layers", *DRAWN)
 # Whatever is known of models beside their training and their quality.
 WHOLE = ("fused", "conformal", "predictor")
+STORED = ("checkpoint", "checkpoint_folders", "parts")
 MODELS = tuple(
     f"models.{name}"
-    for name in ("base", "slope_gp", "nets", "zoo", "checkpoint", "config", *WHOLE)
+    for name in (*STORED, "base", "slope_gp", "nets", "zoo", "config", *WHOLE)
 )
 VALUES_OF_EVAL = ("eval.experiment",)
 # What running writes and reports read.
-WRITTEN = ("eval.folder", "eval.recording")
+WRITTEN = ("eval.folder", "eval.recording", "eval.recorded_plans")
 # What figures of runs are drawn from and with.
 FIGURES = (
     *(
@@ -60,6 +61,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
         "models.nets",
         "models.base",
         "models.checkpoint",
+        "models.parts",
         "models.config",
         "datagen",
     ),
@@ -77,6 +79,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "planning/world": (*PLANNING, "planning.world"),
     "planning/sensing": ("planning.sensing",),
     "planning/sensing/knowledge.py": (*PLANNING, "planning.sensing", "planning.world"),
+    "planning/sensing/learner.py": (*PLANNING, "planning.sensing", "planning.world"),
     "planning/sensing/appearance.py": (
         "planning.sensing",
         "datagen.synth",
@@ -89,7 +92,8 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "eval": ("eval", "metrics", "models", "planning", "datagen", "viz"),
     "eval/experiment": ("eval.experiment", "metrics", "models", "planning", "datagen"),
     "eval/folder": ("eval.folder", *VALUES_OF_EVAL, "models", "planning", "datagen"),
-    "eval/recording.py": ("eval.folder", "planning"),
+    "eval/recorded_plans.py": (),
+    "eval/recording.py": ("eval.folder", "eval.recorded_plans", "planning"),
     "eval/run": (
         "eval.run",
         *WRITTEN,

@@ -11,13 +11,10 @@ Letters in shapes: b×h×w cells of a chunk; M nodes; S intervals.
 
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import Protocol, Self
 
 import torch
 from torch import Tensor
-
-if TYPE_CHECKING:
-    from benchnav.core.distribution import TraversabilityDistribution
 
 N_INTERVALS = 16  # initial intervals
 _AT_ONCE = 4  # intervals of a cell that are bisected together
@@ -29,6 +26,24 @@ _MAX_ERROR = 3e-5
 _JUMP_FRACTION = 0.1
 # Ratio of the change over an interval to the maximum correction of a monotone parabola.
 _MAX_CORRECTION = 3
+
+
+class _Distribution(Protocol):
+    """Methods of `TraversabilityDistribution` that an integral needs."""
+
+    @property
+    def shape(self) -> torch.Size: ...
+
+    @property
+    def device(self) -> torch.device: ...
+
+    def cdf(self, value: Tensor | float) -> Tensor: ...
+
+    def at(self, cells: Tensor) -> Self: ...
+
+    def select(self, members: Tensor) -> Self: ...
+
+    def _in_members(self) -> Self: ...
 
 
 def edges_between(low: Tensor, high: Tensor | float) -> Tensor:
@@ -45,7 +60,7 @@ def edges_between(low: Tensor, high: Tensor | float) -> Tensor:
 
 
 def integral(
-    distribution: "TraversabilityDistribution",
+    distribution: _Distribution,
     curve: Callable[[Callable[[Tensor], Tensor], Tensor], Tensor],
     edges: Tensor,
     first: Tensor,
@@ -82,13 +97,13 @@ def integral(
 
 
 def _stacked(
-    distribution: "TraversabilityDistribution",
+    distribution: _Distribution,
 ) -> Callable[[Tensor], Tensor]:
     """Return the CDF as a function of M values per cell, [M, b, h, w] to [M, b, h, w].
 
     A single call for all values is as fast as a call for each.
     """
-    cache: dict[int, TraversabilityDistribution] = {}
+    cache: dict[int, _Distribution] = {}
 
     def cdf(values: Tensor) -> Tensor:
         count = len(values)
