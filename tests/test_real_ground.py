@@ -165,9 +165,9 @@ def test_nothing_is_scored_against_a_truth_that_is_unknown(
                 in text
             )
             assert "are against measured λ" in text
-            assert (
-                "this model gives the class table of the recipe, not the truth" in text
-            ) == (model == "oracle")
+            assert ("this model predicts by the class table of the recipe" in text) == (
+                model == "oracle"
+            )
         found = json.loads((tmp_path / model / "quality.json").read_text())
         assert found["truth"] == {"test/site": "unknown"}
         assert found["splits"]["test/site"]["rmse_expected"] is None
@@ -213,7 +213,7 @@ def test_lambda_that_the_class_table_drew_is_not_called_measured(
     capfd.readouterr()
     assert call("train", "evaluate", "oracle", "--data", "real.h5") == 0
     said = capfd.readouterr().out
-    assert "λ that the class table drew at least in part, not measured λ" in said
+    assert "λ drawn at least in part from the class table, not measured λ" in said
     # Beside such ground the truth of what a recipe made is as well known as before.
     made = (
         "create",

@@ -201,7 +201,7 @@ BAD = {
     "another answer": (Forgetful(), "Expected the same from `predict` when asked again"),
     "an answer of the batch": (changed(of_batch), "Expected the same from `predict` for one alone"),
     "too many names": (Misnamed(), "each of 2 components, got 3"),
-    "members without names": (Nameless(), "`class_names` beside"),
+    "members without names": (Nameless(), "`class_names` with"),
     "members of another shape": (with_members(lambda weights: weights), "shape [M, 3, 2, 32, 32], got [3, 2, 32, 32]"),
     "too few maps of members": (with_members(lambda weights: weights[None, :1]), "got [1, 1, 2, 32, 32]"),
     "no members": (with_members(lambda weights: weights[None][:0]), "got [0, 3, 2, 32, 32]"),
@@ -384,9 +384,9 @@ BAD_DISTRIBUTIONS = {
     "of another inverse": (
         overriding(quantile=lambda d, u: 0.9 * QuantileDistribution.quantile(d, u)), "inverse of `cdf`",
     ),
-    "of another mean": (overriding(mean=lambda d: QuantileDistribution.mean(d) + 0.01), "`mean` to be what"),
-    "of another tail": (overriding(cvar=lambda d, level: d.var(level)), "`cvar` to be what"),
-    "of another time": (overriding(expected_time=lambda d, floor: 1 / d.mean()), "`expected_time` to be what"),
+    "of another mean": (overriding(mean=lambda d: QuantileDistribution.mean(d) + 0.01), "`mean` to follow"),
+    "of another tail": (overriding(cvar=lambda d, level: d.var(level)), "`cvar` to follow"),
+    "of another time": (overriding(expected_time=lambda d, floor: 1 / d.mean()), "`expected_time` to follow"),
     "of other limits": (overriding(cdf_limits=lambda d, x: (0 * d.cdf(x), d.cdf(x)), cdf=lambda d, x: (
         QuantileDistribution.cdf_limits(d, x)[1])), "`cdf_limits` to be P(λ < value)"),
     "of another dtype": (
