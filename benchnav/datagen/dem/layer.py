@@ -28,7 +28,7 @@ class LayerRaster(NamedTuple):
     field: schema.Field
 
     @property
-    def how(self) -> str:
+    def resampling(self) -> str:
         """Resampling in GDAL's terms; the mean of angles would be wrong."""
         return "nearest" if is_azimuth(self.name) else "average"
 

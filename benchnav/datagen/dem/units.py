@@ -3,7 +3,8 @@
 import numpy as np
 
 from benchnav.core.errors import DatasetError, expect
-from benchnav.datagen.dem.raster import Raster, horizontal
+from benchnav.datagen.dem.crs import horizontal
+from benchnav.datagen.dem.raster import Raster
 
 UNITS_M = {"m": 1.0, "ft": 0.3048, "us-ft": 1200 / 3937}  # by the names of PROJ
 # How rasters write units, in lower case, by what `dem_unit` takes.

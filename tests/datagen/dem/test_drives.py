@@ -14,11 +14,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchnav.core.errors import BenchnavError, ConfigError, DatasetError
+from benchnav.datagen.dem.crs import transformed
 from benchnav.datagen.dem.drive_cells import describe_drives, drive_over
 from benchnav.datagen.dem.drive_log import REASONS, DriveLog, Drives, read_drives
 from benchnav.datagen.dem.drive_motion import compare_motion
 from benchnav.datagen.dem.importer import import_dem
-from benchnav.datagen.dem.raster import Rasters, transformed
+from benchnav.datagen.dem.options import Rasters
 from benchnav.datagen.dem.tiling import cut
 from benchnav.datagen.files.check import find_faults
 from benchnav.datagen.files.merge import merge
@@ -721,7 +722,7 @@ MOVE = "".join(
         (HEAD + MOVE, "a drive for each of the 3 splits .* got 1 in .*--splits"),
         (
             HEAD + "".join(MOVE.replace("a\n", f"{name}\n") for name in "abc"),
-            "ground for 3 splits|a drive of its own on the ground of each split, got none for valid, test/site",
+            "terrain for 3 splits|a drive of its own on the terrain of each split, got none for valid, test/site",
         ),
     ],
 )
@@ -740,7 +741,7 @@ def test_a_drive_on_the_ground_of_each_split_is_needed(dem: Path) -> None:
     rows = rows[(rows["x"] < 30) | (rows["drive"] == "drive-11")]
     path = log_of(rows, dem.parent / "log.csv")
     with pytest.raises(
-        DatasetError, match="on the ground of each split, got none for valid in"
+        DatasetError, match="on the terrain of each split, got none for valid in"
     ):
         imported(dem, path)
 
@@ -807,7 +808,7 @@ def test_the_command_says_what_was_used_and_what_was_not(
         ("between_maps", "lie between the maps"),
         (
             "other_split",
-            "lie on the ground of a split that their drive does not belong to",
+            "lie on the terrain of a split that their drive does not belong to",
         ),
     ):
         assert f"{about['left_out'][reason]} rows are left out: they {why}" in said

@@ -92,7 +92,7 @@ def test_a_small_share_is_one_strip_and_small_ground_is_refused() -> None:
     assert [
         len(strip) for strip in cut((8, 56), (8, 8), (8, 8), shares).strips.values()
     ] == [3, 1, 1]
-    with pytest.raises(DatasetError, match=r"ground for 3 splits.*got 4 maps"):
+    with pytest.raises(DatasetError, match=r"terrain for 3 splits.*got 4 maps"):
         cut((8, 39), (8, 8), (8, 8), shares)
 
 
