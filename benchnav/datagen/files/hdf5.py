@@ -33,7 +33,7 @@ from benchnav.datagen.files.manifest import FOLDER_MANIFEST, open_file, read_man
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import Recipe
 
-FOLDER_FORMAT_VERSION = "1.2"  # at least
+FOLDER_FORMAT_VERSION = "1.2"  # the lowest version of a folder of shards
 
 # Structures of HDF5 1.10 have checksums, which detect damage to them.
 _LIBRARY = ("v110", "v110")
@@ -328,7 +328,7 @@ def assemble(contents: Contents, folder: Path, out: Path) -> None:
 
 
 def _opened(split: str, files: Iterable[Path]) -> Iterator[h5py.Group]:
-    """Yield the group of a split in each file, which is open while it is used."""
+    """Yield the group of a split in each file, which is open until the next one."""
     for path in files:
         with open_file(path) as file:
             yield file[split]
@@ -403,7 +403,7 @@ def _put(source: ndarray | h5py.Dataset, target: h5py.Dataset, first: int) -> No
 
 
 def _packing(array: h5py.Dataset) -> tuple[object, ...]:
-    """Return what must be equal to copy chunks; the level of deflate may differ."""
+    """Return properties that must be equal to copy chunks; deflate levels may differ."""
     return (
         array.dtype.str,
         array.chunks,
