@@ -67,14 +67,14 @@ class DrivenCells:
         return bands
 
 
-def lay_out(log: DriveLog, ground: Raster, crs: Any, bounds: Any) -> DriveLog:
+def lay_out(log: DriveLog, dem: Raster, crs: Any, bounds: Any) -> DriveLog:
     """Return a log with positions in the CRS of the maps.
 
     They are in metres from the south-west corner of the elevation model.
 
     Args:
         log: log with positions as logged.
-        ground: the elevation model.
+        dem: the elevation model.
         crs: CRS of the maps.
         bounds: bounds of the elevation model in `crs`.
 
@@ -87,8 +87,8 @@ def lay_out(log: DriveLog, ground: Raster, crs: Any, bounds: Any) -> DriveLog:
     """
     log_crs: Any = "EPSG:4326"
     if not log.is_geographic:
-        log_crs = ground.file.crs
-        _check_in_metres(log, ground)
+        log_crs = dem.file.crs
+        _check_in_metres(log, dem)
     corner_m = np.array([[bounds.left], [bounds.bottom]])
     x = log.rows["x"]
     y = log.rows["y"]
@@ -97,34 +97,34 @@ def lay_out(log: DriveLog, ground: Raster, crs: Any, bounds: Any) -> DriveLog:
     if is_off.all():
         swapped_m = transformed(log_crs, crs, y, x) - corner_m
         is_swapped = bool(_is_within(swapped_m, bounds).any())
-        raise _off_terrain(log, ground, is_swapped=is_swapped)
+        raise _off_terrain(log, dem, is_swapped=is_swapped)
     x_m, y_m = positions_m
     rows = log.rows.assign(x=x_m, y=y_m)
     return replace(log, rows=rows).without("off_dem", is_off)
 
 
-def _check_in_metres(log: DriveLog, ground: Raster) -> None:
+def _check_in_metres(log: DriveLog, dem: Raster) -> None:
     """Check that the CRS of the elevation model, and so of the log, is in metres."""
-    crs = ground.file.crs
+    crs = dem.file.crs
     if is_in_metres(crs):
         return
     raise DatasetError(
         f"Expected positions as longitude_deg and latitude_deg in {log.settings.file}, "
-        f"since the CRS of {ground.name}, "
+        f"since the CRS of {dem.name}, "
         f"{crs.to_string()[:80]}, is not in metres, got x_m and y_m. Log "
         "them in WGS 84."
     )
 
 
-def _off_terrain(log: DriveLog, ground: Raster, *, is_swapped: bool) -> DatasetError:
+def _off_terrain(log: DriveLog, dem: Raster, *, is_swapped: bool) -> DatasetError:
     """Return an error on a log whose positions all lie off the elevation model.
 
     Args:
         log: the log.
-        ground: the elevation model.
+        dem: the elevation model.
         is_swapped: whether swapped coordinates lie on it.
     """
-    covered = ground.file.bounds
+    covered = dem.file.bounds
     west, east = log.rows["x"].agg(["min", "max"])
     south, north = log.rows["y"].agg(["min", "max"])
     names = PLACES["WGS 84" if log.is_geographic else "crs"]
@@ -135,9 +135,9 @@ def _off_terrain(log: DriveLog, ground: Raster, *, is_swapped: bool) -> DatasetE
     if is_swapped:
         remedy = f"Swap {columns}."
     return DatasetError(
-        f"Expected positions on {ground.name}, which covers x {covered.left:.9g} to "
+        f"Expected positions on {dem.name}, which covers x {covered.left:.9g} to "
         f"{covered.right:.9g} and y {covered.bottom:.9g} to {covered.top:.9g} of "
-        f"{ground.file.crs.to_string()[:80]}, got {names[0]} {west:.9g} to {east:.9g} "
+        f"{dem.file.crs.to_string()[:80]}, got {names[0]} {west:.9g} to {east:.9g} "
         f"and {names[1]} {south:.9g} to {north:.9g} in {log.settings.file}. {remedy}"
     )
 
@@ -174,7 +174,7 @@ def elevation_under(layer: Layer, row: ndarray, column: ndarray) -> ndarray:
         layer: elevation in metres.
         row: row coordinate of each position, northward from the centre of the first
             cell, float64, shape [N].
-        column: column coordinate, eastward.
+        column: column coordinate, eastward from the same centre, shape [N].
 
     Returns:
         Elevation in metres, NaN off the cells, float64, shape [N].
@@ -239,7 +239,7 @@ def describe_drives(log: DriveLog, splits: Sequence[str]) -> Json:
         rows = log.rows[log.rows["split"] == index]
         used[split] = len(rows)
         drives[split] = [log.names[drive] for drive in np.unique(rows["drive"])]
-    # The order of the checks.
+    # `REASONS` has the order of the checks.
     left_out = {
         reason: log.left_out[reason] for reason in REASONS if reason in log.left_out
     }

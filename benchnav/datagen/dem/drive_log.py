@@ -3,9 +3,10 @@
 A row is a moment of a drive. Columns: `time_s`; the position, `x_m` and `y_m` in the
 coordinate reference system of the elevation model or `longitude_deg` and `latitude_deg`
 (WGS 84); `commanded_m_s` and `measured_m_s`, speeds forward over ground; optionally
-`drive`, its name. λ is measured over commanded speed, where the robot was commanded to
-move. The ratio of a row may lie beyond [0, 1]: robots slide back and run downhill. It
-is clipped only when it is stored.
+`drive`, its name. λ is the ratio of measured to commanded speed in rows with a command
+to move. The ratio of a row may lie beyond [0, 1], since robots slide back and run
+downhill. It is clipped only when it is stored.
+
 Letters in shapes: N rows that are used.
 """
 
@@ -46,15 +47,15 @@ _CLOCK = "Convert clock times to seconds, such as those since the start of the d
 
 # Reasons why rows are left out, in the order of the checks.
 REASONS = {
-    "missing": "lack a value, or positions around them",
+    "missing": "lack a value, or neighbouring positions",
     "off_dem": "lie off the elevation model",
     "doubled": "repeat another row",
     "restarted": "have a time before an earlier row of their drive",
     "frozen": "have a position that stays the same while the robot moves",
     "jumped": f"have a position out of reach at {TOP_RATIO:g} times the top command",
-    "off_pace": "are of a drive whose positions and measured speed disagree by more "
+    "off_pace": "belong to a drive whose positions and measured speed disagree by more "
     "than 15 %",
-    "slow": "were commanded less than the least speed (standing, turning on the spot)",
+    "slow": "were commanded less than the least speed (standing, turning in place)",
     "implausible": f"have a speed above {MOST_SPEED_M_S:g} m/s or above {TOP_RATIO:g} "
     "times the top command",
     "between_maps": "lie between the maps",
@@ -64,7 +65,7 @@ REASONS = {
 
 @dataclass(frozen=True, kw_only=True)
 class Drives:
-    """Log of drives, and its use.
+    """File of a log of drives, and the selection of its rows.
 
     Args:
         file: Table, CSV, TSV, one of these with .gz, or Parquet.

@@ -54,7 +54,7 @@ _REMEDIES = {
 
 
 def compare_motion(log: DriveLog) -> DriveLog:
-    """Return a log without faulty rows, and with the ratio of speeds of each row.
+    """Return a log without faulty rows, with the ratio of measured to commanded speed.
 
     Args:
         log: log with positions in metres.
@@ -177,7 +177,7 @@ def _leave_out(
 ) -> DriveLog:
     """Return a log without faulty rows; reject a log with too many of them.
 
-    A row counts for its first reason.
+    A row is counted under its first reason.
 
     Args:
         log: the log.
@@ -216,7 +216,7 @@ def _check_rest(log: DriveLog, is_unknown: ndarray) -> None:
 
 
 def _pace_ratios(spans: pd.DataFrame) -> dict[str, float | None]:
-    """Return ratios of positions to both speeds, to three digits; None if unknown."""
+    """Return the ratio of positions to each speed, to three digits; None if unknown."""
     paces = {}
     for name, speed in (("pace", "measured"), ("commanded_pace", "commanded")):
         ratio = median_ratio(spans, speed)
@@ -225,7 +225,7 @@ def _pace_ratios(spans: pd.DataFrame) -> dict[str, float | None]:
 
 
 def _remedies_of_scale(log: DriveLog) -> dict[str, str]:
-    """Return remedies by reason if positions exceed the command."""
+    """Return remedies by reason if commands are logged too low."""
     ratio = log.motion["commanded_pace"]
     if ratio is None or ratio <= OVER_SPEED:
         return {}

@@ -1,6 +1,7 @@
 """Pace of a drive log: distances by its positions compared with those by its speeds.
 
-Where they disagree, a log is rejected with the unit or fault that explains it.
+If they disagree, the log is rejected, and the error names the unit or fault that
+explains it.
 """
 
 import math
@@ -20,8 +21,8 @@ from benchnav.datagen.dem.drive_units import (
 )
 from benchnav.datagen.dem.drive_wheels import equals_command
 
-# Maximum fraction of rows whose measured speed has the other sign than the command, a
-# choice of this package.
+# Maximum fraction of rows whose measured speed is opposite to the command, a choice of
+# this package.
 _MAX_AGAINST = 0.05
 _SHOWN_DRIVES = 5
 
@@ -35,8 +36,8 @@ def check_pace(
         log: the log.
         rows: its rows, without faulty ones.
         spans: spans of these rows.
-        is_jumpy: whether positions jump so often that only the ratio of a unit is
-            certain.
+        is_jumpy: whether positions jump so often that only a ratio that fits a unit is
+            reliable.
 
     Raises:
         DatasetError: If they disagree, or nothing can be compared.
@@ -92,7 +93,7 @@ def _is_within_limits(ratio: float) -> bool:
 def _unit_of(
     log: DriveLog, rows: pd.DataFrame, spans: pd.DataFrame
 ) -> tuple[str, str, bool]:
-    """Return the unit of rows of a log, as `unit_of` does."""
+    """Return the unit that explains some rows of a log; see `unit_of`."""
     return unit_of(
         rows,
         spans,
@@ -118,14 +119,14 @@ def _check_command(log: DriveLog, rows: pd.DataFrame, spans: pd.DataFrame) -> No
 
 
 def check_sign(log: DriveLog, is_driven: ndarray) -> None:
-    """Reject measured speed of the other sign than the command.
+    """Reject measured speed of the opposite sign to the command.
 
     Args:
         log: the log.
         is_driven: rows that count, bool, shape [N].
 
     Raises:
-        DatasetError: If more than 5 % of the rows have the other sign.
+        DatasetError: If more than 5 % of the rows have the opposite sign.
     """
     commanded = log.rows["commanded"].to_numpy()[is_driven]
     measured = log.rows["speed"].to_numpy()[is_driven]

@@ -129,7 +129,7 @@ def find_standing(
     Args:
         track: track from `track_of`; `speed` is NaN where it was not measured.
         least_speed: minimum speed of commands that count, and of a moving robot [m/s].
-        by_positions: whether the next position must be far away too.
+        by_positions: whether a frozen position also requires a distant next position.
 
     Returns:
         Masks by the track's index, False in the first row of each fix: `is_frozen`;
@@ -169,9 +169,9 @@ def find_standing(
 
 
 def find_jumped(track: pd.DataFrame, limit_m_s: float) -> pd.Index:
-    """Return the labels of rows whose position is out of reach of their drive's others.
+    """Return the labels of rows whose position cannot be reached from the others.
 
-    The longest stretch without a jump is correct. From there, forward and backward, a
+    The longest stretch of a drive without a jump is correct. From there, forward and backward, a
     position is correct if it is in reach of the last correct one. Within less than a
     second, noise may exceed the reach, so times count as at least a second.
 
@@ -217,7 +217,9 @@ def _is_reached(fixes: pd.DataFrame, limit_m_s: float) -> ndarray:
 def spans_of(
     track: pd.DataFrame, least_speed: float, span_s: float = WINDOW_S
 ) -> pd.DataFrame:
-    """Return motion under command, summed over spans of a time, or from fix to fix.
+    """Return the motion under command, summed over spans of time.
+
+    If fixes are rarer than spans, a span reaches from one fix to the next.
 
     Args:
         track: track from `track_of`; for slopes, with elevation `z` in metres.
@@ -270,7 +272,7 @@ def spans_of(
 
 
 def _span_of(track: pd.DataFrame, knots: pd.DataFrame, span_s: float) -> pd.Series:
-    """Return the number of each row's span, that of the last measured position."""
+    """Return the index of each row's span, given by the last measured position."""
     period_s = knots.groupby("segment")["time_s"].diff().median()
     times = track.groupby("drive")["time_s"]
     longest_s = (times.max() - times.min()).max()

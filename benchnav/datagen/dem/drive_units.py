@@ -14,7 +14,7 @@ _MAX_LAMBDA = 1.3
 _MAX_COMMAND_RATIO = 5.0
 # Quantile of a log's spans, since some may show an immobilised robot.
 _FASTEST = 0.95
-# A smaller ratio of measured to commanded speed shows that it is not that of wheels.
+# Below this ratio of measured to commanded speed, measured speed is not that of wheels.
 _SLIPS = 0.9
 _COARSE = 0.25  # maximum resolution of positions over the distance of a span
 
@@ -34,7 +34,7 @@ _TIMES = {
     "minutes": 60.0,
     "hours": 3600.0,
 }
-# Number of each unit of length in a metre.
+# Units of length per metre.
 _LENGTHS = {"feet": 3.281, "centimetres": 100.0, "millimetres": 1000.0}
 _NO_UNIT = "no known unit"
 _METRES = "Bring speeds to m/s, times to s and positions to m"
@@ -98,17 +98,17 @@ def unit_of(
     Args:
         rows: rows of a log.
         spans: spans of these rows.
-        least_speed: minimum command of spans that count [m/s].
+        least_speed: minimum commanded speed of spans that count [m/s].
         is_geographic: whether positions are angles, which have no other unit.
         resolution_m: resolution of positions in metres.
 
     Returns:
-        The unit, empty if none fits; the remedy without a full stop; whether it is a
+        The unit, empty if no unit fits; the remedy without a full stop; whether it is a
         unit of times or positions.
     """
     ratio = median_ratio(spans, "measured")
     for name, seconds in _TIMES.items():
-        # In another unit, spans of 2 s consist of other rows and have other arcs.
+        # In another unit, a span of 2 s has other rows and arcs.
         in_unit = _in_seconds(rows, seconds, least_speed)
         if _is_close(median_ratio(in_unit, "measured"), 1):
             return name, f"Multiply `time_s` by {seconds:.4g}", True
@@ -138,7 +138,7 @@ def _is_close(ratio: float, expected: float) -> bool:
 
 
 def _in_seconds(rows: pd.DataFrame, seconds: float, least_speed: float) -> pd.DataFrame:
-    """Return the spans of rows whose times are in a unit of some seconds."""
+    """Return the spans of rows whose unit of time lasts `seconds`."""
     in_seconds = rows.assign(time_s=rows["time_s"] * seconds)
     return spans_of(track_of(in_seconds), least_speed)
 
@@ -153,7 +153,7 @@ def unit_of_command(
     Args:
         rows: rows of a log.
         spans: spans of these rows.
-        least_speed: minimum command of spans that count [m/s].
+        least_speed: minimum commanded speed of spans that count [m/s].
         is_geographic: whether positions are angles, which have no other unit.
 
     Returns:

@@ -16,7 +16,7 @@ MAX_PERIOD_S = 0.8
 # Cosine of 120°, by which no robot turns between rows of one command (choice).
 _SLIDES_COS = -0.5
 _CLEAR_ERRORS = 5.0  # standard errors of a velocity whose direction counts (choice)
-# Windows without such a velocity, after which a robot may have turned (choice).
+# Windows without a clear velocity, after which a robot may have turned (choice).
 _MAX_REST_WINDOWS = 2.0
 _ROWS_AT_ONCE = 4096
 
@@ -86,7 +86,7 @@ def _fit(rows: pd.DataFrame, knots: pd.DataFrame, columns: list[str]) -> pd.Data
 
 
 def _fit_at(row_s: ndarray, knot_s: ndarray, values: ndarray, half_s: float) -> ndarray:
-    """Fit lines at some times.
+    """Fit a line around each of some times.
 
     Letters in shapes: M times, K knots, C coordinates.
 
@@ -94,7 +94,7 @@ def _fit_at(row_s: ndarray, knot_s: ndarray, values: ndarray, half_s: float) -> 
         row_s: times, shape [M].
         knot_s: times of the knots, ascending, shape [K].
         values: coordinates of the knots, shape [K, C].
-        half_s: half width of the window.
+        half_s: half width of the window in seconds.
 
     Returns:
         Slopes, count, residual and spread, shape [M, C + 3].
@@ -139,8 +139,8 @@ def speed_of_positions(track: pd.DataFrame, least_speed: float) -> pd.Series:
     the fit, the robot moves as commanded again. If fixes are rare, the robot may have
     turned between them, and no reversal counts.
 
-    In a curve, the fitted line is shorter than the arc. The rate at which its direction
-    turns gives the correction.
+    In a curve, the fitted line is shorter than the arc. The turn rate of the
+    track yields the correction.
 
     Args:
         track: track from `track_of`.

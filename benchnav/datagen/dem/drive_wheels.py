@@ -1,6 +1,6 @@
-"""Detection of a measured speed that is that of wheels instead of speed over ground.
+"""Detection of measured speeds that come from wheels instead of motion over ground.
 
-Wheels follow the command on any terrain. Their speed therefore hides slip.
+Wheels follow the command on any terrain, so their speed hides slip.
 """
 
 import math
@@ -13,12 +13,13 @@ from benchnav.datagen.dem.drive_tracks import WINDOW_S, spans_of
 from benchnav.datagen.dem.drive_units import median_ratio
 
 # All thresholds are choices of this package.
-# Spread of the ratio of measured to commanded speed. On terrain it is larger.
+# Spread of the ratio of measured to commanded speed, below which it counts as constant.
+# Terrain causes a larger spread.
 _STEADY = 0.02
 _MIN_SPANS = 10  # 20 s
 # Distance by which positions may fall short of wheels that equal the command.
 _WHEEL_PACE = 0.05
-# Difference of the 5 % and 95 % quantiles of slope along a track, over which λ varies.
+# Difference of the 5 % and 95 % quantiles of slope along a track, at which λ varies too.
 _VARIED_SLOPE_DEG = 10.0
 
 

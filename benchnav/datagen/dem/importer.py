@@ -1,7 +1,7 @@
 """Import of real data: rasters become maps of the dataset schema.
 
-Slopes follow from the real elevation, also at a map's edges, where the surrounding
-elevation is read. The recipe provides what the rasters do not contain. The true
+Slopes follow from the real elevation. For those at a map's edges, the surrounding
+elevation is read too. The recipe provides what the rasters do not contain. The true
 distribution of λ in real terrain is unknown, and the dataset records this;
 `Terrain.truth` is then the distribution of the recipe's class table.
 

@@ -11,7 +11,7 @@ MAX_MAPS = 20_000  # maximum number of maps of an import, unless more are allowe
 
 @dataclass(frozen=True, kw_only=True)
 class GroundOptions:
-    """Reading of an elevation model, and cutting into maps.
+    """Options of the elevation model, and of cutting it into maps.
 
     Args:
         dem_unit: Unit of elevations: m, ft, us-ft, or metres in a unit. If empty, the
@@ -44,7 +44,7 @@ class Cut:
         stride_m: distance from one map to the next in metres; None for adjacent maps.
         solvable: whether to keep only maps whose goal is reachable, and to store the
             grid reference time.
-        ground: reading and cutting of the elevation model.
+        ground: options of the elevation model.
     """
 
     shares: Mapping[str, float] = field(default_factory=lambda: {"test/real": 1.0})
@@ -62,17 +62,17 @@ class Rasters:
     raster does not cover are left out.
 
     Args:
-        classes: Raster of terrain classes. If empty, classes are laid out at random.
+        classes: Raster of terrain classes. If empty, classes are random.
         class_ids: Class names by value of that raster, such as '{1: gravel, 9: null}',
             null for no label. If not given, values are class indices.
-        random_classes: Allow a photo or measured traversability without classes; they
-            are laid out at random.
+        random_classes: Allow a photo or measured traversability without classes; these
+            are then random.
         unlabelled: Allow a photo and measured traversability without classes; all cells
             are unlabelled.
         photo: Raster of red, green and blue. If empty, cells have the colours of their
             classes.
         traversability: Raster of measured traversability in [0, 1]. If empty, it is
-            drawn by the class table.
+            drawn from the class table.
         layer: A layer as NAME=RASTER or NAME=RASTER:UNIT, such as
             vegetation_m=canopy.tif; several as a list.
     """
@@ -89,27 +89,25 @@ class Rasters:
         """Reject options that contradict each other."""
         expect(
             self.classes or self.class_ids is None,
-            "`classes` with `class_ids`, got none. Pass the raster they belong to.",
+            "`classes` with `class_ids`, got none. Pass the raster with these values.",
         )
         expect(
             not (self.classes and self.random_classes),
-            "either `classes` or `random_classes`, got both.",
+            "either `classes` or `random_classes`, got both. Leave one out.",
         )
         has_classes = bool(self.classes or self.random_classes)
         expect(
             not self.unlabelled or (self.photo and not has_classes),
-            "`unlabelled` with `photo` and without classes, got otherwise: a cell "
-            "without a class has only the colour of the photo. "
-            "Pass --photo RASTER, or --classes RASTER instead of it.",
+            "`unlabelled` with `photo` and without classes, got another combination: "
+            "without a class, only a photo gives a cell its colour. "
+            "Pass --photo RASTER, or --classes RASTER instead of --unlabelled.",
         )
         for name in ("photo", "traversability"):
             expect(
                 not getattr(self, name) or has_classes or self.unlabelled,
-                f"`classes` with `{name}`, got none: what is real would be joined to "
-                "classes laid out at random. "
-                "Pass --classes RASTER, --unlabelled for models that need none, or "
-                "--random-classes if that is what "
-                "you want.",
+                f"`classes` with `{name}`, got none: real values would be joined to random "
+                "classes. Pass --classes RASTER, --unlabelled for models that need no "
+                "classes, or --random-classes to allow this.",
             )
         names = [layer.name for layer in self.layers]
         twice = sorted({name for name in names if names.count(name) > 1})

@@ -209,7 +209,7 @@ def _check_georeference(argument: str, name: str, file: Any) -> None:
     if file.transform.is_identity:
         raise DatasetError(
             f"Expected `{argument}` with a geotransform, which states its position and "
-            f"cell size, got {name} without one. If you know it: rio edit-info "
+            f"cell size, got {name} without one. If you know it, declare it: rio edit-info "
             f"--transform '[CELL, 0, WEST, 0, -CELL, NORTH]' {name}"
         )
 
@@ -233,7 +233,7 @@ def _check_bands(argument: str, name: str, file: Any, kinds: tuple[str, ...]) ->
             f"{', '.join(file.dtypes)} in {name}. "
             "Convert it: gdal_translate -expand rgb for a palette, rio convert "
             "--dtype uint8 --scale-ratio RATIO "
-            "for deeper numbers."
+            "for numbers of more than 8 bits."
         )
 
 

@@ -20,15 +20,16 @@ from benchnav.core.errors import DatasetError, expect
 from benchnav.core.sources import digest_of_path
 from benchnav.datagen.dem.drive_cells import (
     BANDS,
+    DrivenCells,
     check_enough,
     describe_drives,
     drive_over,
     elevation_under,
     lay_out,
 )
-from benchnav.datagen.dem.drive_log import Drives, read_drives
+from benchnav.datagen.dem.drive_log import DriveLog, Drives, read_drives
 from benchnav.datagen.dem.drive_motion import compare_motion, compare_slopes
-from benchnav.datagen.dem.extent import Extent
+from benchnav.datagen.dem.extent import Extent, Laid
 from benchnav.datagen.dem.options import Cut, Rasters
 from benchnav.datagen.dem.raster import Layer, Raster, opened
 from benchnav.datagen.dem.recipe_fit import check_fit
@@ -60,10 +61,10 @@ class Survey:
         tiling: tiling of the terrain into maps.
         layers: resampled rasters by argument; `NAME min` and `NAME max` are the
             extremes of averaged cells.
-        unlabelled: whether all cells lack a class.
-        driven: values of driven cells; None without a log.
-        arguments: arguments of the rasters; layers are `layer NAME`.
-        fields: fields of layers, by name.
+        unlabelled: whether no cell has a class.
+        driven: values of driven cells; None without a log of drives.
+        arguments: arguments of the rasters; that of a layer is `layer NAME`.
+        fields: stored fields of layers, by name.
         valued: names of layers with at least one value so far.
         is_inside: rows and columns of all cells, padded by one, that lie completely on
             the elevation model; two masks.
@@ -172,40 +173,38 @@ class Survey:
             layer_origins = {name: origins[f"layer {name}"] for name in self.fields}
             self.source["layers"] = layer_origins
         self.valued: set[str] = set()
-        self.is_inside = []
-        slack = SLACK * step
-        sides = zip(laid.offset_m, self.tiling.cells, extent.size_m, strict=True)
-        for offset, count, size in sides:
-            edges = offset + step * np.arange(-1, count + 2)
-            is_inside = (edges[:-1] > -slack) & (edges[1:] < size + slack)
-            self.is_inside.append(is_inside)
+        self.is_inside = _inside(extent, laid, step)
         indices: dict[str | None, float] = {None: np.nan}
         for index, item in enumerate(recipe.classes):
             indices[item.name] = index
         self.indices = {value: indices[name] for value, name in class_names.items()}
         self.unlabelled = rasters.unlabelled
         self.cliff_m = _CLIFF * max(*cell_m, step)
-        self.driven = None
+        self.driven: DrivenCells | None = None
         if log is not None:
-            positions = (log.places_m - laid.offset_m) / step
-            row, column = (positions - 0.5).T
-            elevation_m = elevation_under(self.layers["dem"], row, column)
-            log = compare_slopes(log, elevation_m)
-            cells = np.floor(positions).astype(np.int64)
-            log, self.driven = drive_over(log, self.tiling, *cells.T)
-            entry = describe_drives(log, list(cut.shares))
-            self.source["drives"] = entry
-            self.source["traversability"] = {
-                name: entry[name] for name in ("file", "sha256")
-            }
+            self._add_drives(log, laid, step)
+
+    def _add_drives(self, log: DriveLog, laid: Laid, step: float) -> None:
+        """Add the driven cells of a log, and its entry of the manifest."""
+        positions = (log.places_m - laid.offset_m) / step
+        row, column = (positions - 0.5).T
+        elevation_m = elevation_under(self.layers["dem"], row, column)
+        log = compare_slopes(log, elevation_m)
+        cell_row, cell_column = np.floor(positions).astype(np.int64).T
+        log, self.driven = drive_over(log, self.tiling, cell_row, cell_column)
+        entry = describe_drives(log, list(self.tiling.strips))
+        self.source["drives"] = entry
+        self.source["traversability"] = {
+            name: entry[name] for name in ("file", "sha256")
+        }
 
     def read(self, run: Run) -> tuple[ndarray, Maps]:
         """Return the inputs of some maps.
 
         Returns:
-            Elevation padded by one cell of the surrounding terrain, shape [B, H + 2, W
-            + 2]; and values by the names in `arguments` and in `BANDS`, each of shape
-            [B, K, H, W]; NaN if missing.
+            Elevation, padded by one cell of the surrounding terrain, shape [B, H + 2,
+            W + 2]; and values by the names in `arguments` and `BANDS`, each of shape
+            [B, K, H, W]. Missing values are NaN.
 
         Raises:
             DatasetError: If a raster cannot be read, or contains invalid values.
@@ -266,7 +265,7 @@ class Survey:
             raise DatasetError(
                 f"Expected values of `classes` in {sorted(self.indices)}, got "
                 f"[{', '.join(shown)}] too in {name}. Name each by `class_ids`, null "
-                "for no label; or, if one stands for missing, declare it: rio "
+                "for no label; or, if one marks missing cells, declare it: rio "
                 f"edit-info --nodata VALUE {name}"
             )
         return indices
@@ -324,6 +323,17 @@ def _resampled(
             yield f"{raster.argument} {end}", raster.laid(frame, bands, end)
 
 
+def _inside(extent: Extent, laid: Laid, step: float) -> list[ndarray]:
+    """Return masks of rows and columns, padded by one, inside the elevation model."""
+    slack = SLACK * step
+    masks = []
+    sides = zip(laid.offset_m, laid.tiling.cells, extent.size_m, strict=True)
+    for offset, count, size in sides:
+        edges = offset + step * np.arange(-1, count + 2)
+        masks.append((edges[:-1] > -slack) & (edges[1:] < size + slack))
+    return masks
+
+
 def _cut_maps(strip: ndarray, wests: Sequence[int], width: int) -> ndarray:
     """Return the maps of a strip, shape [B, K, H, W].
 
@@ -339,7 +349,7 @@ def _cut_maps(strip: ndarray, wests: Sequence[int], width: int) -> ndarray:
 def _check_covers(
     raster: Raster, crs: Any, area: tuple[float, float, float, float], step: float
 ) -> None:
-    """Check that a raster covers all maps to within a cell; values may be missing.
+    """Check that a raster covers all maps to within a cell, perhaps without values.
 
     Args:
         raster: raster of a layer.
@@ -360,8 +370,8 @@ def _check_covers(
         raise DatasetError(
             f"Expected `{raster.argument}` over all of the terrain, WEST SOUTH EAST "
             f"NORTH {ours} in {crs.to_string()[:80]}, got {raster.name} over {theirs}. "
-            "Take a raster that covers it, with a value for missing where nothing is "
-            "known, or cut `dem` out: rio clip DEM part.tif --bounds 'WEST SOUTH EAST "
+            "Take a raster that covers it, with a declared value for missing cells, "
+            "or cut `dem` out: rio clip DEM part.tif --bounds 'WEST SOUTH EAST "
             "NORTH'"
         )
 

@@ -35,7 +35,7 @@ def check_elevation(dem: Raster, values: Maps, cliff_m: float) -> None:
     low, high = _range("dem", values)
     for extreme, heights_m in ((low, lowest_m), (high, highest_m)):
         if is_missing(dem, extreme, heights_m, cliff_m):
-            expected = "elevations of `dem` without stand-ins"
+            expected = "elevations of `dem` without undeclared missing values"
             raise _out_of_range(dem, expected, low, high, extreme)
     declared_gap_m = widest_gap_m(cliff_m)
     max_gap_m = declared_gap_m if dem.declares_missing else cliff_m
@@ -46,7 +46,7 @@ def check_elevation(dem: Raster, values: Maps, cliff_m: float) -> None:
             advice = ""
             if gap_m <= declared_gap_m:  # perhaps the sea
                 advice = (
-                    f"Where {value} is a height, declare a value that does not "
+                    f"If {value} is a height, declare a value that does not "
                     "occur, such as -9999."
                 )
             raise _out_of_range(dem, expected, low, high, value, advice)
@@ -94,10 +94,10 @@ def check_layer(raster: Raster, maps: Maps, field: Field) -> bool:
     for extreme, end in ((low, "min"), (high, "max")):
         extremes = maps.get(f"{name} {end}", maps[name])
         if is_certain(raster, extreme, extremes):
-            expected = f"values of `{name}` without stand-ins"
+            expected = f"values of `{name}` without undeclared missing values"
             advice = ""
             if not raster.declares_missing:
-                advice = "Where it is a value, declare one that does not occur."
+                advice = "If it is a valid value, declare one that does not occur."
             raise _out_of_range(raster, expected, low, high, extreme, advice)
     return True
 
@@ -135,7 +135,7 @@ def _out_of_range(
         percent = "."
         if raster.argument == "traversability":
             percent = (
-                ", from percent so: rio calc --not-masked -t float32 "
+                "; from percent: rio calc --not-masked -t float32 "
                 f"'(/ (read 1) 100.0)' {raster.name} scaled.tif"
             )
         return DatasetError(f"{problem} Convert them{percent}")
@@ -143,7 +143,7 @@ def _out_of_range(
     if nodata is not None:
         replacement = f"(where (== (read 1) {value:.9g}) {nodata:.9g} (read 1))"
         remedy = (
-            f"replace it by what is declared: rio calc '{replacement}' "
+            f"replace it by the declared value: rio calc '{replacement}' "
             f"{raster.name} filled.tif"
         )
     elif raster.declares_missing:  # a mask would hide the declared value
@@ -155,4 +155,4 @@ def _out_of_range(
         remedy = f"declare it: rio edit-info --nodata {value:.9g} {raster.name}"
     if advice:
         remedy += f". {advice}"
-    return DatasetError(f"{problem} If {value:.9g} stands for missing, {remedy}")
+    return DatasetError(f"{problem} If {value:.9g} marks missing cells, {remedy}")
