@@ -18,10 +18,10 @@ class GroundOptions:
             unit that the raster declares.
         origin: South-west corner of the first map, [X,Y] in the coordinate reference
             system of the maps.
-        max_maps: Maximum number of maps. More stop the import, with a command that
-            makes fewer.
-        coarse: Allow an elevation model whose cells are three times as wide as the
-            maps', or wider.
+        max_maps: Maximum number of maps. If there are more, the import fails, and the
+            error states a command that makes fewer.
+        coarse: Allow an elevation model with cells at least three times as wide as the
+            maps'.
     """
 
     dem_unit: str = ""
@@ -58,8 +58,8 @@ class Cut:
 class Rasters:
     """Further rasters of the terrain.
 
-    Layers must cover all maps; missing values of a layer are NaN. Maps that another
-    raster does not cover are left out.
+    A layer must cover all maps; its missing values are NaN. Maps that any other raster
+    does not cover are left out.
 
     Args:
         classes: Raster of terrain classes. If empty, classes are random.
