@@ -357,7 +357,7 @@ class _Part:
 
 def _lacking(inputs: Maps) -> dict[str, ndarray]:
     """Return masks of maps that lack an input, by its name, bool, shape [B]."""
-    lacking = {}
+    lacking: dict[str, Any] = {}
     for name, values in inputs.items():
         lacking[name] = np.isnan(values).any(axis=(1, 2, 3))
     # Without a photo, a cell has the colour of its class.

@@ -41,7 +41,7 @@ from benchnav.datagen.dem.value_checks import (
     check_limits,
 )
 from benchnav.datagen.recipe.recipe import Recipe
-from benchnav.datagen.schema import FIELDS, OPTIONAL, Fields, Maps
+from benchnav.datagen.schema import FIELDS, OPTIONAL, Field, Maps
 
 # Tangent of 80°: natural terrain next to cells of height 0 is less steep.
 _CLIFF = 5.67
@@ -126,7 +126,7 @@ class Survey:
         laid = extent.lay(recipe.grid, stride)
         self.tiling = laid.tiling
         self.fields = {layer.name: layer.field for layer in rasters.layers}
-        drive_fields: Fields = {}
+        drive_fields: dict[str, Field] = {}
         if log is not None:
             drive_fields = {name: OPTIONAL[name] for name in BANDS if name in OPTIONAL}
         fields = FIELDS | drive_fields | self.fields
