@@ -18,7 +18,12 @@ from scipy.optimize import linear_sum_assignment
 
 from benchnav.core.errors import DatasetError
 from benchnav.datagen.dem.crs import is_in_metres, transformed
-from benchnav.datagen.dem.drive_log import OVER_SPEED, PLACES, REASONS, DriveLog
+from benchnav.datagen.dem.drive_log import (
+    OVER_SPEED,
+    POSITION_COLUMNS,
+    REASONS,
+    DriveLog,
+)
 from benchnav.datagen.dem.raster import Layer, Raster
 from benchnav.datagen.dem.tiling import Tiling
 from benchnav.datagen.schema import Json
@@ -67,7 +72,7 @@ class DrivenCells:
         return bands
 
 
-def lay_out(log: DriveLog, dem: Raster, crs: Any, bounds: Any) -> DriveLog:
+def to_map_crs(log: DriveLog, dem: Raster, crs: Any, bounds: Any) -> DriveLog:
     """Return a log with positions in the CRS of the maps.
 
     They are in metres from the south-west corner of the elevation model.
@@ -127,7 +132,7 @@ def _off_terrain(log: DriveLog, dem: Raster, *, is_swapped: bool) -> DatasetErro
     covered = dem.file.bounds
     west, east = log.rows["x"].agg(["min", "max"])
     south, north = log.rows["y"].agg(["min", "max"])
-    names = PLACES["WGS 84" if log.is_geographic else "crs"]
+    names = POSITION_COLUMNS["WGS 84" if log.is_geographic else "crs"]
     columns = " and ".join(f"`{name}`" for name in names)
     remedy = _PROJECT
     if log.is_geographic:
@@ -197,7 +202,7 @@ def elevation_under(layer: Layer, row: ndarray, column: ndarray) -> ndarray:
     return elevation_m
 
 
-def drive_over(
+def aggregate_drives(
     log: DriveLog, tiling: Tiling, row: ndarray, column: ndarray
 ) -> tuple[DriveLog, DrivenCells]:
     """Assign drives to splits, and aggregate λ over the rows on each cell.
@@ -232,7 +237,7 @@ def drive_over(
 
 
 def describe_drives(log: DriveLog, splits: Sequence[str]) -> Json:
-    """Return the manifest entry of a log from `drive_over`: used and unused rows."""
+    """Return the manifest entry of a log from `aggregate_drives`: used and unused rows."""
     used = {}
     drives = {}
     for index, split in enumerate(splits):

@@ -30,18 +30,18 @@ from benchnav.datagen.files.robot_logs import (
 )
 
 # Thresholds that are a choice of this package are marked (choice).
-LEAST_SPEED_M_S = 0.1
+MIN_SPEED_M_S = 0.1
 # Off-road robots are slower, unless they are logged in km/h or cm/s.
-MOST_SPEED_M_S = 15.0
+MAX_SPEED_M_S = 15.0
 TOP_RATIO = 1.5  # times the top command, which no robot exceeds (choice)
 # Times the command, which noise and downhill driving seldom exceed (choice).
 OVER_SPEED = 1.2
 # Ratios of distances by positions and by measured speed that count as equal (choice).
 PACE_LIMITS = (0.85, 1.15)
 MAX_FAULTY = 0.1  # maximum fraction of rows with faults of one kind (choice)
-PLACES = {"crs": ("x_m", "y_m"), "WGS 84": ("longitude_deg", "latitude_deg")}
-_MOVES = ("commanded_m_s", "measured_m_s")
-_METRES_A_DEGREE = 111_320  # of latitude
+POSITION_COLUMNS = {"crs": ("x_m", "y_m"), "WGS 84": ("longitude_deg", "latitude_deg")}
+_SPEED_COLUMNS = ("commanded_m_s", "measured_m_s")
+_METRES_PER_DEGREE = 111_320  # of latitude
 _LIMITS = {"longitude_deg": (-180.0, 360.0), "latitude_deg": (-90.0, 90.0)}
 _CLOCK = "Convert clock times to seconds, such as those since the start of the drive."
 
@@ -56,7 +56,7 @@ REASONS = {
     "off_pace": "belong to a drive whose positions and measured speed disagree by more "
     "than 15 %",
     "slow": "were commanded less than the least speed (standing, turning in place)",
-    "implausible": f"have a speed above {MOST_SPEED_M_S:g} m/s or above {TOP_RATIO:g} "
+    "implausible": f"have a speed above {MAX_SPEED_M_S:g} m/s or above {TOP_RATIO:g} "
     "times the top command",
     "between_maps": "lie between the maps",
     "other_split": "lie on the terrain of a split that their drive does not belong to",
@@ -76,7 +76,7 @@ class Drives:
     """
 
     file: str
-    least_speed: float = LEAST_SPEED_M_S
+    least_speed: float = MIN_SPEED_M_S
     speed: Literal["", "positions", "measured"] = ""
 
     def __post_init__(self) -> None:
@@ -123,7 +123,7 @@ class DriveLog:
     motion: Mapping[str, Any] = field(default_factory=dict)
 
     @property
-    def places_m(self) -> ndarray:
+    def positions_m(self) -> ndarray:
         """Positions northward and eastward in metres, float64, shape [N, 2]."""
         return self.rows[["y", "x"]].to_numpy()
 
@@ -175,18 +175,18 @@ def read_drives(drives: Drives) -> DriveLog:
     path = Path(drives.file)
     rows = read_log(path)
     by_positions = drives.speed == "positions"
-    names_of_moves = _MOVES[:1] if by_positions else _MOVES
-    has_crs = set(PLACES["crs"]) <= set(rows)
-    is_geographic = not has_crs and set(PLACES["WGS 84"]) <= set(rows)
-    place_names = PLACES["WGS 84" if is_geographic else "crs"]
-    columns = ("time_s", *place_names, *names_of_moves)
+    speed_names = _SPEED_COLUMNS[:1] if by_positions else _SPEED_COLUMNS
+    has_crs = set(POSITION_COLUMNS["crs"]) <= set(rows)
+    is_geographic = not has_crs and set(POSITION_COLUMNS["WGS 84"]) <= set(rows)
+    position_names = POSITION_COLUMNS["WGS 84" if is_geographic else "crs"]
+    columns = ("time_s", *position_names, *speed_names)
     _require_columns(rows, columns, path)
     values = {name: _read_column(rows, name, path) for name in columns}
-    for name in names_of_moves:
+    for name in speed_names:
         speed = np.abs(values[name])
         moving = speed[speed >= drives.least_speed]
         usual = pd.Series(moving).median()
-        if usual > MOST_SPEED_M_S:
+        if usual > MAX_SPEED_M_S:
             raise DatasetError(
                 f"Expected `{name}` in m/s in {path}, got a median of {usual:.4g} "
                 "while moving, which looks like "
@@ -197,7 +197,7 @@ def read_drives(drives: Drives) -> DriveLog:
     if "drive" in rows:
         names_by_row = read_names(rows, "drive", path)
         drive_names, drive = np.unique(names_by_row, return_inverse=True)
-    x, y = (values[name] for name in place_names)
+    x, y = (values[name] for name in position_names)
     measured = values.get("measured_m_s", np.full(len(rows), np.nan))
     if by_positions and "measured_m_s" in rows:
         # It only serves for the comparison with positions.
@@ -229,9 +229,9 @@ def _require_columns(rows: pd.DataFrame, columns: Sequence[str], path: Path) -> 
     """Check that a log has all columns, or raise an error with a remedy."""
     missing = set(columns) - set(rows)
     remedy = "Name positions x_m and y_m, or longitude_deg and latitude_deg for WGS 84."
-    if missing.isdisjoint((*PLACES["crs"], *PLACES["WGS 84"])):
+    if missing.isdisjoint((*POSITION_COLUMNS["crs"], *POSITION_COLUMNS["WGS 84"])):
         remedy = ""
-        if missing & {*_MOVES} == {"measured_m_s"}:
+        if missing & {*_SPEED_COLUMNS} == {"measured_m_s"}:
             remedy = "Log speed over ground, or pass --speed positions."
     require_columns(rows, columns, path, remedy)
 
@@ -249,7 +249,7 @@ def _read_column(rows: pd.DataFrame, name: str, path: Path) -> ndarray:
 def _resolution_m(x: ndarray, y: ndarray, *, is_geographic: bool) -> float:
     """Return the largest step that divides all positions; 0 below some centimetres."""
     max_decimals = 6 if is_geographic else 2
-    metres = _METRES_A_DEGREE if is_geographic else 1
+    metres = _METRES_PER_DEGREE if is_geographic else 1
     for decimals in range(max_decimals):
         scaled = np.stack([x, y]) * 10.0**decimals
         scaled = scaled[:, np.isfinite(scaled).all(axis=0)]

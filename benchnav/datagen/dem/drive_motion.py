@@ -18,7 +18,7 @@ from numpy import ndarray
 from benchnav.core.errors import DatasetError
 from benchnav.datagen.dem.drive_log import (
     MAX_FAULTY,
-    MOST_SPEED_M_S,
+    MAX_SPEED_M_S,
     OVER_SPEED,
     REASONS,
     TOP_RATIO,
@@ -70,11 +70,11 @@ def compare_motion(log: DriveLog) -> DriveLog:
     if by_positions:
         # Measured speed only serves for the comparison, if it is plausible.
         measured = log.rows["speed"]
-        comparable = measured.where(measured.abs() <= MOST_SPEED_M_S)
+        comparable = measured.where(measured.abs() <= MAX_SPEED_M_S)
         log = replace(log, rows=log.rows.assign(speed=comparable))
     log = log.without("doubled", log.rows.duplicated().to_numpy())
     log = _leave_out(log, {"restarted": find_restarted(log.rows)})
-    is_beyond = log.rows[["commanded", "speed"]].abs() > MOST_SPEED_M_S
+    is_beyond = log.rows[["commanded", "speed"]].abs() > MAX_SPEED_M_S
     log = _leave_out(log, {"implausible": is_beyond.any(axis=1).to_numpy()})
     is_slow = (log.rows["commanded"].abs() < least_speed).to_numpy()
     if is_slow.all():

@@ -36,8 +36,8 @@ _RESAMPLED = {
 }
 
 
-class Laid(NamedTuple):
-    """Maps laid on an elevation model.
+class Layout(NamedTuple):
+    """Layout of maps on an elevation model.
 
     Args:
         tiling: Tiling of the terrain into maps.
@@ -63,7 +63,7 @@ class Extent:
         shares: Fraction of the maps of each split.
         origin_m: (x, y) of the south-west corner of the first map in `crs`; None for
             the default.
-        places_m: Positions of drives, around which maps are cut, shape [N, 2]; None for
+        positions_m: Positions of drives, around which maps are cut, shape [N, 2]; None for
             all of the elevation model.
     """
 
@@ -74,7 +74,7 @@ class Extent:
     cell_m: ndarray
     shares: Mapping[str, float]
     origin_m: tuple[float, float] | None = None
-    places_m: ndarray | None = None
+    positions_m: ndarray | None = None
 
     @property
     def corner_m(self) -> ndarray:
@@ -86,7 +86,7 @@ class Extent:
         """Size of the elevation model, shape [2]."""
         return np.array([self.bounds.top, self.bounds.right]) - self.corner_m
 
-    def lay(self, grid: Grid, stride: Shape) -> Laid:
+    def lay(self, grid: Grid, stride: Shape) -> Layout:
         """Lay maps on the terrain.
 
         Args:
@@ -101,11 +101,11 @@ class Extent:
         step = grid.resolution_m
         start_m = np.zeros(2)
         end_m = self.size_m
-        if self.places_m is not None:
+        if self.positions_m is not None:
             map_m = np.multiply(grid.shape, step)
             stride_m = np.multiply(stride, step)
             start_m, size_m = cut_around(
-                self.places_m, self.size_m, self.cell_m, map_m, stride_m
+                self.positions_m, self.size_m, self.cell_m, map_m, stride_m
             )
             end_m = start_m + size_m
         if self.origin_m is not None:
@@ -129,7 +129,7 @@ class Extent:
         max_margin_m = 0.0 if self.origin_m is not None else reach_m
         margin_m = (size_m - np.multiply(step, tiling.cells)) / 2
         offset_m = start_m + np.clip(margin_m, 0, max_margin_m)
-        return Laid(tiling, offset_m, resampling)
+        return Layout(tiling, offset_m, resampling)
 
     def _check_origin(self, start_m: ndarray, step: float) -> None:
         """Reject an origin off the elevation model."""
@@ -168,7 +168,7 @@ class Extent:
         if len(self.shares) == 1:
             maps = "a map"
         end = "of the terrain around the drives"
-        if self.places_m is None:
+        if self.positions_m is None:
             end = "of `dem`"
         raise ConfigError(
             f"Expected `origin` from which {maps} of {wide:g} m × {high:g} m fit up to "
@@ -214,16 +214,16 @@ class Extent:
             return "average", 0.0
         return "cubic", _KERNEL_CELLS * max(*self.cell_m, step)
 
-    def describe(self, laid: Laid, recipe: Recipe, fields: Fields) -> str:
+    def describe(self, layout: Layout, recipe: Recipe, fields: Fields) -> str:
         """Return a paragraph on the cells, the maps, their size in bytes, and the unit.
 
         Args:
-            laid: The maps.
+            layout: Layout of the maps.
             recipe: Recipe of the maps.
             fields: Stored fields of each map.
         """
         grid = recipe.grid
-        tiling = laid.tiling
+        tiling = layout.tiling
         file = self.raster.file
         bytes_per_map = 0
         for field in fields.values():
@@ -234,26 +234,26 @@ class Extent:
         high, wide = (f"{value:.4g}" for value in self.cell_m)
         maps = f"{tiling.maps:,} map{'s' * (tiling.maps > 1)}"
         stride_m = tiling.stride[1] * grid.resolution_m
-        corner = _origin(self.corner_m + laid.offset_m)
+        corner = _origin(self.corner_m + layout.offset_m)
         origin_hint = "set by `origin`" if self.origin_m else "set it by `origin`"
         return (
             f"{self.raster.name}: {file.height} × {file.width} cells of {wide} m × "
             f"{high} m on the terrain, elevations "
-            f"in {self.unit}, {_RESAMPLED[laid.resampling]}. {maps} of {grid.height} × "
+            f"in {self.unit}, {_RESAMPLED[layout.resampling]}. {maps} of {grid.height} × "
             f"{grid.width} cells of {grid.resolution_m:g} m, one every {stride_m:g} m "
             f"from the south-west corner {corner} on ({origin_hint}), in "
             f"{_name_of(self.crs)}; {gigabytes} GB before compression."
         )
 
-    def frame(self, laid: Laid, step: float) -> dict[str, Any]:
-        """Return the cells of all maps, padded by one, as an argument of `Raster.laid`.
+    def frame(self, layout: Layout, step: float) -> dict[str, Any]:
+        """Return the cells of all maps, padded by one, as an argument of `Raster.resampled`.
 
         Args:
-            laid: The maps.
+            layout: Layout of the maps.
             step: Width of a cell in metres.
         """
-        south_m, west_m = (self.corner_m + laid.offset_m).tolist()
-        height, width = laid.tiling.cells
+        south_m, west_m = (self.corner_m + layout.offset_m).tolist()
+        height, width = layout.tiling.cells
         north_m = south_m + (height + 1) * step
         transform = load_rasterio().transform.from_origin(
             west_m - step, north_m, step, step
@@ -266,25 +266,29 @@ class Extent:
         }
 
     def suggest_origin(
-        self, raster: Raster, laid: Laid, step: float, announce: Callable[[str], object]
+        self,
+        raster: Raster,
+        layout: Layout,
+        step: float,
+        announce: Callable[[str], object],
     ) -> None:
         """Announce the corner of another raster as an origin, if it lies within a map.
 
         Args:
             raster: A raster other than the elevation model.
-            laid: The maps.
+            layout: Layout of the maps.
             step: Width of a map's cell in metres.
             announce: Receives a sentence.
         """
         with raster.warped(self.crs) as warped:
             bounds = warped.bounds
-        has_default_origin = self.origin_m is None and self.places_m is None
+        has_default_origin = self.origin_m is None and self.positions_m is None
         if not has_default_origin or bounds != raster.file.bounds:
             return
         start_m = np.array([bounds.bottom, bounds.left]) - self.corner_m
         is_on = ((start_m >= 0) & (start_m < self.size_m)).all()
-        stride_m = np.multiply(laid.tiling.stride, step)
-        n_strides = (start_m - laid.offset_m) / stride_m
+        stride_m = np.multiply(layout.tiling.stride, step)
+        n_strides = (start_m - layout.offset_m) / stride_m
         if is_on and np.abs(n_strides - np.rint(n_strides)).max() > SLACK:
             corner = _origin((bounds.bottom, bounds.left))
             announce(

@@ -340,7 +340,7 @@ class _Part:
     def entry(self, first: int = 0, stop: int | None = None) -> dict[str, Any]:
         """Return the manifest entry of consecutive maps, from `first` to before `stop`."""
         records = {name: values[first:stop] for name, values in self.records.items()}
-        left_out = {**self.left_out, "between_splits": self.survey.tiling.between}
+        left_out = {**self.left_out, "between_splits": self.survey.tiling.n_omitted}
         source = {
             **self.survey.source,
             "truth": "unknown",

@@ -58,7 +58,7 @@ class Raster(NamedTuple):
         """Whether some value, mask or band marks cells without a value."""
         return self.mask_kinds != {"all_valid"}
 
-    def place(self) -> tuple[Any, Any, tuple[float, float]]:
+    def georeference(self) -> tuple[Any, Any, tuple[float, float]]:
         """Return a CRS in metres, bounds in it, and cell size northward and eastward.
 
         It is the raster's CRS if its metres are metres on the terrain everywhere in the
@@ -118,10 +118,10 @@ class Raster(NamedTuple):
                 **settings,
             )
 
-    def laid(
+    def resampled(
         self, frame: Mapping[str, Any], bands: list[int], resampling: str
     ) -> "Layer":
-        """Return bands resampled to cells.
+        """Return bands, resampled to cells.
 
         Args:
             frame: the cells of all maps, padded by one: `crs`, `transform`, `height`
@@ -176,7 +176,9 @@ class Layer(NamedTuple):
 
 
 @contextmanager
-def opened(argument: str, name: str, kinds: tuple[str, ...] = ()) -> Iterator[Raster]:
+def open_raster(
+    argument: str, name: str, kinds: tuple[str, ...] = ()
+) -> Iterator[Raster]:
     """Open a raster.
 
     Args:
@@ -215,7 +217,7 @@ def _check_georeference(argument: str, name: str, file: Any) -> None:
 
 
 def _check_bands(argument: str, name: str, file: Any, kinds: tuple[str, ...]) -> None:
-    """Check the first bands of a raster; see `opened`."""
+    """Check the first bands of a raster; see `open_raster`."""
     if not kinds and file.count != 1:
         raise DatasetError(
             f"Expected one band in `{argument}`, got {file.count} in {name}. "

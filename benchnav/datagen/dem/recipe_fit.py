@@ -13,7 +13,7 @@ import numpy as np
 from benchnav.core.copula import LONGEST_CORRELATION
 from benchnav.core.errors import BenchnavError, ConfigError
 from benchnav.core.grid import Grid
-from benchnav.datagen.dem.extent import Extent, Laid
+from benchnav.datagen.dem.extent import Extent, Layout
 from benchnav.datagen.dem.options import GroundOptions
 from benchnav.datagen.dem.tiling import Run, Shape
 from benchnav.datagen.layers.spec import overrides_of
@@ -65,13 +65,13 @@ class GroundError(ConfigError):
 
 
 def check_fit(
-    extent: Extent, laid: Laid, recipe: Recipe, options: GroundOptions
+    extent: Extent, layout: Layout, recipe: Recipe, options: GroundOptions
 ) -> None:
     """Reject terrain that makes too many or too smooth maps.
 
     Args:
         extent: Terrain.
-        laid: Maps on it.
+        layout: Layout of the maps on it.
         recipe: Recipe of the maps.
         options: Maximum number of maps, and whether the elevation model may be much
             coarser than the maps.
@@ -82,7 +82,7 @@ def check_fit(
     step = recipe.resolution_m
     cell_m = float(max(extent.cell_m))
     max_maps = options.max_maps
-    n_maps = laid.tiling.maps
+    n_maps = layout.tiling.maps
     name = extent.raster.name
     is_coarse = cell_m / step >= MAX_RATIO * (1 - 1e-9) and not options.coarse
     if is_coarse:
@@ -101,14 +101,14 @@ def check_fit(
     scalings: Iterator[Scaling] = iter([({}, 1)])
     if is_coarse:
         scalings = _scalings(recipe, cell_m)
-    corrections = _corrections(extent, laid, recipe, scalings, max_maps)
+    corrections = _corrections(extent, layout, recipe, scalings, max_maps)
     changes, stride_m = next(corrections, ({}, None))
     raise GroundError(problem, changes, stride_m)
 
 
 def _corrections(
     extent: Extent,
-    laid: Laid,
+    layout: Layout,
     recipe: Recipe,
     scalings: Iterator[Scaling],
     max_maps: int,
@@ -119,12 +119,12 @@ def _corrections(
 
     Args:
         extent: Terrain.
-        laid: Maps of the recipe on it.
+        layout: Layout of the recipe's maps on it.
         recipe: Recipe of the maps.
         scalings: Changes of the recipe to try.
         max_maps: Maximum number of maps.
     """
-    north, east = laid.tiling.stride
+    north, east = layout.tiling.stride
     is_adjacent = (north, east) == recipe.grid.shape
     for changes, divisor in scalings:
         stride = (max(1, north // divisor), max(1, east // divisor))
@@ -143,26 +143,26 @@ def _corrections(
 
 def _thinned(
     extent: Extent, grid: Grid, stride: Shape, max_maps: int
-) -> tuple[Laid, int]:
+) -> tuple[Layout, int]:
     """Return up to `max_maps` maps, and the multiple of the stride between them."""
     times = 1
-    laid = extent.lay(grid, stride)
-    while laid.tiling.maps > max_maps:
-        excess = laid.tiling.maps / max_maps
+    layout = extent.lay(grid, stride)
+    while layout.tiling.maps > max_maps:
+        excess = layout.tiling.maps / max_maps
         times += max(1, int(np.sqrt(excess)) - 1)
-        laid = extent.lay(grid, (stride[0] * times, stride[1] * times))
-    return laid, times
+        layout = extent.lay(grid, (stride[0] * times, stride[1] * times))
+    return layout, times
 
 
-def _has_maps(extent: Extent, laid: Laid, step: float) -> bool:
+def _has_maps(extent: Extent, layout: Layout, step: float) -> bool:
     """Return whether each split has a map without missing elevation."""
-    frame = extent.frame(laid, step)
-    layer = extent.raster.laid(frame, [1], laid.resampling)
+    frame = extent.frame(layout, step)
+    layer = extent.raster.resampled(frame, [1], layout.resampling)
     without_map = set(extent.shares)
     with layer.warped:
-        for run in laid.tiling.runs(1):
+        for run in layout.tiling.runs(1):
             if run.split in without_map:
-                rows, columns = _cells_of(run, laid)
+                rows, columns = _cells_of(run, layout)
                 heights_m = layer.read(rows, columns)
                 relief_m = np.ptp(heights_m[:, 1:-1, 1:-1])
                 if relief_m <= MAX_RELIEF_M:  # false for NaN
@@ -172,11 +172,11 @@ def _has_maps(extent: Extent, laid: Laid, step: float) -> bool:
     return False
 
 
-def _cells_of(run: Run, laid: Laid) -> tuple[range, range]:
+def _cells_of(run: Run, layout: Layout) -> tuple[range, range]:
     """Return rows and columns of the cells of a run's first map."""
-    height, width = laid.tiling.shape
-    south = run.row * laid.tiling.stride[0]
-    west = run.columns[0] * laid.tiling.stride[1]
+    height, width = layout.tiling.shape
+    south = run.row * layout.tiling.stride[0]
+    west = run.columns[0] * layout.tiling.stride[1]
     return range(south, south + height), range(west, west + width)
 
 

@@ -58,7 +58,7 @@ def _is_among(raw: float, sentinels: Sequence[float]) -> bool:
     return bool(np.isclose(raw, sentinels, rtol=_TOLERANCE, atol=0).any())
 
 
-def is_certain(raster: Raster, value: float, values: ndarray) -> bool:
+def is_certain_sentinel(raster: Raster, value: float, values: ndarray) -> bool:
     """Return whether an extreme value of a map means missing, for any quantity.
 
     If the raster declares another value for missing, the extreme means missing only if

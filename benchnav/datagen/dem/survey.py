@@ -21,17 +21,17 @@ from benchnav.core.sources import digest_of_path
 from benchnav.datagen.dem.drive_cells import (
     BANDS,
     DrivenCells,
+    aggregate_drives,
     check_enough,
     describe_drives,
-    drive_over,
     elevation_under,
-    lay_out,
+    to_map_crs,
 )
 from benchnav.datagen.dem.drive_log import DriveLog, Drives, read_drives
 from benchnav.datagen.dem.drive_motion import compare_motion, compare_slopes
-from benchnav.datagen.dem.extent import Extent, Laid
+from benchnav.datagen.dem.extent import Extent, Layout
 from benchnav.datagen.dem.options import Cut, Rasters
-from benchnav.datagen.dem.raster import Layer, Raster, opened
+from benchnav.datagen.dem.raster import Layer, Raster, open_raster
 from benchnav.datagen.dem.recipe_fit import check_fit
 from benchnav.datagen.dem.tiling import SLACK, Run, Shape
 from benchnav.datagen.dem.units import check_metres, in_unit
@@ -104,15 +104,15 @@ class Survey:
         step = recipe.resolution_m
         class_names = _class_names(rasters, recipe)
         log = read_drives(drives) if drives else None
-        dem_raster = stack.enter_context(opened("dem", dem))
+        dem_raster = stack.enter_context(open_raster("dem", dem))
         dem_raster, unit = in_unit(dem_raster, cut.ground.dem_unit)
-        crs, bounds, cell_m = dem_raster.place()
+        crs, bounds, cell_m = dem_raster.georeference()
         stride = _stride(cut, recipe)
         positions_m = None
         if log is not None:
-            log = compare_motion(lay_out(log, dem_raster, crs, bounds))
+            log = compare_motion(to_map_crs(log, dem_raster, crs, bounds))
             check_enough(log, list(cut.shares))
-            positions_m = log.places_m
+            positions_m = log.positions_m
         extent = Extent(
             raster=dem_raster,
             unit=unit,
@@ -121,28 +121,28 @@ class Survey:
             cell_m=np.array(cell_m),
             shares=cut.shares,
             origin_m=cut.ground.origin,
-            places_m=positions_m,
+            positions_m=positions_m,
         )
-        laid = extent.lay(recipe.grid, stride)
-        self.tiling = laid.tiling
+        layout = extent.lay(recipe.grid, stride)
+        self.tiling = layout.tiling
         self.fields = {layer.name: layer.field for layer in rasters.layers}
         drive_fields: dict[str, Field] = {}
         if log is not None:
             drive_fields = {name: OPTIONAL[name] for name in BANDS if name in OPTIONAL}
         fields = FIELDS | drive_fields | self.fields
-        announce(extent.describe(laid, recipe, fields))
-        check_fit(extent, laid, recipe, cut.ground)
+        announce(extent.describe(layout, recipe, fields))
+        check_fit(extent, layout, recipe, cut.ground)
 
-        south_m, west_m = (extent.corner_m + laid.offset_m).tolist()
+        south_m, west_m = (extent.corner_m + layout.offset_m).tolist()
         height, width = self.tiling.cells
         area = (west_m, south_m, west_m + width * step, south_m + height * step)
-        sources = [(dem_raster, laid.resampling)]
+        sources = [(dem_raster, layout.resampling)]
         for raster, resampling in _open_others(stack, rasters):
-            extent.suggest_origin(raster, laid, step, announce)
+            extent.suggest_origin(raster, layout, step, announce)
             if raster.argument.startswith("layer "):
                 _check_covers(raster, crs, area, step)
             sources.append((raster, resampling))
-        frame = extent.frame(laid, step)
+        frame = extent.frame(layout, step)
         self.layers: dict[str, Layer] = {}
         for raster, resampling in sources:
             for name, layer in _resampled(raster, frame, resampling):
@@ -173,7 +173,7 @@ class Survey:
             layer_origins = {name: origins[f"layer {name}"] for name in self.fields}
             self.source["layers"] = layer_origins
         self.valued: set[str] = set()
-        self.is_inside = _inside(extent, laid, step)
+        self.is_inside = _inside(extent, layout, step)
         indices: dict[str | None, float] = {None: np.nan}
         for index, item in enumerate(recipe.classes):
             indices[item.name] = index
@@ -182,16 +182,16 @@ class Survey:
         self.cliff_m = _CLIFF * max(*cell_m, step)
         self.driven: DrivenCells | None = None
         if log is not None:
-            self._add_drives(log, laid, step)
+            self._add_drives(log, layout, step)
 
-    def _add_drives(self, log: DriveLog, laid: Laid, step: float) -> None:
+    def _add_drives(self, log: DriveLog, layout: Layout, step: float) -> None:
         """Add the driven cells of a log, and its entry of the manifest."""
-        positions = (log.places_m - laid.offset_m) / step
+        positions = (log.positions_m - layout.offset_m) / step
         row, column = (positions - 0.5).T
         elevation_m = elevation_under(self.layers["dem"], row, column)
         log = compare_slopes(log, elevation_m)
         cell_row, cell_column = np.floor(positions).astype(np.int64).T
-        log, self.driven = drive_over(log, self.tiling, cell_row, cell_column)
+        log, self.driven = aggregate_drives(log, self.tiling, cell_row, cell_column)
         entry = describe_drives(log, list(self.tiling.strips))
         self.source["drives"] = entry
         self.source["traversability"] = {
@@ -303,9 +303,9 @@ def _open_others(stack: ExitStack, rasters: Rasters) -> Iterator[tuple[Raster, s
     for argument, kinds, resampling in _OTHERS:
         name = getattr(rasters, argument)
         if name:
-            yield stack.enter_context(opened(argument, name, kinds)), resampling
+            yield stack.enter_context(open_raster(argument, name, kinds)), resampling
     for layer in rasters.layers:
-        raster = stack.enter_context(opened(f"layer {layer.name}", layer.raster))
+        raster = stack.enter_context(open_raster(f"layer {layer.name}", layer.raster))
         if layer.field.unit == "m":
             check_metres(raster)
         yield raster, layer.resampling
@@ -317,17 +317,17 @@ def _resampled(
     """Yield a raster's layers by name: its values, and the extremes of their means."""
     is_photo = raster.argument == "photo"
     bands = [1, 2, 3] if is_photo else [1]
-    yield raster.argument, raster.laid(frame, bands, resampling)
+    yield raster.argument, raster.resampled(frame, bands, resampling)
     if resampling in ("average", "cubic") and not is_photo:
         for end in ("min", "max"):
-            yield f"{raster.argument} {end}", raster.laid(frame, bands, end)
+            yield f"{raster.argument} {end}", raster.resampled(frame, bands, end)
 
 
-def _inside(extent: Extent, laid: Laid, step: float) -> list[ndarray]:
+def _inside(extent: Extent, layout: Layout, step: float) -> list[ndarray]:
     """Return masks of rows and columns, padded by one, inside the elevation model."""
     slack = SLACK * step
     masks = []
-    sides = zip(laid.offset_m, laid.tiling.cells, extent.size_m, strict=True)
+    sides = zip(layout.offset_m, layout.tiling.cells, extent.size_m, strict=True)
     for offset, count, size in sides:
         edges = offset + step * np.arange(-1, count + 2)
         masks.append((edges[:-1] > -slack) & (edges[1:] < size + slack))

@@ -76,7 +76,7 @@ class Tiling(NamedTuple):
             numbers: indices of some maps in the terrain.
 
         Returns:
-            The lowest index of a map of each map's group, int64, shape of `numbers`.
+            Lowest index in each map's group, int64, shape of `numbers`.
         """
         # On a lattice of twice the resolution, each map is a block that reaches to the
         # last map that it overlaps. Blocks intersect exactly if maps overlap, and do
@@ -122,7 +122,7 @@ class Tiling(NamedTuple):
         return split
 
     @property
-    def between(self) -> int:
+    def n_omitted(self) -> int:
         """Number of omitted maps between the splits."""
         return self.tiles[0] * self.tiles[1] - self.maps
 

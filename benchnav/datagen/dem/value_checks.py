@@ -10,7 +10,7 @@ import numpy as np
 from benchnav.core.errors import DatasetError
 from benchnav.datagen.dem.raster import Raster
 from benchnav.datagen.dem.sentinel import (
-    is_certain,
+    is_certain_sentinel,
     is_missing,
     looks_missing,
     widest_gap_m,
@@ -93,7 +93,7 @@ def check_layer(raster: Raster, maps: Maps, field: Field) -> bool:
         return False
     for extreme, end in ((low, "min"), (high, "max")):
         extremes = maps.get(f"{name} {end}", maps[name])
-        if is_certain(raster, extreme, extremes):
+        if is_certain_sentinel(raster, extreme, extremes):
             expected = f"values of `{name}` without undeclared missing values"
             advice = ""
             if not raster.declares_missing:

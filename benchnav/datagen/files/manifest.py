@@ -92,8 +92,8 @@ def _manifest_text(path: Path) -> str | bytes:
         if not is_dataset(path):
             raise DatasetError(
                 f"Expected a folder with a finished dataset, got {path} without "
-                f"{FOLDER_MANIFEST}. Finish it by the command that began it, or by "
-                "`benchnav-datagen merge` of its shards."
+                f"{FOLDER_MANIFEST}. Finish it with the command that started it, or "
+                "merge its shards with `benchnav-datagen merge`."
             )
         return (path / FOLDER_MANIFEST).read_text()
     with open_file(path) as file:
