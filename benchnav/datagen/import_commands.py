@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any, Literal
 from benchnav import datagen
 from benchnav.core.errors import ConfigError, expect
 from benchnav.core.progress import show_progress
-from benchnav.datagen.dem.raster import Cut, GroundOptions, Rasters
+from benchnav.datagen.dem.options import Cut, GroundOptions, Rasters
 
 if TYPE_CHECKING:
-    from benchnav.datagen.dem.extent import GroundError
+    from benchnav.datagen.dem.recipe_fit import GroundError
 
 _MAX_BACKWARD = 0.1  # of the rows (choice)
 _FEW_REVERSES = 0.01  # of the rows, which noise may show (choice)
@@ -205,7 +205,7 @@ def _sum_up(entry: Mapping[str, Any]) -> str:
 
 def _doubts(entry: Mapping[str, Any]) -> list[str]:
     """Return possible faults of a log's positions, in sentences."""
-    from benchnav.datagen.dem.drive_tracks import MAX_PERIOD_S
+    from benchnav.datagen.dem.drive_velocity import MAX_PERIOD_S
 
     doubts = []
     by_positions = entry["speed"] == "positions"
@@ -267,8 +267,8 @@ def _import(
     **settings: Any,
 ) -> "datagen.TerrainDataset":
     """Import under the requested id, or the name of the output; return the dataset."""
-    from benchnav.datagen.dem.extent import GroundError
     from benchnav.datagen.dem.importer import import_dem as import_maps
+    from benchnav.datagen.dem.recipe_fit import GroundError
     from benchnav.datagen.dem.tiling import read_shares
     from benchnav.datagen.files.describe import written
     from benchnav.datagen.files.hdf5 import name_of

@@ -1,9 +1,9 @@
 """Traversability of driven cells, and the split of each drive.
 
-Splits have strips of the terrain; terrain between them is in no map (`tiling`). A drive
-belongs to the split whose strip contains most of its rows. Its rows on other strips are
-left out, so no cell and no drive occurs in two splits. Letters in shapes: N rows, D
-drives, S splits, M driven cells.
+Each split has a strip of the terrain; terrain between strips is in no map (`tiling`). A
+drive belongs to the split whose strip contains most of its rows. Its rows on other
+strips are left out, so no cell and no drive occurs in two splits. Letters in shapes: N
+rows, D drives, M driven cells.
 """
 
 from collections.abc import Sequence
@@ -17,14 +17,20 @@ from scipy import ndimage
 from scipy.optimize import linear_sum_assignment
 
 from benchnav.core.errors import DatasetError
-from benchnav.datagen.dem.drive_log import OVER_SPEED, PLACES, REASONS, DriveLog
-from benchnav.datagen.dem.raster import Layer, Raster, transformed
+from benchnav.datagen.dem.crs import is_in_metres, transformed
+from benchnav.datagen.dem.drive_log import (
+    OVER_SPEED,
+    POSITION_COLUMNS,
+    REASONS,
+    DriveLog,
+)
+from benchnav.datagen.dem.raster import Layer, Raster
 from benchnav.datagen.dem.tiling import Tiling
 from benchnav.datagen.schema import Json
 
 BANDS = ("traversability", "drive_count", "drive_std")
-RATIO_LIMITS = (0.0, 1.0)  # that the ratio of a row is clipped to when it is stored
-_BLOCK_CELLS = 64  # rows of cells that are read at once
+RATIO_LIMITS = (0.0, 1.0)  # to which the ratio of a row is clipped when it is stored
+_BLOCK_ROWS = 64  # rows of cells that are read at once
 _PROJECT = "Give x_m and y_m in that CRS, or longitude_deg and latitude_deg."
 
 
@@ -33,7 +39,7 @@ class DrivenCells:
     """Driven cells.
 
     Args:
-        cells: index of each, row · width + column, ascending, int64, shape [M].
+        cells: index of each cell, row · width + column, ascending, int64, shape [M].
         values: values of `BANDS`: mean of λ, number of rows, standard deviation of λ
             (NaN for one row), shape [3, M].
         width: number of columns of the terrain.
@@ -66,14 +72,14 @@ class DrivenCells:
         return bands
 
 
-def lay_out(log: DriveLog, ground: Raster, crs: Any, bounds: Any) -> DriveLog:
+def to_map_crs(log: DriveLog, dem: Raster, crs: Any, bounds: Any) -> DriveLog:
     """Return a log with positions in the CRS of the maps.
 
-    They are metres from the south-west corner of the elevation model.
+    They are in metres from the south-west corner of the elevation model.
 
     Args:
         log: log with positions as logged.
-        ground: the elevation model.
+        dem: the elevation model.
         crs: CRS of the maps.
         bounds: bounds of the elevation model in `crs`.
 
@@ -81,52 +87,73 @@ def lay_out(log: DriveLog, ground: Raster, crs: Any, bounds: Any) -> DriveLog:
         The log with the rows on the elevation model.
 
     Raises:
-        DatasetError: If no row is on it, or the CRS of the log is not in metres.
+        DatasetError: If no row lies on it, or positions are in its CRS and this is not
+            in metres.
     """
-    ground_crs, path = ground.file.crs, log.settings.file
-    if not log.is_geographic and not (
-        ground_crs.is_projected and ground_crs.linear_units_factor[1] == 1
-    ):
-        raise DatasetError(
-            f"Expected positions as longitude_deg and latitude_deg in {path}, since "
-            f"the CRS of {ground.name}, "
-            f"{ground_crs.to_string()[:80]}, is not in metres, got x_m and y_m. Log "
-            "them in WGS 84."
-        )
-    source_crs = "EPSG:4326" if log.is_geographic else ground_crs
-    corner = np.array([[bounds.left], [bounds.bottom]])
-    x, y = positions = (
-        transformed(source_crs, crs, log.rows["x"], log.rows["y"]) - corner
+    log_crs: Any = "EPSG:4326"
+    if not log.is_geographic:
+        log_crs = dem.file.crs
+        _check_in_metres(log, dem)
+    corner_m = np.array([[bounds.left], [bounds.bottom]])
+    x = log.rows["x"]
+    y = log.rows["y"]
+    positions_m = transformed(log_crs, crs, x, y) - corner_m
+    is_off = ~_is_within(positions_m, bounds)
+    if is_off.all():
+        swapped_m = transformed(log_crs, crs, y, x) - corner_m
+        is_swapped = bool(_is_within(swapped_m, bounds).any())
+        raise _off_terrain(log, dem, is_swapped=is_swapped)
+    x_m, y_m = positions_m
+    rows = log.rows.assign(x=x_m, y=y_m)
+    return replace(log, rows=rows).without("off_dem", is_off)
+
+
+def _check_in_metres(log: DriveLog, dem: Raster) -> None:
+    """Check that the CRS of the elevation model, and so of the log, is in metres."""
+    crs = dem.file.crs
+    if is_in_metres(crs):
+        return
+    raise DatasetError(
+        f"Expected positions as longitude_deg and latitude_deg in {log.settings.file}, "
+        f"since the CRS of {dem.name}, "
+        f"{crs.to_string()[:80]}, is not in metres, got x_m and y_m. Log "
+        "them in WGS 84."
     )
-    off = ~_is_within(positions, bounds)
-    if off.all():
-        covered = ground.file.bounds
-        (west, east), (south, north) = (
-            log.rows[name].agg(["min", "max"]) for name in ("x", "y")
-        )
-        names = PLACES["WGS 84" if log.is_geographic else "crs"]
-        columns = " and ".join(f"`{name}`" for name in names)
-        remedy = (
-            f"Convert {columns} to degrees in WGS 84."
-            if log.is_geographic
-            else _PROJECT
-        )
-        swapped = transformed(source_crs, crs, log.rows["y"], log.rows["x"]) - corner
-        if _is_within(swapped, bounds).any():
-            remedy = f"Swap {columns}."
-        raise DatasetError(
-            f"Expected positions on {ground.name}, which covers x {covered.left:.9g} to "
-            f"{covered.right:.9g} and y {covered.bottom:.9g} to {covered.top:.9g} of "
-            f"{ground_crs.to_string()[:80]}, got {names[0]} {west:.9g} to {east:.9g} "
-            f"and {names[1]} {south:.9g} to {north:.9g} in {path}. {remedy}"
-        )
-    return replace(log, rows=log.rows.assign(x=x, y=y)).without("off_dem", off)
+
+
+def _off_terrain(log: DriveLog, dem: Raster, *, is_swapped: bool) -> DatasetError:
+    """Return an error on a log whose positions all lie off the elevation model.
+
+    Args:
+        log: the log.
+        dem: the elevation model.
+        is_swapped: whether swapped coordinates lie on it.
+    """
+    covered = dem.file.bounds
+    west, east = log.rows["x"].agg(["min", "max"])
+    south, north = log.rows["y"].agg(["min", "max"])
+    names = POSITION_COLUMNS["WGS 84" if log.is_geographic else "crs"]
+    columns = " and ".join(f"`{name}`" for name in names)
+    remedy = _PROJECT
+    if log.is_geographic:
+        remedy = f"Convert {columns} to degrees in WGS 84."
+    if is_swapped:
+        remedy = f"Swap {columns}."
+    return DatasetError(
+        f"Expected positions on {dem.name}, which covers x {covered.left:.9g} to "
+        f"{covered.right:.9g} and y {covered.bottom:.9g} to {covered.top:.9g} of "
+        f"{dem.file.crs.to_string()[:80]}, got {names[0]} {west:.9g} to {east:.9g} "
+        f"and {names[1]} {south:.9g} to {north:.9g} in {log.settings.file}. {remedy}"
+    )
 
 
 def _is_within(positions_m: ndarray, bounds: Any) -> ndarray:
     """Return whether positions lie on the elevation model, bool, shape [N]."""
-    size = np.array([[bounds.right - bounds.left], [bounds.top - bounds.bottom]])
-    return np.all((positions_m >= 0) & (positions_m < size), axis=0)
+    width_m = bounds.right - bounds.left
+    height_m = bounds.top - bounds.bottom
+    size_m = np.array([[width_m], [height_m]])
+    is_within = (positions_m >= 0) & (positions_m < size_m)
+    return np.all(is_within, axis=0)
 
 
 def check_enough(log: DriveLog, splits: Sequence[str]) -> None:
@@ -135,51 +162,47 @@ def check_enough(log: DriveLog, splits: Sequence[str]) -> None:
     Raises:
         DatasetError: If the log has fewer drives.
     """
-    drives = log.rows["drive"].nunique()
-    if drives < len(splits):
+    n_drives = log.rows["drive"].nunique()
+    if n_drives < len(splits):
         raise DatasetError(
             f"Expected a drive for each of the {len(splits)} splits "
-            f"{', '.join(splits)}, got {drives} in "
+            f"{', '.join(splits)}, got {n_drives} in "
             f"{log.settings.file}. Name drives in a column `drive`, or take fewer "
             "--splits."
         )
 
 
-def elevation_under(
-    log: DriveLog, layer: Layer, row: ndarray, column: ndarray
-) -> ndarray:
-    """Return the elevation at each row of a log, interpolated between cells.
+def elevation_under(layer: Layer, row: ndarray, column: ndarray) -> ndarray:
+    """Return the elevation at positions, interpolated between cells.
 
     Args:
-        log: the drives.
         layer: elevation in metres.
         row: row coordinate of each position, northward from the centre of the first
             cell, float64, shape [N].
-        column: column coordinate, eastward.
+        column: column coordinate, eastward from the same centre, shape [N].
 
     Returns:
-        Metres, float64, NaN off the cells, shape [N].
+        Elevation in metres, NaN off the cells, float64, shape [N].
     """
-    height, width = layer.warped.height - 2, layer.warped.width - 2
+    # Layers are padded by one cell.
+    height = layer.warped.height - 2
+    width = layer.warped.width - 2
     elevation_m = np.full(len(row), np.nan)
-    block = np.floor(np.clip(row, 0, height - 1) / _BLOCK_CELLS).astype(np.int64)
-    for start in np.unique(block) * _BLOCK_CELLS:
-        is_in_block = block == start // _BLOCK_CELLS
-        cells = layer.read(
-            range(start, min(start + _BLOCK_CELLS, height)), range(width)
-        )[0]
-        # cells are padded by one
-        positions = (
-            row[is_in_block] - start + 1,
-            column[is_in_block] + 1,
-        )
+    block = np.floor(np.clip(row, 0, height - 1) / _BLOCK_ROWS).astype(np.int64)
+    for index in np.unique(block).tolist():
+        is_in_block = block == index
+        start = index * _BLOCK_ROWS
+        stop = min(start + _BLOCK_ROWS, height)
+        cells_m = layer.read(range(start, stop), range(width))[0]
+        padded_row = row[is_in_block] - start + 1
+        padded_column = column[is_in_block] + 1
         elevation_m[is_in_block] = ndimage.map_coordinates(
-            cells, positions, order=1, cval=np.nan
+            cells_m, (padded_row, padded_column), order=1, cval=np.nan
         )
     return elevation_m
 
 
-def drive_over(
+def aggregate_drives(
     log: DriveLog, tiling: Tiling, row: ndarray, column: ndarray
 ) -> tuple[DriveLog, DrivenCells]:
     """Assign drives to splits, and aggregate λ over the rows on each cell.
@@ -196,29 +219,40 @@ def drive_over(
     Raises:
         DatasetError: If a split gets no drive.
     """
-    rows = log.rows.assign(row=row, column=column, split=tiling.split_of(row, column))
+    split_of_row = tiling.split_of(row, column)
+    rows = log.rows.assign(row=row, column=column, split=split_of_row)
     log = replace(log, rows=rows)
-    log = log.without("between_maps", (rows["split"] < 0).to_numpy())
-    splits = list(tiling.strips)
-    owner = _owners(log, splits)
-    log = log.without(
-        "other_split", log.rows["split"].to_numpy() != owner[log.rows["drive"]]
-    )
+    log = log.without("between_maps", split_of_row < 0)
+    owner = _owners(log, list(tiling.strips))
+    split_of_drive = owner[log.rows["drive"]]
+    is_elsewhere = log.rows["split"].to_numpy() != split_of_drive
+    log = log.without("other_split", is_elsewhere)
     width = tiling.cells[1]
     cell = log.rows["row"] * width + log.rows["column"]
     # Ratios below 0 or above 1 remain in the log, but stored λ is in [0, 1].
     stored = log.rows["traversability"].clip(*RATIO_LIMITS)
     driven = stored.groupby(cell).agg(["mean", "count", "std"])
-    return log, DrivenCells(
-        driven.index.to_numpy(), driven.to_numpy(np.float64).T, width
-    )
+    values = driven.to_numpy(np.float64).T
+    return log, DrivenCells(driven.index.to_numpy(), values, width)
 
 
 def describe_drives(log: DriveLog, splits: Sequence[str]) -> Json:
-    """Return the manifest entry of a log from `drive_over`: used and unused rows."""
-    by_split = {
-        split: log.rows[log.rows["split"] == index]
-        for index, split in enumerate(splits)
+    """Return the manifest entry of a log from `aggregate_drives`: used and unused rows."""
+    used = {}
+    drives = {}
+    for index, split in enumerate(splits):
+        rows = log.rows[log.rows["split"] == index]
+        used[split] = len(rows)
+        drives[split] = [log.names[drive] for drive in np.unique(rows["drive"])]
+    # `REASONS` has the order of the checks.
+    left_out = {
+        reason: log.left_out[reason] for reason in REASONS if reason in log.left_out
+    }
+    ratio = log.rows["traversability"]
+    beyond = {
+        "below_0": int((ratio < 0).sum()),
+        "above_1": int((ratio > 1).sum()),
+        "above_1.2": int((ratio > OVER_SPEED).sum()),
     }
     return {
         "file": Path(log.settings.file).name,
@@ -226,19 +260,10 @@ def describe_drives(log: DriveLog, splits: Sequence[str]) -> Json:
         "least_speed_m_s": log.settings.least_speed,
         "ratio_limits": list(RATIO_LIMITS),
         "rows": len(log.rows) + sum(log.left_out.values()),
-        "used": {split: len(rows) for split, rows in by_split.items()},
-        "left_out": {
-            reason: log.left_out[reason] for reason in REASONS if reason in log.left_out
-        },
-        "beyond": {
-            "below_0": int((log.rows["traversability"] < 0).sum()),
-            "above_1": int((log.rows["traversability"] > 1).sum()),
-            "above_1.2": int((log.rows["traversability"] > OVER_SPEED).sum()),
-        },
-        "drives": {
-            split: [log.names[drive] for drive in np.unique(rows["drive"])]
-            for split, rows in by_split.items()
-        },
+        "used": used,
+        "left_out": left_out,
+        "beyond": beyond,
+        "drives": drives,
         "speed": log.settings.speed,
         "pace": log.motion.get("pace"),
         "commanded_pace": log.motion.get("commanded_pace"),
@@ -252,25 +277,27 @@ def describe_drives(log: DriveLog, splits: Sequence[str]) -> Json:
 def _owners(log: DriveLog, splits: Sequence[str]) -> ndarray:
     """Return the split of each drive, index into the splits, shape [D].
 
-    Each split gets one drive, so that the fewest rows are lost. Other drives belong to
-    the split with most of their rows.
+    Each split gets one drive such that the fewest rows are lost. Any other drive
+    belongs to the split with most of its rows.
+
+    Raises:
+        DatasetError: If a split gets no drive.
     """
     counts = np.zeros((len(splits), len(log.names)))
     np.add.at(counts, (log.rows["split"], log.rows["drive"]), 1)
     owner = counts.argmax(axis=0)
-    lost = np.where(counts > 0, counts.max(axis=0) - counts, 2.0 * counts.sum() + 1)
-    chosen, drives = linear_sum_assignment(lost)
-    owner[drives] = chosen
-    empty = [
-        splits[split]
-        for split, drive in zip(chosen, drives, strict=True)
-        if counts[split, drive] == 0
-    ]
+    n_lost = counts.max(axis=0) - counts
+    impossible = 2.0 * counts.sum() + 1
+    costs = np.where(counts > 0, n_lost, impossible)
+    assigned, drives = linear_sum_assignment(costs)
+    owner[drives] = assigned
+    is_empty = counts[assigned, drives] == 0
+    empty = [splits[split] for split in assigned[is_empty]]
     if empty:
         raise DatasetError(
-            "Expected a drive of its own on the ground of each split, got none for "
+            "Expected a drive of its own on the terrain of each split, got none for "
             f"{', '.join(empty)} in "
-            f"{log.settings.file}. Take fewer --splits, other shares, smaller maps, "
-            "or drives over more ground."
+            f"{log.settings.file}. Take fewer --splits, other fractions, smaller maps, "
+            "or drives over more terrain."
         )
     return owner

@@ -3,13 +3,14 @@
 A row is a moment of a drive. Columns: `time_s`; the position, `x_m` and `y_m` in the
 coordinate reference system of the elevation model or `longitude_deg` and `latitude_deg`
 (WGS 84); `commanded_m_s` and `measured_m_s`, speeds forward over ground; optionally
-`drive`, its name. λ is measured over commanded speed, where the robot was commanded to
-move. The ratio of a row may lie beyond [0, 1]: robots slide back and run downhill. It
-is clipped only when it is stored.
+`drive`, its name. λ is the ratio of measured to commanded speed in rows with a command
+to move. The ratio of a row may lie beyond [0, 1], since robots slide back and run
+downhill. It is clipped only when it is stored.
+
 Letters in shapes: N rows that are used.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -28,37 +29,43 @@ from benchnav.datagen.files.robot_logs import (
     require_columns,
 )
 
-LEAST_SPEED_M_S = 0.1
-MOST_SPEED_M_S = (
-    15.0  # off-road robots are slower, unless they are logged in km/h or cm/s
-)
-TOP_RATIO = 1.5  # of a speed to the top command, which no robot exceeds (choice)
-_MOVES = ("commanded_m_s", "measured_m_s")
-_METRES_A_DEGREE = 111_320  # of latitude
-OVER_SPEED = 1.2  # of the command; noise and downhill driving seldom exceed it (choice)
-PLACES = {"crs": ("x_m", "y_m"), "WGS 84": ("longitude_deg", "latitude_deg")}
+# Thresholds that are a choice of this package are marked (choice).
+MIN_SPEED_M_S = 0.1
+# Off-road robots are slower, unless they are logged in km/h or cm/s.
+MAX_SPEED_M_S = 15.0
+TOP_RATIO = 1.5  # times the top command, which no robot exceeds (choice)
+# Times the command, which noise and downhill driving seldom exceed (choice).
+OVER_SPEED = 1.2
+# Ratios of distances by positions and by measured speed that count as equal (choice).
+PACE_LIMITS = (0.85, 1.15)
+MAX_FAULTY = 0.1  # maximum fraction of rows with faults of one kind (choice)
+POSITION_COLUMNS = {"crs": ("x_m", "y_m"), "WGS 84": ("longitude_deg", "latitude_deg")}
+_SPEED_COLUMNS = ("commanded_m_s", "measured_m_s")
+_METRES_PER_DEGREE = 111_320  # of latitude
+_LIMITS = {"longitude_deg": (-180.0, 360.0), "latitude_deg": (-90.0, 90.0)}
+_CLOCK = "Convert clock times to seconds, such as those since the start of the drive."
 
-# Why rows are left out, in the order of the checks.
+# Reasons why rows are left out, in the order of the checks.
 REASONS = {
-    "missing": "lack a value, or positions around them",
+    "missing": "lack a value, or neighbouring positions",
     "off_dem": "lie off the elevation model",
     "doubled": "repeat another row",
     "restarted": "have a time before an earlier row of their drive",
     "frozen": "have a position that stays the same while the robot moves",
     "jumped": f"have a position out of reach at {TOP_RATIO:g} times the top command",
-    "off_pace": "are of a drive whose positions and measured speed disagree by more "
+    "off_pace": "belong to a drive whose positions and measured speed disagree by more "
     "than 15 %",
-    "slow": "were commanded less than the least speed (standing, turning on the spot)",
-    "implausible": f"have a speed above {MOST_SPEED_M_S:g} m/s or above {TOP_RATIO:g} "
+    "slow": "were commanded less than the least speed (standing, turning in place)",
+    "implausible": f"have a speed above {MAX_SPEED_M_S:g} m/s or above {TOP_RATIO:g} "
     "times the top command",
     "between_maps": "lie between the maps",
-    "other_split": "lie on the ground of a split that their drive does not belong to",
+    "other_split": "lie on the terrain of a split that their drive does not belong to",
 }
 
 
 @dataclass(frozen=True, kw_only=True)
 class Drives:
-    """Log of drives, and its use.
+    """File of a log of drives, and the selection of its rows.
 
     Args:
         file: Table, CSV, TSV, one of these with .gz, or Parquet.
@@ -69,7 +76,7 @@ class Drives:
     """
 
     file: str
-    least_speed: float = LEAST_SPEED_M_S
+    least_speed: float = MIN_SPEED_M_S
     speed: Literal["", "positions", "measured"] = ""
 
     def __post_init__(self) -> None:
@@ -116,9 +123,14 @@ class DriveLog:
     motion: Mapping[str, Any] = field(default_factory=dict)
 
     @property
-    def places_m(self) -> ndarray:
-        """Positions northward and eastward, float64, shape [N, 2]."""
+    def positions_m(self) -> ndarray:
+        """Positions northward and eastward in metres, float64, shape [N, 2]."""
         return self.rows[["y", "x"]].to_numpy()
+
+    @property
+    def resolution_m(self) -> float:
+        """Resolution of positions in metres; 0 if it is fine or unknown."""
+        return float(self.motion.get("resolution_m", 0.0))
 
     def without(self, reason: str, mask: ndarray) -> "DriveLog":
         """Return the log without some rows.
@@ -132,25 +144,23 @@ class DriveLog:
         """
         left_out = {**self.left_out, reason: int(mask.sum())}
         if mask.all():
-            several = [
-                f"{count} {REASONS[name]}" for name, count in left_out.items() if count
-            ]
-            why = (
-                f": of {sum(left_out.values())}, {', '.join(several)}"
-                if several
-                else " below the header"
-            )
-            speeds = (
-                "commanded speed"
-                if self.settings.speed == "positions"
-                else "both speeds"
-            )
-            raise DatasetError(
-                f"Expected rows of drives to learn from in {self.settings.file}, got "
-                f"none{why}. Log time, position and {speeds} on the move."
-            )
+            raise self._error_of_no_row(left_out)
         rows = self.rows[~mask].reset_index(drop=True)
         return replace(self, rows=rows, left_out=left_out)
+
+    def _error_of_no_row(self, left_out: Mapping[str, int]) -> DatasetError:
+        counts = {name: count for name, count in left_out.items() if count}
+        why = " below the header"
+        if counts:
+            reasons = [f"{count} {REASONS[name]}" for name, count in counts.items()]
+            why = f": of {sum(counts.values())}, {', '.join(reasons)}"
+        speeds = "both speeds"
+        if self.settings.speed == "positions":
+            speeds = "commanded speed"
+        return DatasetError(
+            f"Expected rows of drives to learn from in {self.settings.file}, got "
+            f"none{why}. Log time, position and {speeds} on the move."
+        )
 
 
 def read_drives(drives: Drives) -> DriveLog:
@@ -160,84 +170,91 @@ def read_drives(drives: Drives) -> DriveLog:
 
     Raises:
         DatasetError: If the file is missing, cannot be read, lacks a column, contains
-            values that are not numbers, has speeds in another unit, or no row remains.
+            invalid numbers, has speeds in another unit, or no row remains.
     """
     path = Path(drives.file)
     rows = read_log(path)
-    kind = (
-        "WGS 84"
-        if set(PLACES["WGS 84"]) <= set(rows) and not set(PLACES["crs"]) <= set(rows)
-        else "crs"
-    )
-    moves = _MOVES[:1] if drives.speed == "positions" else _MOVES
-    columns = ("time_s", *PLACES[kind], *moves)
-    remedy = "Name positions x_m and y_m, or longitude_deg and latitude_deg for WGS 84."
-    if set(PLACES[kind]) <= set(rows):
-        remedy = (
-            "Log speed over ground, or pass --speed positions."
-            if set(_MOVES) - set(rows) == {"measured_m_s"}
-            else ""
-        )
-    require_columns(rows, columns, path, remedy)
-    limits = {"longitude_deg": (-180.0, 360.0), "latitude_deg": (-90.0, 90.0)}
-    remedy = "Swap `longitude_deg` and `latitude_deg`, or convert to degrees."
-    values = {}
-    for name in columns:
-        number = "Convert the column to numbers."
-        if name == "time_s":
-            number = (
-                "Convert clock times to seconds, such as those since the start "
-                "of the drive."
-            )
-        values[name] = read_numbers(
-            rows, name, path, limits.get(name, (-np.inf, np.inf)), remedy, number
-        )
-    for name in moves:
-        moving = np.abs(values[name])
-        usual = pd.Series(moving[moving >= drives.least_speed]).median()
-        if usual > MOST_SPEED_M_S:
+    by_positions = drives.speed == "positions"
+    speed_names = _SPEED_COLUMNS[:1] if by_positions else _SPEED_COLUMNS
+    has_crs = set(POSITION_COLUMNS["crs"]) <= set(rows)
+    is_geographic = not has_crs and set(POSITION_COLUMNS["WGS 84"]) <= set(rows)
+    position_names = POSITION_COLUMNS["WGS 84" if is_geographic else "crs"]
+    columns = ("time_s", *position_names, *speed_names)
+    _require_columns(rows, columns, path)
+    values = {name: _read_column(rows, name, path) for name in columns}
+    for name in speed_names:
+        speed = np.abs(values[name])
+        moving = speed[speed >= drives.least_speed]
+        usual = pd.Series(moving).median()
+        if usual > MAX_SPEED_M_S:
             raise DatasetError(
                 f"Expected `{name}` in m/s in {path}, got a median of {usual:.4g} "
                 "while moving, which looks like "
                 "another unit. Divide km/h by 3.6, cm/s by 100 and mm/s by 1000."
             )
-    names, drive = np.array([path.name]), np.zeros(len(rows), dtype=np.int64)
+    drive_names = np.array([path.name])
+    drive = np.zeros(len(rows), dtype=np.int64)
     if "drive" in rows:
-        names, drive = np.unique(read_names(rows, "drive", path), return_inverse=True)
-    x, y = (values[name] for name in PLACES[kind])
-    unmeasured = np.full(len(rows), np.nan)
-    if (
-        drives.speed == "positions" and "measured_m_s" in rows
-    ):  # only for the comparison
-        unmeasured = read_numbers(rows, "measured_m_s", path, (-np.inf, np.inf))
+        names_by_row = read_names(rows, "drive", path)
+        drive_names, drive = np.unique(names_by_row, return_inverse=True)
+    x, y = (values[name] for name in position_names)
+    measured = values.get("measured_m_s", np.full(len(rows), np.nan))
+    if by_positions and "measured_m_s" in rows:
+        # It only serves for the comparison with positions.
+        measured = read_numbers(rows, "measured_m_s", path, (-np.inf, np.inf))
+    table = pd.DataFrame(
+        {
+            "x": x,
+            "y": y,
+            "time_s": values["time_s"],
+            "commanded": values["commanded_m_s"],
+            "speed": measured,
+            "drive": drive,
+        }
+    )
+    resolution_m = _resolution_m(x, y, is_geographic=is_geographic)
     log = DriveLog(
         settings=drives,
         sha256=digest_of_path(path),
-        names=tuple(map(str, names)),
-        is_geographic=kind == "WGS 84",
-        rows=pd.DataFrame(
-            {
-                "x": x,
-                "y": y,
-                "time_s": values["time_s"],
-                "commanded": values["commanded_m_s"],
-                "speed": values.get("measured_m_s", unmeasured),
-                "drive": drive,
-            }
-        ),
-        motion={"resolution_m": _resolution_m(x, y, is_geographic=kind == "WGS 84")},
+        names=tuple(map(str, drive_names)),
+        is_geographic=is_geographic,
+        rows=table,
+        motion={"resolution_m": resolution_m},
     )
-    return log.without("missing", np.isnan(np.stack([*values.values()])).any(axis=0))
+    is_missing = np.isnan(np.stack([*values.values()])).any(axis=0)
+    return log.without("missing", is_missing)
+
+
+def _require_columns(rows: pd.DataFrame, columns: Sequence[str], path: Path) -> None:
+    """Check that a log has all columns, or raise an error with a remedy."""
+    missing = set(columns) - set(rows)
+    remedy = "Name positions x_m and y_m, or longitude_deg and latitude_deg for WGS 84."
+    if missing.isdisjoint((*POSITION_COLUMNS["crs"], *POSITION_COLUMNS["WGS 84"])):
+        remedy = ""
+        if missing & {*_SPEED_COLUMNS} == {"measured_m_s"}:
+            remedy = "Log speed over ground, or pass --speed positions."
+    require_columns(rows, columns, path, remedy)
+
+
+def _read_column(rows: pd.DataFrame, name: str, path: Path) -> ndarray:
+    """Return the numbers of a column, or raise an error with a remedy."""
+    limits = _LIMITS.get(name, (-np.inf, np.inf))
+    swapped = "Swap `longitude_deg` and `latitude_deg`, or convert to degrees."
+    number = "Convert the column to numbers."
+    if name == "time_s":
+        number = _CLOCK
+    return read_numbers(rows, name, path, limits, swapped, number)
 
 
 def _resolution_m(x: ndarray, y: ndarray, *, is_geographic: bool) -> float:
     """Return the largest step that divides all positions; 0 below some centimetres."""
     max_decimals = 6 if is_geographic else 2
+    metres = _METRES_PER_DEGREE if is_geographic else 1
     for decimals in range(max_decimals):
         scaled = np.stack([x, y]) * 10.0**decimals
         scaled = scaled[:, np.isfinite(scaled).all(axis=0)]
-        if scaled.size and (np.abs(scaled - np.rint(scaled)) < 1e-3).all():
-            return float(
-                f"{10.0**-decimals * (_METRES_A_DEGREE if is_geographic else 1):.3g}"
-            )
+        distance = np.abs(scaled - np.rint(scaled))
+        if scaled.size and (distance < 1e-3).all():
+            step_m = 10.0**-decimals * metres
+            return float(f"{step_m:.3g}")
     return 0.0

@@ -6,19 +6,19 @@ import pandas as pd
 
 from benchnav.datagen.dem.drive_tracks import MIN_SPANS, spans_of, track_of
 
-_UNIT_TOLERANCE = 0.08  # of a ratio to that of a unit (choice)
-_PLAUSIBLE = (0.05, 1.3)  # λ of a whole log (choice)
-# of positions to the command, beyond which a time is in another unit (choice)
-_COMMAND_LIMITS = (
-    _PLAUSIBLE[0],
-    5.0,
-)
-# quantile of the spans of a log, some of which may show an immobilised robot (choice)
+# Thresholds are choices of this package.
+_UNIT_TOLERANCE = 0.08  # relative error of a ratio that counts as that of a unit
+_MIN_LAMBDA = 0.05  # minimum and maximum λ of a whole log
+_MAX_LAMBDA = 1.3
+# A larger ratio of positions to the command shows that a time is in another unit.
+_MAX_COMMAND_RATIO = 5.0
+# Quantile of a log's spans, since some may show an immobilised robot.
 _FASTEST = 0.95
-_SLIPS = 0.9  # of measured to commanded speed, which is not that of wheels (choice)
-_COARSE = 0.25  # of a span's distance (choice)
+# Below this ratio of measured to commanded speed, measured speed is not that of wheels.
+_SLIPS = 0.9
+_COARSE = 0.25  # maximum resolution of positions over the distance of a span
 
-# The ratio of positions to measured speed that each unit gives.
+# Ratio of positions to measured speed, by the unit of speed.
 _SPEEDS = {
     "knots": 0.5144,
     "km/h": 1 / 3.6,
@@ -26,6 +26,7 @@ _SPEEDS = {
     "ft/s": 1 / 3.281,
     "cm/s": 0.01,
 }
+# Seconds in each unit of time.
 _TIMES = {
     "milliseconds": 1e-3,
     "microseconds": 1e-6,
@@ -33,29 +34,35 @@ _TIMES = {
     "minutes": 60.0,
     "hours": 3600.0,
 }
+# Units of length per metre.
 _LENGTHS = {"feet": 3.281, "centimetres": 100.0, "millimetres": 1000.0}
+_NO_UNIT = "no known unit"
 _METRES = "Bring speeds to m/s, times to s and positions to m"
 
 
-def median_ratio(spans: pd.DataFrame, of: str) -> float:
+def median_ratio(spans: pd.DataFrame, speed: str) -> float:
     """Return the median ratio of distances by positions and by a speed.
 
-    Only straight spans count, if they suffice.
+    If there are enough straight spans, only these count.
+
+    Args:
+        spans: spans from `drive_tracks.spans_of`.
+        speed: column of the distance by speed, `measured` or `commanded`.
     """
-    spans = spans[spans["is_moving"] & spans[of].notna()]
-    straight = spans[spans["is_straight"]]
-    chosen = straight if len(straight) >= MIN_SPANS else spans
-    return float((chosen["moved"] / chosen[of]).median())
+    usable = spans[spans["is_moving"] & spans[speed].notna()]
+    straight = usable[usable["is_straight"]]
+    chosen = straight if len(straight) >= MIN_SPANS else usable
+    ratio = chosen["moved"] / chosen[speed]
+    return float(ratio.median())
 
 
 def no_unit(spans: pd.DataFrame, resolution_m: float) -> str:
     """Return the text of messages if no unit fits, with the reason."""
-    why = ""
-    if _is_winding(spans):
-        why = ", since the track winds between positions"
     if is_coarse(spans, resolution_m):
-        why = f", since positions are multiples of {resolution_m:.2g} m"
-    return "no unit that is known" + why
+        return f"{_NO_UNIT}, since positions are multiples of {resolution_m:.2g} m"
+    if _is_winding(spans):
+        return f"{_NO_UNIT}, since the track winds between positions"
+    return _NO_UNIT
 
 
 def _n_straight(spans: pd.DataFrame) -> int:
@@ -64,15 +71,18 @@ def _n_straight(spans: pd.DataFrame) -> int:
 
 def _is_winding(spans: pd.DataFrame) -> bool:
     """Return whether the track winds between positions, which shortens distances."""
-    return (
-        _n_straight(spans) < min(MIN_SPANS, len(spans))
-        and median_ratio(spans, "measured") < 1
-    )
+    min_straight = min(MIN_SPANS, len(spans))
+    return _n_straight(spans) < min_straight and median_ratio(spans, "measured") < 1
 
 
 def is_coarse(spans: pd.DataFrame, resolution_m: float) -> bool:
     """Return whether positions have too few decimals to measure a span's distance."""
-    return bool(resolution_m > _COARSE * spans["commanded"].median())
+    distance_m = spans["commanded"].median()
+    return bool(resolution_m > _COARSE * distance_m)
+
+
+def _is_plausible(traversability: float) -> bool:
+    return _MIN_LAMBDA <= traversability <= _MAX_LAMBDA
 
 
 def unit_of(
@@ -88,49 +98,49 @@ def unit_of(
     Args:
         rows: rows of a log.
         spans: spans of these rows.
-        least_speed: minimum command of spans that count, in m/s.
+        least_speed: minimum commanded speed of spans that count [m/s].
         is_geographic: whether positions are angles, which have no other unit.
         resolution_m: resolution of positions in metres.
 
     Returns:
-        The unit, empty if none fits; the remedy without a full stop; whether it is a
+        The unit, empty if no unit fits; the remedy without a full stop; whether it is a
         unit of times or positions.
     """
-    ratio, by_command = (
-        median_ratio(spans, name) for name in ("measured", "commanded")
-    )
-    # Times and positions are off against the command too, a measured speed is not.
-    is_plausible = _PLAUSIBLE[0] <= by_command <= _PLAUSIBLE[1]
-    for name, value in _TIMES.items():
-        # Spans of 2 s are others in another unit, and their arcs too.
-        if (
-            abs(median_ratio(_in_seconds(rows, value, least_speed), "measured") - 1)
-            <= _UNIT_TOLERANCE
-        ):
-            return name, f"Multiply `time_s` by {value:.4g}", True
-    if not is_plausible:
-        for name, value in {} if is_geographic else _LENGTHS.items():
-            if abs(ratio / value - 1) <= _UNIT_TOLERANCE:
+    ratio = median_ratio(spans, "measured")
+    for name, seconds in _TIMES.items():
+        # In another unit, a span of 2 s has other rows and arcs.
+        in_unit = _in_seconds(rows, seconds, least_speed)
+        if _is_close(median_ratio(in_unit, "measured"), 1):
+            return name, f"Multiply `time_s` by {seconds:.4g}", True
+    # A wrong unit of positions also changes the ratio to the command, in contrast to a
+    # wrong unit of measured speed.
+    by_command = median_ratio(spans, "commanded")
+    if not _is_plausible(by_command) and not is_geographic:
+        for name, value in _LENGTHS.items():
+            if _is_close(ratio, value):
                 return name, f"Multiply `x_m` and `y_m` by {1 / value:.4g}", True
     if is_coarse(spans, resolution_m):
         return "", "Log positions with more decimals", False
     if _is_winding(spans):
         return "", f"{_METRES}, log positions more often", False
-    for name, value in sorted(
-        _SPEEDS.items(), key=lambda item: abs(ratio / item[1] - 1)
-    ):
-        if (
-            abs(ratio / value - 1) <= _UNIT_TOLERANCE
-            and _n_straight(spans) >= MIN_SPANS
-        ):
+    if _n_straight(spans) >= MIN_SPANS:
+        errors = {name: abs(ratio / value - 1) for name, value in _SPEEDS.items()}
+        name = min(errors, key=errors.__getitem__)
+        if errors[name] <= _UNIT_TOLERANCE:
+            value = _SPEEDS[name]
             also = f" (`commanded_m_s` too, if it is in {name})"
             return name, f"Multiply `measured_m_s` by {value:.4g}{also}", False
     return "", _METRES, False
 
 
-def _in_seconds(rows: pd.DataFrame, value: float, least_speed: float) -> pd.DataFrame:
-    """Return the spans of rows whose times are in a unit of `value` seconds."""
-    return spans_of(track_of(rows.assign(time_s=rows["time_s"] * value)), least_speed)
+def _is_close(ratio: float, expected: float) -> bool:
+    return abs(ratio / expected - 1) <= _UNIT_TOLERANCE
+
+
+def _in_seconds(rows: pd.DataFrame, seconds: float, least_speed: float) -> pd.DataFrame:
+    """Return the spans of rows whose unit of time lasts `seconds`."""
+    in_seconds = rows.assign(time_s=rows["time_s"] * seconds)
+    return spans_of(track_of(in_seconds), least_speed)
 
 
 def unit_of_command(
@@ -143,7 +153,7 @@ def unit_of_command(
     Args:
         rows: rows of a log.
         spans: spans of these rows.
-        least_speed: minimum command of spans that count, in m/s.
+        least_speed: minimum commanded speed of spans that count [m/s].
         is_geographic: whether positions are angles, which have no other unit.
 
     Returns:
@@ -151,36 +161,38 @@ def unit_of_command(
         λ.
     """
     ratios = spans["moved"] / spans["commanded"]
-    ratio, fastest = float(ratios.median()), float(ratios.quantile(_FASTEST))
-    if (
-        spans["measured"] / spans["commanded"]
-    ).median() < _SLIPS:  # so that the robot did move at that speed
+    ratio = float(ratios.median())
+    fastest = float(ratios.quantile(_FASTEST))
+    measured_ratio = (spans["measured"] / spans["commanded"]).median()
+    if measured_ratio < _SLIPS:  # measured speed confirms that the robot was slow
         fastest = ratio
-    is_slow, is_fast = fastest < _COMMAND_LIMITS[0], ratio > _COMMAND_LIMITS[1]
-    if math.isnan(ratio) or not (is_slow or ratio > _PLAUSIBLE[1]):
+    is_slow = fastest < _MIN_LAMBDA
+    is_fast = ratio > _MAX_COMMAND_RATIO
+    if math.isnan(ratio) or not (is_slow or ratio > _MAX_LAMBDA):
         return None
-    units, remedies = [], []
-    for name, value in _TIMES.items():
-        in_unit = _in_seconds(rows, value, least_speed)
+    units = []
+    remedies = []
+    for name, seconds in _TIMES.items():
+        in_unit = _in_seconds(rows, seconds, least_speed)
         traversability = float((in_unit["moved"] / in_unit["commanded"]).median())
-        is_off = is_slow if value < 1 else traversability * value > _COMMAND_LIMITS[1]
-        if is_off and _PLAUSIBLE[0] <= traversability <= _PLAUSIBLE[1]:
+        is_off = is_slow
+        if seconds >= 1:
+            is_off = traversability * seconds > _MAX_COMMAND_RATIO
+        if is_off and _is_plausible(traversability):
             units.append(name)
-            remedies.append(f"multiply `time_s` by {value:.4g}")
-    for name, value in _LENGTHS.items() if is_fast and not is_geographic else ():
-        if _PLAUSIBLE[0] <= ratio / value <= _PLAUSIBLE[1]:
-            units.append(name)
-            remedies.append(f"multiply `x_m` and `y_m` by {1 / value:.4g}")
+            remedies.append(f"multiply `time_s` by {seconds:.4g}")
+    if is_fast and not is_geographic:
+        for name, value in _LENGTHS.items():
+            if _is_plausible(ratio / value):
+                units.append(name)
+                remedies.append(f"multiply `x_m` and `y_m` by {1 / value:.4g}")
     if not (units or is_slow or is_fast):
         return None
     if not units:
+        units = [_NO_UNIT]
         remedies = [
             "log `time_s` in seconds and positions in metres, or `measured_m_s` where "
             "the robot was immobilised"
         ]
     remedy = " or ".join(remedies)
-    return (
-        ratio,
-        " or ".join(units) or "no unit that is known",
-        remedy[0].upper() + remedy[1:],
-    )
+    return ratio, " or ".join(units), remedy[0].upper() + remedy[1:]

@@ -1,7 +1,7 @@
 """Import of real data: rasters become maps of the dataset schema.
 
-Slopes follow from the real elevation, also at a map's edges, where the surrounding
-elevation is read. The recipe provides what the rasters do not contain. The true
+Slopes follow from the real elevation. For those at a map's edges, the surrounding
+elevation is read too. The recipe provides what the rasters do not contain. The true
 distribution of λ in real terrain is unknown, and the dataset records this;
 `Terrain.truth` is then the distribution of the recipe's class table.
 
@@ -9,7 +9,7 @@ Overlapping maps contain the same cells. They are stored with a `group`, the sta
 unit: maps of one group overlap, directly or through other maps, and maps of two groups
 do not. If all maps of a split are connected, it is one group, and statistics have one
 unit. To cut such terrain into smaller groups, maps between them must be omitted. This
-gives no more units than adjacent maps without overlap.
+yields no more units than adjacent maps without overlap.
 """
 
 import hashlib
@@ -22,12 +22,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy import ndarray
 
 from benchnav.core.errors import DatasetError, expect
 from benchnav.core.store import building, real_place
+from benchnav.datagen.dem.crs import load_rasterio
 from benchnav.datagen.dem.drive_log import Drives
-from benchnav.datagen.dem.extent import MAX_RELIEF_M
-from benchnav.datagen.dem.raster import Cut, Rasters, load_rasterio
+from benchnav.datagen.dem.options import Cut, Rasters
+from benchnav.datagen.dem.recipe_fit import MAX_RELIEF_M
 from benchnav.datagen.dem.survey import Survey
 from benchnav.datagen.dem.tiling import Run
 from benchnav.datagen.files.create import SHARD_CELLS
@@ -52,7 +54,7 @@ from benchnav.datagen.schema import (
 from benchnav.datagen.synth.generate import class_map, complete, reference_time_s
 
 _CELLS_AT_ONCE = 2**20
-# Cache of GDAL for rasters; its default grows with the machine.
+# Cache of GDAL for rasters. Its default grows with the machine's memory.
 _CACHE_BYTES = 2**29
 
 # Reasons why maps are left out, in the order of the checks.
@@ -60,12 +62,18 @@ REASONS = {
     "not_driven": "have no cell that a drive of their split crossed",
     "missing_elevation": "have cells without elevation",
     "too_rough": f"span more than {MAX_RELIEF_M:g} m of elevation",
-    "missing_classes": "have no cell with a class or measured λ, or have cells with "
-    "neither class nor photo",
+    "missing_classes": (
+        "have no cell with a class or measured λ, or have cells with neither class nor "
+        "photo"
+    ),
     "missing_colours": "have cells without colour",
     "not_solvable": "have a goal that cannot be reached",
 }
-_LACKING = {
+# Records of each map: its index, its lowest elevation, and its number of unlabelled
+# cells.
+_RECORDS = ("kept", "lowest_m", "unlabelled")
+# Input without which a map is left out, by reason.
+_REQUIRED = {
     "not_driven": "drive_count",
     "missing_elevation": "dem",
     "missing_classes": "classes",
@@ -86,15 +94,15 @@ def import_dem(
 ) -> Iterator[tuple[int, int]]:
     """Create a dataset from rasters; yield (maps done, total maps).
 
-    Iterate to the end. Maps that lack elevation or colour in some cells are left out.
-    Cells may lack a class, measured λ or values of layers. A map's random numbers
-    depend on its index in the terrain, and not on other maps that are left out.
+    Iterate to the end. Maps are left out if elevation or colour is missing in some
+    cells. A class, measured λ or values of layers may be missing in cells. A map's
+    random numbers depend on its index in the terrain, and not on omitted maps.
 
     Args:
-        dem: elevations, by any name that rasterio opens.
+        dem: raster of elevations, by any name that rasterio opens.
         out: file to write, of suffix `.h5` or `.hdf5`; else a folder.
-        recipe: id of the dataset, size, resolution, start and goal of the maps, class
-            table, light, seed.
+        recipe: recipe with the id of the dataset, the maps' size, resolution, start and
+            goal, the class table, the light and the seed.
         rasters: rasters of classes, colours, λ and layers.
         drives: log of drives, the source of λ. The maps are cut around its positions;
             maps without a driven cell are left out.
@@ -114,13 +122,13 @@ def import_dem(
     )
     expect(
         not (cut.solvable and rasters.unlabelled),
-        "`classes` with `solvable`, which goes by the class table, got none. Leave "
+        "`classes` with `solvable`, which depends on the class table, got none. Leave "
         "`solvable` out, or pass --classes.",
     )
     affecting = [spec.name for spec in recipe.layers if spec.affects]
     expect(
         not affecting,
-        "a recipe whose `layers` leave λ as it is, since an import draws none, got "
+        "a recipe whose `layers` do not change λ, since an import draws no layers, got "
         f"{', '.join(affecting)}.",
     )
     out = real_place(out)
@@ -140,40 +148,43 @@ def import_dem(
             parts[run.split].add(run)
             done += len(run.columns)
             yield done, survey.tiling.maps
-        for name in set(survey.fields) - survey.valued:
-            raster = survey.layers[f"layer {name}"].raster.name
-            raise DatasetError(
-                f"Expected `layer {name}` with a value on some map, got none in "
-                f"{raster}."
-            )
-        for part in parts.values():
+        _check_valued(survey)
+        sizes = {}
+        entries = {}
+        files = {}
+        for name, part in parts.items():
             part.finish()
-        sizes = {
-            name: replace(splits[name], maps=len(part.records["kept"]))
-            for name, part in parts.items()
-        }
+            sizes[name] = replace(splits[name], maps=len(part.records["kept"]))
+            entries[name] = part.entry()
+            files[name] = [folder / shard.name for shard in part.shards]
         contents = Contents(
             id=recipe.id,
             recipes=[replace(recipe, splits=sizes)],
-            splits={name: part.entry() for name, part in parts.items()},
-            files={
-                name: [folder / shard.name for shard in part.shards]
-                for name, part in parts.items()
-            },
+            splits=entries,
+            files=files,
             fields=_fields_of(survey),
         )
         assemble(contents, folder, out)
 
 
-def _fields_of(ground: Survey) -> Fields:
+def _check_valued(survey: Survey) -> None:
+    """Check that each layer has a value on some map."""
+    for name in set(survey.fields) - survey.valued:
+        raster = survey.layers[f"layer {name}"].raster.name
+        raise DatasetError(
+            f"Expected `layer {name}` with a value on some map, got none in {raster}."
+        )
+
+
+def _fields_of(survey: Survey) -> Fields:
     """Return the fields of the maps; groups are added when all maps exist."""
     names = []
-    if ground.tiling.overlaps:
+    if survey.tiling.overlaps:
         names.append("group")
-    if ground.driven is not None:
+    if survey.driven is not None:
         names += ["drive_count", "drive_std"]
     optional = {name: OPTIONAL[name] for name in OPTIONAL if name in names}
-    return FIELDS | optional | ground.fields
+    return FIELDS | optional | survey.fields
 
 
 @dataclass
@@ -183,9 +194,9 @@ class _Part:
     name: str
     recipe: Recipe
     folder: Path
-    ground: Survey
+    survey: Survey
     records: dict[str, list[Any]] = field(
-        default_factory=lambda: {"kept": [], "lowest_m": [], "unlabelled": []}
+        default_factory=lambda: {name: [] for name in _RECORDS}
     )
     left_out: Counter[str] = field(default_factory=Counter)
     shards: list[ShardFile] = field(default_factory=list)
@@ -193,47 +204,58 @@ class _Part:
 
     def add(self, run: Run) -> None:
         """Add the valid maps of a run, count the others, and write full shards."""
-        recipe = self.recipe
-        padded_m, inputs = self.ground.read(run)
-        is_valid = np.ones(len(run.columns), dtype=bool)
-        lacking = {
-            name: np.isnan(values).any(axis=(1, 2, 3))
-            for name, values in inputs.items()
-        }
-        # Without a photo, a cell has the colour of its class.
-        if "classes" in inputs and "photo" in inputs:
-            # Models can learn from measured λ without a class.
-            measured = inputs.get("traversability", np.nan)
-            is_useless = np.isnan(inputs["classes"]) & np.isnan(measured)
-            lacking["classes"] = is_useless.all(axis=(1, 2, 3))
-        if "drive_count" in inputs:
-            lacking["drive_count"] = (inputs["drive_count"] == 0).all(axis=(1, 2, 3))
-        for reason, name in _LACKING.items():
+        padded_m, inputs = self.survey.read(run)
+        is_valid = self._count_invalid(padded_m, inputs)
+        if not is_valid.any():
+            return
+        first = run.row * self.survey.tiling.tiles[1]
+        indices = first + np.array(run.columns)
+        valid_inputs = {name: values[is_valid] for name, values in inputs.items()}
+        maps = self._maps_of(indices[is_valid], padded_m[is_valid], valid_inputs)
+        is_solved = ~np.isinf(maps["reference_time_s"])
+        self.left_out["not_solvable"] += int((~is_solved).sum())
+        names = [name for name in _fields_of(self.survey) if name != "group"]
+        names += [f"record {name}" for name in _RECORDS]
+        self.pending.append({name: maps[name][is_solved] for name in names})
+        n_cells = sum(maps["class_id"].size for maps in self.pending)
+        if n_cells >= SHARD_CELLS:
+            self._flush()
+
+    def _count_invalid(self, padded_m: ndarray, inputs: Maps) -> ndarray:
+        """Return a mask of valid maps, bool, shape [B]; count the others by reason."""
+        is_valid = np.ones(len(padded_m), dtype=bool)
+        lacking = _lacking(inputs)
+        for reason, name in _REQUIRED.items():
             if name in lacking:
                 self.left_out[reason] += int((is_valid & lacking[name]).sum())
                 is_valid &= ~lacking[name]
         relief_m = np.ptp(padded_m[:, 1:-1, 1:-1], axis=(1, 2))
-        rough = is_valid & (relief_m > MAX_RELIEF_M)
-        if rough.any():
-            self.left_out["too_rough"] += int(rough.sum())
-            is_valid &= ~rough
-        first = run.row * self.ground.tiling.tiles[1]
-        indices = (first + np.array(run.columns))[is_valid]
-        if not len(indices):
-            return
-        padded_m = quantise(padded_m[is_valid], 13)
-        inputs = {name: values[is_valid] for name, values in inputs.items()}
+        is_rough = is_valid & (relief_m > MAX_RELIEF_M)
+        if is_rough.any():
+            self.left_out["too_rough"] += int(is_rough.sum())
+        return is_valid & ~is_rough
+
+    def _maps_of(self, indices: ndarray, padded_m: ndarray, inputs: Maps) -> Maps:
+        """Return complete maps with their records, in the dtypes of the fields.
+
+        Args:
+            indices: indices of the maps in the terrain, shape [B].
+            padded_m: elevation, padded by one cell, shape [B, H + 2, W + 2].
+            inputs: values by the names of `Survey.read`, each of shape [B, K, H, W].
+        """
+        recipe = self.recipe
+        padded_m = quantise(padded_m, 13)
         lowest_m = padded_m[:, 1:-1, 1:-1].min(axis=(1, 2))
+        height_m = padded_m - lowest_m[:, None, None]
         class_id = class_map(recipe, self.name, indices)
         if "classes" in inputs:
             class_id = np.nan_to_num(inputs["classes"][:, 0], nan=UNLABELLED)
             class_id = class_id.astype(np.int64)
-        labelled = class_id != UNLABELLED
-        height_m = padded_m - lowest_m[:, None, None]
-        filled_id = np.where(labelled, class_id, 0)
+        is_labelled = class_id != UNLABELLED
+        filled_id = np.where(is_labelled, class_id, 0)
         maps = complete(recipe, self.name, indices, filled_id, height_m)
         maps["class_id"] = class_id
-        maps["traversability"] = np.where(labelled, maps["traversability"], np.nan)
+        maps["traversability"] = np.where(is_labelled, maps["traversability"], np.nan)
         if "classes" in inputs:
             maps["environment"] = np.zeros(len(indices))
         if "photo" in inputs:
@@ -246,21 +268,15 @@ class _Part:
         maps["reference_time_s"] = np.full(len(indices), np.nan)
         if recipe.splits[self.name].solvable:
             maps["reference_time_s"] = reference_time_s(recipe, maps)
-        solved = ~np.isinf(maps["reference_time_s"])
-        self.left_out["not_solvable"] += int((~solved).sum())
-        for name in self.ground.fields:
+        for name in self.survey.fields:
             maps[name] = inputs[f"layer {name}"][:, 0]
-        fields = dict(_fields_of(self.ground))
-        fields.pop("group", None)
-        stored = {
-            name: maps[name].astype(field.dtype) for name, field in fields.items()
-        }
-        stored["record kept"] = indices
-        stored["record lowest_m"] = lowest_m
-        stored["record unlabelled"] = (~labelled).sum(axis=(1, 2))
-        self.pending.append({name: values[solved] for name, values in stored.items()})
-        if sum(maps["class_id"].size for maps in self.pending) >= SHARD_CELLS:
-            self._flush()
+        for name, stored_field in _fields_of(self.survey).items():
+            if name in maps:
+                maps[name] = maps[name].astype(stored_field.dtype)
+        maps["record kept"] = indices
+        maps["record lowest_m"] = lowest_m
+        maps["record unlabelled"] = (~is_labelled).sum(axis=(1, 2))
+        return maps
 
     def finish(self) -> None:
         """Write pending maps, and groups of overlapping maps.
@@ -271,34 +287,34 @@ class _Part:
         if self.pending:
             self._flush()
         if not self.records["kept"]:
-            reasons = [
-                f"{count} {REASONS[reason]}"
-                for reason, count in self.left_out.items()
-                if count
-            ]
+            reasons = []
+            for reason, count in self.left_out.items():
+                if count:
+                    reasons.append(f"{count} {REASONS[reason]}")
             raise DatasetError(
                 f"Expected split {self.name!r} to get at least one map, got none from "
-                f"{self.ground.layers['dem'].raster.name}: of "
+                f"{self.survey.layers['dem'].raster.name}: of "
                 f"{self.left_out.total()}, {', '.join(reasons)}. Fill the gaps, or "
-                "take smaller maps, other shares or a recipe of easier ground."
+                "take smaller maps, other fractions or a recipe of easier terrain."
             )
-        if self.ground.tiling.overlaps:
+        if self.survey.tiling.overlaps:
             self._add_groups()
 
     def _flush(self) -> None:
+        """Write the pending maps to a shard."""
         maps = join_maps(self.pending)
+        self.pending = []
         first = len(self.records["kept"])
         for name, values in self.records.items():
             values += maps.pop(f"record {name}").tolist()
         shard = ShardFile(self.name, first, len(self.records["kept"]))
-        self.pending = []
         if shard.maps:
             self.shards.append(shard)
             self._write(shard, maps)
 
     def _write(self, shard: ShardFile, maps: Maps) -> None:
         entry = self.entry(shard.first, shard.stop)
-        content = pack(self.recipe, self.name, entry, maps, _fields_of(self.ground))
+        content = pack(self.recipe, self.name, entry, maps, _fields_of(self.survey))
         (self.folder / shard.name).write_bytes(content)
 
     def _add_groups(self) -> None:
@@ -307,34 +323,49 @@ class _Part:
         The number of a group is a digest of the terrain and its first map. Groups can
         therefore be merged: numbers are equal only on the same terrain.
         """
-        source = self.ground.source
+        source = self.survey.source
         keys = ("file", "sha256", "crs", "origin_m", "stride_m")
         terrain = [source[key] for key in keys]
-        terrain += self.ground.tiling.shape
-        firsts = self.ground.tiling.groups(self.records["kept"]).tolist()
-        texts = (json.dumps([*terrain, first]).encode() for first in firsts)
-        numbers = np.array(
-            [int(hashlib.sha256(text).hexdigest()[:13], 16) for text in texts]
-        )
+        terrain += self.survey.tiling.shape
+        numbers = []
+        for first in self.survey.tiling.groups(self.records["kept"]).tolist():
+            text = json.dumps([*terrain, first])
+            digest = hashlib.sha256(text.encode()).hexdigest()
+            numbers.append(int(digest[:13], 16))
         for shard in self.shards:
             maps = TerrainDataset(self.folder / shard.name).read(self.name)
-            maps["group"] = numbers[shard.first : shard.stop]
+            maps["group"] = np.array(numbers[shard.first : shard.stop])
             self._write(shard, maps)
 
     def entry(self, first: int = 0, stop: int | None = None) -> dict[str, Any]:
         """Return the manifest entry of consecutive maps, from `first` to before `stop`."""
         records = {name: values[first:stop] for name, values in self.records.items()}
-        left_out = {**self.left_out, "between_splits": self.ground.tiling.between}
+        left_out = {**self.left_out, "between_splits": self.survey.tiling.n_omitted}
         source = {
-            **self.ground.source,
+            **self.survey.source,
             "truth": "unknown",
             **records,
             "left_out": left_out,
         }
-        count = len(records["kept"])
-        scenario = self.recipe.splits[self.name].scenario
+        n_maps = len(records["kept"])
         return {
-            "scenario": scenario,
-            "maps": count,
-            "parts": [{"maps": count, "source": source}],
+            "scenario": self.recipe.splits[self.name].scenario,
+            "maps": n_maps,
+            "parts": [{"maps": n_maps, "source": source}],
         }
+
+
+def _lacking(inputs: Maps) -> dict[str, ndarray]:
+    """Return masks of maps that lack an input, by its name, bool, shape [B]."""
+    lacking: dict[str, Any] = {}
+    for name, values in inputs.items():
+        lacking[name] = np.isnan(values).any(axis=(1, 2, 3))
+    # Without a photo, a cell has the colour of its class.
+    if "classes" in inputs and "photo" in inputs:
+        # Models can learn from measured λ without a class.
+        measured = inputs.get("traversability", np.nan)
+        is_useless = np.isnan(inputs["classes"]) & np.isnan(measured)
+        lacking["classes"] = is_useless.all(axis=(1, 2, 3))
+    if "drive_count" in inputs:
+        lacking["drive_count"] = (inputs["drive_count"] == 0).all(axis=(1, 2, 3))
+    return lacking

@@ -10,7 +10,7 @@ from benchnav.core.grid import is_azimuth
 from benchnav.datagen import schema
 from benchnav.datagen.layers.spec import shipped_fields
 
-# By the end of a layer's name.
+# Units by the suffix of a layer's name.
 _UNITS = {"_m": "m", "_deg": "deg", "_s": "s", "_mps": "m/s", "_k": "K"}
 
 
@@ -28,15 +28,15 @@ class LayerRaster(NamedTuple):
     field: schema.Field
 
     @property
-    def how(self) -> str:
-        """Resampling in GDAL's terms; the mean of angles would be wrong."""
+    def resampling(self) -> str:
+        """Resampling in GDAL's terms; angles must not be averaged."""
         return "nearest" if is_azimuth(self.name) else "average"
 
 
 def read_layer(text: str) -> LayerRaster:
     """Return the layer of a text `NAME=RASTER` or `NAME=RASTER:UNIT`.
 
-    The text after the last colon is a unit unless it looks like a path.
+    The text after the last colon is a unit, unless it looks like a path.
 
     Raises:
         ConfigError: If it has another form, or the name is not valid for a layer.

@@ -27,8 +27,8 @@ class Run(NamedTuple):
 
     Args:
         split: name of the split.
-        row: their row of maps.
-        columns: their indices in the row.
+        row: row of maps that contains them.
+        columns: indices of the maps in this row.
     """
 
     split: str
@@ -43,8 +43,8 @@ class Tiling(NamedTuple):
         shape: cells of a map, (H, W).
         stride: cells from one map to the next, northward and eastward.
         tiles: rows and columns of maps.
-        strips: rows of maps of each split if there are more rows than columns; else
-            columns.
+        strips: range of each split, in rows of maps if there are more rows than
+            columns, else in columns.
     """
 
     shape: Shape
@@ -55,12 +55,14 @@ class Tiling(NamedTuple):
     @property
     def cells(self) -> list[int]:
         """Cells of all maps together, northward and eastward."""
-        return (np.subtract(self.tiles, 1) * self.stride + self.shape).tolist()
+        last_map = np.subtract(self.tiles, 1) * self.stride
+        return (last_map + self.shape).tolist()
 
     @property
     def maps(self) -> int:
         """Number of maps of all splits."""
-        return sum(len(strip) for strip in self.strips.values()) * min(self.tiles)
+        n_lines = sum(len(strip) for strip in self.strips.values())
+        return n_lines * min(self.tiles)
 
     @property
     def overlaps(self) -> bool:
@@ -74,20 +76,23 @@ class Tiling(NamedTuple):
             numbers: indices of some maps in the terrain.
 
         Returns:
-            The lowest index of a map of each map's group, int64, shape of `numbers`.
+            Lowest index in each map's group, int64, shape of `numbers`.
         """
-        # On a lattice of twice the resolution, draw each map as a block up to the last
-        # map that it overlaps. Blocks intersect exactly if maps overlap, and do not
-        # touch otherwise.
-        reach = 2 * np.ceil(np.divide(self.shape, self.stride)).astype(int) - 2
+        # On a lattice of twice the resolution, each map is a block that reaches to the
+        # last map that it overlaps. Blocks intersect exactly if maps overlap, and do
+        # not touch otherwise.
+        n_strides = np.ceil(np.divide(self.shape, self.stride)).astype(int)
+        reach = 2 * n_strides - 2
         indices = np.asarray(numbers, dtype=np.int64)
-        corners = tuple(2 * index for index in np.divmod(indices, self.tiles[1]))
-        drawn = np.zeros(2 * np.array(self.tiles) + reach, dtype=np.uint8)
-        drawn[corners] = 1
-        drawn = ndimage.maximum_filter(
-            drawn, (reach + 1).tolist(), origin=(reach // 2).tolist(), mode="constant"
-        )
-        labels = ndimage.label(drawn)[0][corners]
+        row, column = np.divmod(indices, self.tiles[1])
+        corners = (2 * row, 2 * column)
+        lattice = np.zeros(2 * np.array(self.tiles) + reach, dtype=np.uint8)
+        lattice[corners] = 1
+        size = (reach + 1).tolist()
+        origin = (reach // 2).tolist()
+        blocks = ndimage.maximum_filter(lattice, size, origin=origin, mode="constant")
+        labelled, _ = ndimage.label(blocks)
+        labels = labelled[corners]
         _, firsts, inverse = np.unique(labels, return_index=True, return_inverse=True)
         return indices[firsts][inverse]
 
@@ -110,14 +115,14 @@ class Tiling(NamedTuple):
             first = strip.start * stride
             stop = (strip.stop - 1) * stride + self.shape[side]
             split[(along >= first) & (along < stop)] = index
-        for cell, count, stride, size in zip(
-            (row, column), self.cells, self.stride, self.shape, strict=True
-        ):
-            split[(cell < 0) | (cell >= count) | (cell % stride >= size)] = -1
+        for side, cell in enumerate((row, column)):
+            is_off = (cell < 0) | (cell >= self.cells[side])
+            is_between = cell % self.stride[side] >= self.shape[side]
+            split[is_off | is_between] = -1
         return split
 
     @property
-    def between(self) -> int:
+    def n_omitted(self) -> int:
         """Number of omitted maps between the splits."""
         return self.tiles[0] * self.tiles[1] - self.maps
 
@@ -149,20 +154,24 @@ def cut(
         DatasetError: If the terrain is too small for the number of splits.
     """
     rows, columns = (np.subtract(cells, shape) // stride + 1).tolist()
-    side, lines = (0, rows) if rows > columns else (1, columns)
+    side = 0 if rows > columns else 1
+    n_lines = max(rows, columns)
+    n_splits = len(shares)
     gap = _gap(shape, stride, side)
-    usable = lines - gap * (len(shares) - 1)
-    if usable < len(shares):
+    usable = n_lines - gap * (n_splits - 1)
+    if usable < n_splits:
         raise DatasetError(
-            f"Expected ground for {len(shares)} splits with a map's width between "
-            f"them, got {lines} maps along its longer side. Take fewer splits, smaller "
-            "maps or larger ground."
+            f"Expected terrain for {n_splits} splits with a map's width between "
+            f"them, got {n_lines} maps along its longer side. Take fewer splits, smaller "
+            "maps or a larger terrain."
         )
     ends = [0]
     for count, total in enumerate(accumulate(shares.values()), start=1):
         # Each split gets a strip, even for a small fraction.
-        end = max(round(total * usable), ends[-1] + 1)
-        ends.append(min(end, usable - len(shares) + count))
+        min_end = ends[-1] + 1
+        max_end = usable - n_splits + count
+        end = max(round(total * usable), min_end)
+        ends.append(min(end, max_end))
     strips = {}
     for index, split in enumerate(shares):
         offset = index * gap
@@ -178,12 +187,13 @@ def fewest_cells(shape: Shape, stride: Shape, splits: int) -> list[Shape]:
         stride: cells from one map to the next, northward and eastward.
         splits: number of splits.
     """
-    grounds = []
+    sizes = []
     for side in (0, 1):
         cells = list(shape)
-        cells[side] += (splits - 1) * (_gap(shape, stride, side) + 1) * stride[side]
-        grounds.append((cells[0], cells[1]))
-    return grounds
+        n_strides = (splits - 1) * (_gap(shape, stride, side) + 1)
+        cells[side] += n_strides * stride[side]
+        sizes.append((cells[0], cells[1]))
+    return sizes
 
 
 def _gap(shape: Shape, stride: Shape, side: int) -> int:
@@ -215,10 +225,13 @@ def cut_around(
     """
     low_m = np.maximum(positions_m.min(axis=0) - cell_m, 0)
     high_m = np.minimum(positions_m.max(axis=0) + cell_m, raster_m)
-    n_strides = np.maximum(np.ceil((high_m - low_m - shape_m) / stride_m - SLACK), 0)
+    strides = (high_m - low_m - shape_m) / stride_m
+    n_strides = np.maximum(np.ceil(strides - SLACK), 0)
     size_m = np.minimum(shape_m + n_strides * stride_m, raster_m)
-    edge_m = np.clip((low_m + high_m - size_m) / 2, 0, raster_m - size_m)
-    return np.floor(edge_m / cell_m + SLACK) * cell_m, size_m
+    centred_m = (low_m + high_m - size_m) / 2
+    edge_m = np.clip(centred_m, 0, raster_m - size_m)
+    corner_m = np.floor(edge_m / cell_m + SLACK) * cell_m
+    return corner_m, size_m
 
 
 def read_shares(text: str) -> dict[str, float]:
@@ -237,12 +250,12 @@ def read_shares(text: str) -> dict[str, float]:
         expect(
             name and name not in shares and 0 < value <= 1,
             "`splits` such as train:0.7,valid:0.1,test/site:0.2, each name once and "
-            f"each share above 0, got {part.strip()!r} in {text!r}.",
+            f"each fraction above 0, got {part.strip()!r} in {text!r}.",
         )
         shares[name] = value
     total = sum(shares.values())
     expect(
         abs(total - 1) < 1e-6,
-        f"the shares of `splits` to sum to 1, got {total:g} in {text!r}.",
+        f"the fractions of `splits` to sum to 1, got {total:g} in {text!r}.",
     )
     return shares

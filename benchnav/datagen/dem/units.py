@@ -1,12 +1,13 @@
-"""Units of length that rasters declare, or leave out."""
+"""Units of length in rasters, declared or set by the user."""
 
 import numpy as np
 
 from benchnav.core.errors import DatasetError, expect
-from benchnav.datagen.dem.raster import Raster, horizontal
+from benchnav.datagen.dem.crs import horizontal
+from benchnav.datagen.dem.raster import Raster
 
 UNITS_M = {"m": 1.0, "ft": 0.3048, "us-ft": 1200 / 3937}  # by the names of PROJ
-# How rasters write units, in lower case, by what `dem_unit` takes.
+# Spellings of units in rasters, in lower case, by the value of `dem_unit`.
 _SPELLINGS = {
     "m": ("m", "metre", "meter", "metres", "meters"),
     "ft": ("ft", "foot", "feet", "international foot", "international feet"),
@@ -38,7 +39,7 @@ def in_unit(dem: Raster, unit: str) -> tuple[Raster, str]:
 
     Raises:
         ConfigError: If the unit is invalid.
-        DatasetError: If it is empty and the raster may not be in metres.
+        DatasetError: If `unit` is empty and the raster may not be in metres.
     """
     declared = dem.file.units[0] or ""
     crs = horizontal(dem.file.crs)
@@ -52,43 +53,46 @@ def in_unit(dem: Raster, unit: str) -> tuple[Raster, str]:
             f"`dem_unit` among {', '.join(UNITS_M)}, or as metres in a unit, such as "
             f"0.01, got {unit!r}.",
         )
-        instead = f", where the raster declares {declared!r}" if declared else ""
-        return dem._replace(metres=metres), f"{unit} as set by `dem_unit`{instead}"
-    name = _known(declared)
+        source = f"{unit} as set by `dem_unit`"
+        if declared:
+            source += f", although the raster declares {declared!r}"
+        return dem._replace(metres=metres), source
+    name = _option_of(declared)
     if name == "m":
         return dem, "metres as the raster declares"
     if declared:
-        option = (
-            f"--dem-unit {name}"
-            if name
-            else "--dem-unit with the metres in one, such as 0.01"
-        )
+        option = "--dem-unit with the metres in one unit, such as 0.01"
+        if name:
+            option = f"--dem-unit {name}"
         raise DatasetError(
             f"Expected elevations of `dem` in metres, got {declared!r} in {dem.name}. "
             f"To convert them, pass {option}; "
-            "if they are metres all the same, pass --dem-unit m."
+            "if they are metres nevertheless, pass --dem-unit m."
         )
     if crs.is_projected and crs.linear_units_factor[1] != 1:
         raise DatasetError(
-            f"Expected a unit of the elevations of `dem`, since {dem.name} is in "
-            f"{crs.linear_units_factor[0]} and "
-            "declares none, got none declared. Pass --dem-unit us-ft, --dem-unit ft "
-            "or --dem-unit m, whichever it is."
+            f"Expected a declared unit of the elevations of `dem`, since the CRS of "
+            f"{dem.name} is in {crs.linear_units_factor[0]}, got none. Pass their unit: "
+            "--dem-unit us-ft, --dem-unit ft or --dem-unit m."
         )
-    return dem, "metres (the raster declares no unit: if others, set `dem_unit`)"
+    return dem, "metres (the raster declares no unit; `dem_unit` sets another)"
 
 
 def check_metres(raster: Raster) -> None:
-    """Check that a raster of metres does not declare another unit.
+    """Check that a raster of a layer in metres does not declare another unit.
 
     Raises:
-        DatasetError: If it does; the message has a command that converts it.
+        DatasetError: If it does, with a command that converts it.
     """
     declared = raster.file.units[0] or ""
-    name = _known(declared)
+    name = _option_of(declared)
     if not declared or name == "m":
         return
-    factor = f"{UNITS_M.get(name) or float(name):.10g}" if name else "METRES"
+    factor = "METRES"
+    explanation = ", METRES being the metres in one unit"
+    if name:
+        factor = f"{UNITS_M.get(name) or float(name):.10g}"
+        explanation = ""
     unmasked = "" if raster.declares_missing else "--not-masked "
     convert = (
         f"rio calc {unmasked}-t float32 '(* {factor} (read 1))' {raster.name} "
@@ -97,13 +101,15 @@ def check_metres(raster: Raster) -> None:
     relabel = f"rio edit-info --bidx 1 --units m {raster.name}"
     raise DatasetError(
         f"Expected `{raster.argument}` in metres, got {declared!r} in {raster.name}. "
-        "If they are metres all the same, "
-        f"declare it: {relabel}. Else convert "
-        f"them{'' if name else ', METRES being those in one'}: {convert}"
+        f"If they are metres nevertheless, declare this: {relabel}. Otherwise, convert "
+        f"them{explanation}: {convert}"
     )
 
 
-def _known(declared: str) -> str:
-    """Return the value of `dem_unit` for a declared unit; empty if it is unknown."""
+def _option_of(declared: str) -> str:
+    """Return the value of `dem_unit` for a declared unit; empty for an unknown one."""
     text = declared.strip().lower()
-    return next((name for name, words in _SPELLINGS.items() if text in words), "")
+    for name, spellings in _SPELLINGS.items():
+        if text in spellings:
+            return name
+    return ""

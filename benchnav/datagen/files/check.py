@@ -1,4 +1,4 @@
-"""Complete check of a dataset: schema, checksums, entry digests, ranges, digests."""
+"""Complete check of a dataset: schema, checksums, ranges, digests of maps and splits."""
 
 from collections.abc import Collection, Iterator
 from contextlib import suppress
@@ -23,8 +23,8 @@ class Fault(NamedTuple):
 
     Args:
         split: name of the split.
-        map: index of the map; −1 if the fault is not of one map.
-        field: array of the split; empty if the fault is not of one array.
+        map: index of the map; −1 if the fault does not concern a single map.
+        field: array of the split; empty if the fault does not concern a single array.
         problem: description of the fault.
         file: name of the shard; empty if the dataset is one file.
     """
@@ -139,7 +139,7 @@ def _split_faults(
 def _damaged_scales(
     file: h5py.File, split: str, names: Collection[str]
 ) -> Iterator[str]:
-    """Yield unreadable arrays of a split besides `names`, such as dimension scales."""
+    """Yield other unreadable arrays of a split, such as dimension scales."""
     others: list[str] = []
     with suppress(*READ_ERRORS):
         others = sorted(set(file[split]) - set(names))

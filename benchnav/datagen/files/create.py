@@ -215,7 +215,7 @@ def _missing(
     for file in outdated:
         expect(
             may_replace,
-            f"`out` to be new or to hold shards of one recipe and version, got {file} "
+            f"`out` to be new or to contain shards of one recipe and version, got {file} "
             "of another. Choose another `out`, or pass --overwrite with the recipe, "
             "settings and version of the other shards.",
         )

@@ -8,8 +8,8 @@ from pathlib import Path
 from benchnav.core.settings import plain
 from benchnav.core.tables import Table
 from benchnav.datagen import schema
-from benchnav.datagen.files.manifest import READ_ERRORS, open_file
-from benchnav.datagen.files.reader import TerrainDataset, damage
+from benchnav.datagen.files.manifest import READ_ERRORS, damage_error, open_file
+from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.layers.spec import LayerSpec
 from benchnav.datagen.recipe.classes import ClassTable
 
@@ -30,6 +30,7 @@ def describe(dataset: TerrainDataset) -> schema.Json:
     shown = {name: settings[name] for name in names}
     if "vegetation_period_m" in stored:
         shown["vegetation_period_m"] = stored["vegetation_period_m"]
+    layers = [_describe_layer(spec, recipe.classes) for spec in recipe.layers]
     splits = {
         name: {
             **entry,
@@ -49,9 +50,7 @@ def describe(dataset: TerrainDataset) -> schema.Json:
         "grid": asdict(dataset.grid),
         **shown,
         "classes": recipe.class_rows,
-        "drawn_layers": [
-            _describe_layer(spec, recipe.classes) for spec in recipe.layers
-        ],
+        "drawn_layers": layers,
         "splits": splits,
         "fields": manifest["fields"],
         "recipes": manifest["recipes"],
@@ -67,7 +66,7 @@ def _stored_bytes(dataset: TerrainDataset, split: str) -> int:
                 for name in dataset.field_names:
                     total += file[split][name].id.get_storage_size()
             except READ_ERRORS as error:
-                raise damage(piece.path, split, name, error) from error
+                raise damage_error(piece.path, split, name, error) from error
     return total
 
 
@@ -114,25 +113,27 @@ def tables(described: schema.Json) -> Iterator[Table | str]:
     fields = schema.read_field_table(described["fields"])
     layers = schema.layer_names(fields)
     if layers:
-        code = {layer["name"]: layer["source"] for layer in described["drawn_layers"]}
+        sources = {
+            layer["name"]: layer["source"] for layer in described["drawn_layers"]
+        }
+        layer_rows = []
+        for name in layers:
+            field = fields[name]
+            row = (name, field.unit, field.meaning, sources.get(name, ""))
+            layer_rows.append(row)
         yield Table(
             title="layers",
             headings=("layer", "unit", "meaning", "drawn by"),
-            rows=tuple(
-                (name, fields[name].unit, fields[name].meaning, code.get(name, ""))
-                for name in layers
-            ),
+            rows=tuple(layer_rows),
         )
     extra = [name for name in fields if name not in (*schema.FIELDS, *layers)]
     if extra:
         yield f"optional fields: {', '.join(extra)}"
+    wide = widest(described["splits"])
     for key, title in _DIGESTS.items():
         yield title
-        wide = widest(described["splits"])
-        yield from (
-            f"  {name:{wide}} {entry[key]}"
-            for name, entry in described["splits"].items()
-        )
+        for name, entry in described["splits"].items():
+            yield f"  {name:{wide}} {entry[key]}"
     columns = {layer["name"]: layer["classes"] for layer in described["drawn_layers"]}
     headings = ["id", "class", "colour", "a", "b", "o", "σ", "soft spots", *columns]
     rows = []
@@ -156,14 +157,17 @@ def tables(described: schema.Json) -> Iterator[Table | str]:
 def _describe_layer(spec: LayerSpec, classes: ClassTable) -> schema.Json:
     """Return the description of a layer; without its code, texts on classes are empty."""
     layer = spec.available
-    names = [item.name for item in classes]
-    texts = [layer.describe_class(name) if layer else "" for name in names]
-    source = f"{spec.source}, digest {spec.digest[:12]}" if spec.source else "benchnav"
+    texts = {item.name: "" for item in classes}
+    if layer:
+        texts = {name: layer.describe_class(name) for name in texts}
+    source = "benchnav"
+    if spec.source:
+        source = f"{spec.source}, digest {spec.digest[:12]}"
     return {
         "name": spec.name,
         "words": spec.words,
         "source": source,
-        "classes": dict(zip(names, texts, strict=True)),
+        "classes": texts,
     }
 
 
@@ -186,7 +190,8 @@ def written(path: Path) -> TerrainDataset:
     dataset = TerrainDataset(path)
     size = decimal(sum(file.stat().st_size for file in dataset.files))
     n_files = len(dataset.files)
-    print(f"wrote {path} ({size}{f' in {n_files} files' if n_files > 1 else ''})")
+    files = f" in {n_files} files" if n_files > 1 else ""
+    print(f"wrote {path} ({size}{files})")
     wide = widest(dataset.splits)
     for name, split in dataset.splits.items():
         print(f"  {name:{wide}} {split['maps']:6} maps  {split['digest']}")

@@ -48,7 +48,7 @@ def _in_snapshot(folder: Path, source: str) -> Path:
     files = sorted(folder.glob("*.h5"))
     if len(files) != 1:
         raise DatasetError(
-            f"Expected {source} to hold {FOLDER_MANIFEST} and its shards, or one file "
+            f"Expected {source} to contain {FOLDER_MANIFEST} and its shards, or one file "
             f".h5, got {len(files)} files .h5. Name another repository or revision."
         )
     return files[0]

@@ -33,7 +33,7 @@ from benchnav.datagen.files.manifest import FOLDER_MANIFEST, open_file, read_man
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import Recipe
 
-FOLDER_FORMAT_VERSION = "1.2"  # at least
+FOLDER_FORMAT_VERSION = "1.2"  # the lowest version of a folder of shards
 
 # Structures of HDF5 1.10 have checksums, which detect damage to them.
 _LIBRARY = ("v110", "v110")
@@ -190,7 +190,7 @@ def _fill(
 def _add_scales(group: h5py.Group, contents: Contents) -> None:
     """Name the dimensions of a split's arrays by HDF5 dimension scales.
 
-    They are map_index, y_m, x_m, and axis_N for other dimensions of length N.
+    The names are map_index, y_m, x_m, and axis_N for other dimensions of length N.
     """
     recipe = contents.recipes[0]
     for name, array in list(group.items()):
@@ -216,7 +216,7 @@ def pack(
     maps: schema.Maps,
     fields: schema.Fields = schema.KNOWN,
 ) -> bytes:
-    """Return the bytes of a file of a few maps of one split.
+    """Return the bytes of a file with some maps of one split.
 
     Args:
         recipe: recipe of the maps, with the dataset's id.
@@ -298,13 +298,14 @@ def assemble(contents: Contents, folder: Path, out: Path) -> None:
     """Assemble a dataset from files that are datasets themselves.
 
     Args:
-        contents: its contents. If `out` is a folder, all files lie in `folder`.
-        folder: `out`, or a folder next to it, which replaces it. If `out` is a file,
-            this is not used.
+        contents: contents of the dataset. If `out` is a folder, all its files lie in
+            `folder`.
+        folder: `out`, or a folder next to it that replaces it; unused if `out` is a
+            file.
         out: file or folder.
 
     Raises:
-        ConfigError: If the folder to be replaced now contains anything else.
+        ConfigError: If the folder to be replaced now contains other files.
     """
     if is_one_file(out):
         _join(out, contents)
@@ -323,12 +324,12 @@ def assemble(contents: Contents, folder: Path, out: Path) -> None:
     manifest |= {"format_version": version, "shards": shards}
     write_text(folder / FOLDER_MANIFEST, seal(manifest))
     if folder != out:
-        check_output(out, True)  # another program may have written there meanwhile
+        check_output(out, True)  # another program may have written to it
         take_place(folder, out)
 
 
 def _opened(split: str, files: Iterable[Path]) -> Iterator[h5py.Group]:
-    """Yield the group of a split in each file, which is open while it is used."""
+    """Yield the group of a split in each file, which is open until the next one."""
     for path in files:
         with open_file(path) as file:
             yield file[split]
@@ -403,7 +404,7 @@ def _put(source: ndarray | h5py.Dataset, target: h5py.Dataset, first: int) -> No
 
 
 def _packing(array: h5py.Dataset) -> tuple[object, ...]:
-    """Return what must be equal to copy chunks; the level of deflate may differ."""
+    """Return properties that must be equal to copy chunks; deflate levels may differ."""
     return (
         array.dtype.str,
         array.chunks,

@@ -1,4 +1,4 @@
-"""Opening of dataset files, and manifests of files and folders of shards."""
+"""Opening of dataset files, manifests of files and folders, and errors of damage."""
 
 import errno
 import json
@@ -12,7 +12,8 @@ from benchnav.core.store import unseal
 from benchnav.core.touched import note_file
 from benchnav.datagen import schema
 
-_LOCKED = (errno.EAGAIN, errno.EACCES)  # of a file that another program has locked
+# Error codes of a file that another program has locked.
+_LOCKED = (errno.EAGAIN, errno.EACCES)
 # Errors that HDF5 and h5py raise for damaged files, depending on the damage.
 READ_ERRORS = (OSError, KeyError, RuntimeError, ValueError)
 
@@ -91,8 +92,8 @@ def _manifest_text(path: Path) -> str | bytes:
         if not is_dataset(path):
             raise DatasetError(
                 f"Expected a folder with a finished dataset, got {path} without "
-                f"{FOLDER_MANIFEST}. Finish it by the command that began it, or by "
-                "`benchnav-datagen merge` of its shards."
+                f"{FOLDER_MANIFEST}. Finish it with the command that started it, or "
+                "merge its shards with `benchnav-datagen merge`."
             )
         return (path / FOLDER_MANIFEST).read_text()
     with open_file(path) as file:
@@ -102,3 +103,12 @@ def _manifest_text(path: Path) -> str | bytes:
                 "one."
             )
         return file[schema.MANIFEST][()]
+
+
+def damage_error(path: Path, split: str, field: str, error: Exception) -> DatasetError:
+    """Return an error that names a damaged field, with a remedy."""
+    return DatasetError(
+        f"Field {field!r} of split {split!r} in {path} is damaged: {error}. Run "
+        "`benchnav-datagen validate` on the dataset, which explains how to make it "
+        "again."
+    )

@@ -16,7 +16,7 @@ class TerrainMaps(Dataset[dict[str, Tensor]]):
     """Maps of a split, each a dict of tensors by field.
 
     Safe under DataLoader workers, forked or spawned: each process opens files itself,
-    at the first map of each. Only the requested fields are read.
+    at its first map of each file. Only the requested fields are read.
 
     Args:
         path: dataset file or folder, or the id of a local dataset.
@@ -38,7 +38,8 @@ class TerrainMaps(Dataset[dict[str, Tensor]]):
     ) -> None:
         """Check split and fields; read all maps if they are kept in memory."""
         self.dataset = TerrainDataset(find_dataset(path).resolve(), keep_open=True)
-        self.split, self.fields = split, self.dataset.check_fields(tuple(fields))
+        self.split = split
+        self.fields = self.dataset.check_fields(tuple(fields))
         if not fields:
             raise DatasetError(
                 f"Expected `fields` among {list(self.dataset.field_names)}, got none."

@@ -30,7 +30,7 @@ from benchnav.datagen.files.manifest import is_dataset
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import Recipe, check_name, recipe_from_dict
 
-# Settings that determine the meaning of maps: identical in all files of a merge.
+# Settings that determine the meaning of maps. They must be identical in all files.
 _SHARED = (
     "height",
     "width",
@@ -54,8 +54,8 @@ def merge(
     Iterate to the end.
 
     Args:
-        paths: two or more datasets, the first of which determines the order of splits;
-            or folders of shards.
+        paths: two or more datasets (the first determines the order of splits), or
+            folders of shards.
         out: file to write, of suffix `.h5` or `.hdf5`; else a folder.
         dataset_id: id of the new dataset; if empty, the name of `out`. Shards keep the
             id of their recipe.
@@ -188,7 +188,7 @@ def _of_shards(folders: Sequence[Path]) -> Contents:
 
 
 def why_unlike(datasets: Sequence[TerrainDataset]) -> Iterator[str]:
-    """Yield the reasons why datasets cannot be merged, one sentence per pair."""
+    """Yield the reasons why datasets cannot be merged, one text per pair."""
     prints = [(dataset, _fingerprints(dataset)) for dataset in datasets]
     for (first, ours), (second, theirs) in combinations(prints, 2):
         reasons = list(_differences(first, second))

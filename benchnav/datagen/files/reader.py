@@ -20,7 +20,12 @@ import numpy as np
 from benchnav.core.errors import DatasetError
 from benchnav.core.grid import Grid
 from benchnav.datagen import schema
-from benchnav.datagen.files.manifest import READ_ERRORS, open_file, read_manifest
+from benchnav.datagen.files.manifest import (
+    READ_ERRORS,
+    damage_error,
+    open_file,
+    read_manifest,
+)
 from benchnav.datagen.layers.spec import shipped_fields
 from benchnav.datagen.recipe.recipe import Recipe, recipe_from_dict
 from benchnav.datagen.schema import Maps
@@ -30,11 +35,10 @@ if TYPE_CHECKING:
 
 CHUNK_CELLS = 2**17
 _MAX_OPEN = 128  # files that a process keeps open; far fewer than systems allow
+_SHOWN_SPLITS = 8
 
 # A file, and its arrays by split and name.
 Opened = tuple[h5py.File, dict[tuple[str, str], h5py.Dataset]]
-
-_SHOWN_SPLITS = 8
 
 
 class Piece(NamedTuple):
@@ -53,10 +57,7 @@ class Piece(NamedTuple):
 
 @lru_cache(maxsize=16)
 def _read_recipe(text: str, origin: str) -> Recipe:
-    """Return the checked recipe of a manifest.
-
-    It is cached, since checking it takes longer than reading a map.
-    """
+    """Return the checked recipe of a manifest; cached, since the check is slow."""
     return recipe_from_dict(json.loads(text), origin)
 
 
@@ -111,7 +112,7 @@ class TerrainDataset:
 
     @cached_property
     def recipe(self) -> Recipe:
-        """Recipe of the dataset; of its first part, if it has several recipes."""
+        """Recipe of the dataset; the first one if it has several."""
         return _read_recipe(json.dumps(self.manifest["recipes"][0]), f"in {self.path}")
 
     @property
@@ -153,7 +154,7 @@ class TerrainDataset:
             DatasetError: If there is no such split.
         """
         self.map_count(split)
-        # Files before 1.3 do not record it for imported maps.
+        # Formats before 1.3 do not record this for imported maps.
         is_known = all(
             "recipe" in part or part["source"].get("truth") == "generated"
             for part in self.splits[split]["parts"]
@@ -179,10 +180,9 @@ class TerrainDataset:
         return any(source.get("photo") for source in sources)
 
     def about_digest(self, split: str) -> str:
-        """Return the SHA-256 of the properties of a split besides its maps.
+        """Return the SHA-256 of the properties of a split other than its maps.
 
-        They are class table, layers of the recipe, λ_stuck, resolution and kind of
-        truth. Results depend on them.
+        They are class table, recipe layers, λ_stuck, resolution and kind of truth.
 
         Raises:
             DatasetError: If there is no such split.
@@ -244,10 +244,9 @@ class TerrainDataset:
                 f"Expected map indices in 0–{size - 1} of split {split!r}, got "
                 f"{chosen}."
             )
-
         pieces = self.pieces[split]
         firsts = self._firsts[split]
-        # In the order of the files, one read for each run of consecutive maps.
+        # Each run of consecutive maps is read at once, in the order of the files.
         order = sorted(range(len(chosen)), key=chosen.__getitem__)
 
         def run_of(item: tuple[int, int]) -> tuple[int, int]:
@@ -366,20 +365,20 @@ class TerrainDataset:
                     )
                 values = _values(arrays[split, name], selection)
                 maps[name] = values
-                # The maximum first, which is faster than comparing all values.
+                # The maximum is checked first, which is faster than comparing all.
                 if name == "class_id" and values.max(initial=0) > max_class:
                     is_beyond = (values > max_class) & (values != schema.UNLABELLED)
                     if is_beyond.any():
                         raise ValueError(f"it has classes beyond {max_class}")
         except READ_ERRORS as error:
-            raise damage(piece.path, split, name, error) from error
+            raise damage_error(piece.path, split, name, error) from error
         finally:
             if not self.keep_open:
                 file.close()
         return maps
 
     def _open(self, path: Path) -> Opened:
-        """Return an open file, and its previously read arrays by split and name."""
+        """Return an open file, and its opened arrays by split and name."""
         if not self.keep_open:
             return open_file(path), {}
         key = os.getpid(), path
@@ -428,7 +427,7 @@ class TerrainDataset:
         return terrain_of(self.read(split, indices, names), self.recipe)
 
     def map_count(self, split: str) -> int:
-        """Number of maps of a split.
+        """Return the number of maps of a split.
 
         Raises:
             DatasetError: If there is no such split.
@@ -441,17 +440,8 @@ class TerrainDataset:
         return self.splits[split]["maps"]
 
 
-def damage(path: Path, split: str, field: str, error: Exception) -> DatasetError:
-    """Return an error that names a damaged field, with a remedy."""
-    return DatasetError(
-        f"Field {field!r} of split {split!r} in {path} is damaged: {error}. Run "
-        "`benchnav-datagen validate` on the dataset, which explains how to make it "
-        "again."
-    )
-
-
 def _values(array: h5py.Dataset, selection: slice) -> np.ndarray:
-    """Return some maps of an array; map by map if one read fails for lack of memory."""
+    """Return some maps of an array, read one by one if memory is short."""
     try:
         return array[selection]
     except OSError:

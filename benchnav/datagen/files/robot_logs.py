@@ -33,7 +33,7 @@ def require_columns(
         rows: rows of the log.
         columns: required columns.
         path: path of the log.
-        remedy: remedy if no column has a similar name, a sentence.
+        remedy: remedy if no column has a similar name, as a sentence.
 
     Raises:
         DatasetError: If one is missing.
@@ -127,8 +127,8 @@ def read_numbers(
         name: name of the column.
         path: path of the log.
         limits: minimum and maximum.
-        remedy: remedy if all numbers are beyond the limits, a sentence.
-        number: remedy if all values are not numbers, a sentence.
+        remedy: remedy if all numbers are beyond the limits, as a sentence.
+        number: remedy if no value is a number, as a sentence.
 
     Raises:
         DatasetError: If a value is not a finite number, or is beyond the limits.

@@ -1,4 +1,7 @@
-"""Stored maps as Terrain, with the true distribution of λ. B maps in shapes."""
+"""Stored maps as Terrain, with the true distribution of λ.
+
+Letters in shapes: B maps.
+"""
 
 from functools import partial
 
@@ -23,21 +26,27 @@ def terrain_of(maps: Maps, recipe: Recipe) -> Terrain:
     """
     fields = {name: torch.from_numpy(maps[name]) for name in MAP_FIELDS}
     fields["class_id"] = fields["class_id"].long()
-    layers = [name for name in maps if name not in (*KNOWN, *TRUTH)]
-    shares_colours = len(recipe.units) < len(recipe.classes)
-    is_hidden = shares_colours or any(spec.hides for spec in recipe.layers)
-    has_look_alikes = recipe.synthesis > 1 and is_hidden
-    truth = latent.stored_truth(maps, recipe.classes)
+    layer_names = [name for name in maps if name not in (*KNOWN, *TRUTH)]
+    layers = {name: torch.from_numpy(maps[name]) for name in layer_names}
+    have_same_colours = len(recipe.units) < len(recipe.classes)
+    are_hidden = have_same_colours or any(spec.hides for spec in recipe.layers)
+    look_alikes = None
+    if recipe.synthesis > 1 and are_hidden:
+        look_alikes = partial(_look_alikes, recipe)
+    parameters = latent.stored_truth(maps, recipe.classes)
+    weights = parameters[0]
+    n_components = len(weights[0])
     return Terrain(
         **fields,
-        truth=_mixture(truth, (0,) * len(truth[0][0])),
+        truth=_mixture(parameters, (0,) * n_components),
         grid=recipe.grid,
-        look_alikes=partial(_look_alikes, recipe) if has_look_alikes else None,
-        layers={name: torch.from_numpy(maps[name]) for name in layers},
+        look_alikes=look_alikes,
+        layers=layers,
     )
 
 
 def _look_alikes(recipe: Recipe, terrain: Terrain) -> TraversabilityMixture:
+    """Return the best prediction of λ from images; see `latent.look_alikes`."""
     maps = DrawnMaps(
         terrain.class_id.cpu().numpy(),
         _to_float64(terrain.elevation_m),
@@ -45,16 +54,17 @@ def _look_alikes(recipe: Recipe, terrain: Terrain) -> TraversabilityMixture:
         recipe.grid,
         recipe.classes,
     )
-    specs = [
-        spec
-        for spec in recipe.layers
-        if spec.name in terrain.layers and (spec.hides or spec.affects)
-    ]
-    values = {spec.name: _to_float64(terrain.layers[spec.name]) for spec in specs}
-    parameters = latent.look_alikes(maps, [spec.layer for spec in specs], values)
+    layers = []
+    values = {}
+    for spec in recipe.layers:
+        if spec.name in terrain.layers and (spec.hides or spec.affects):
+            layers.append(spec.layer)
+            values[spec.name] = _to_float64(terrain.layers[spec.name])
+    parameters = latent.look_alikes(maps, layers, values)
     group: list[int] = []
     for class_id, item in enumerate(recipe.classes):
-        group += [class_id] * (2 if item.soft else 1)
+        n_components = 2 if item.soft else 1
+        group += [class_id] * n_components
     return _mixture(parameters, tuple(group)).to(terrain.class_id.device)
 
 
@@ -66,7 +76,6 @@ def _mixture(
     parameters: latent.Parameters, group: tuple[int, ...]
 ) -> TraversabilityMixture:
     """Return the mixture in float32."""
-    weights, means, stds = (
-        torch.from_numpy(values.astype(np.float32)) for values in parameters
-    )
+    tensors = [torch.from_numpy(values.astype(np.float32)) for values in parameters]
+    weights, means, stds = tensors
     return TraversabilityMixture(weights, means, stds, group)

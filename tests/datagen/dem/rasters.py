@@ -10,7 +10,7 @@ import pytest
 
 from benchnav.core.errors import BenchnavError
 from benchnav.datagen.dem.importer import import_dem
-from benchnav.datagen.dem.raster import Cut, GroundOptions, Rasters
+from benchnav.datagen.dem.options import Cut, GroundOptions, Rasters
 from benchnav.datagen.files.check import find_faults
 from benchnav.datagen.files.reader import TerrainDataset
 from tests.factories import tiny_recipe

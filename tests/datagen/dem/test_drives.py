@@ -14,11 +14,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchnav.core.errors import BenchnavError, ConfigError, DatasetError
-from benchnav.datagen.dem.drive_cells import describe_drives, drive_over
+from benchnav.datagen.dem.crs import transformed
+from benchnav.datagen.dem.drive_cells import aggregate_drives, describe_drives
 from benchnav.datagen.dem.drive_log import REASONS, DriveLog, Drives, read_drives
 from benchnav.datagen.dem.drive_motion import compare_motion
 from benchnav.datagen.dem.importer import import_dem
-from benchnav.datagen.dem.raster import Rasters, transformed
+from benchnav.datagen.dem.options import Rasters
 from benchnav.datagen.dem.tiling import cut
 from benchnav.datagen.files.check import find_faults
 from benchnav.datagen.files.merge import merge
@@ -242,7 +243,7 @@ def test_rows_are_left_out_by_reason_and_kept_beyond_0_and_1(tmp_path: Path) -> 
     assert {name: count for name, count in log.left_out.items() if count} == counted
     np.testing.assert_allclose(log.rows["traversability"], [0.5, 0.8, 1.19, -0.25, 0.5])
     assert [log.names[one] for one in log.rows["drive"]] == ["a", "a", "b", "b", "c"]
-    used, driven = drive_over(
+    used, driven = aggregate_drives(
         log,
         cut((8, 8), (8, 8), (8, 8), {"train": 1.0}),
         np.zeros(5, int),
@@ -333,7 +334,7 @@ def test_splits_share_no_drive_and_no_cell(
     on = (row >= 0) & (row < cells[0]) & (column >= 0) & (column < cells[1])
     own = np.where(on, shown[np.where(on, row, 0), np.where(on, column, 0)], "")
     try:
-        used, driven = drive_over(log, tiling, row, column)
+        used, driven = aggregate_drives(log, tiling, row, column)
     except DatasetError as error:
         counts = pd.crosstab(log.rows["drive"], own).drop(columns="", errors="ignore")
         alone = "got none" in str(error)
@@ -402,7 +403,7 @@ def test_a_split_that_would_be_without_a_drive_takes_the_one_that_loses_least() 
         is_geographic=False,
         rows=rows,
     )
-    used, _ = drive_over(
+    used, _ = aggregate_drives(
         log, tiling, np.zeros(len(rows), int), rows["column"].to_numpy()
     )
     about = describe_drives(used, ["a", "b"])
@@ -439,7 +440,7 @@ def test_a_drive_belongs_where_most_of_its_rows_lie_not_where_it_comes_first() -
         is_geographic=False,
         rows=rows,
     )
-    used, _ = drive_over(
+    used, _ = aggregate_drives(
         log, tiling, np.zeros(len(rows), int), rows["column"].to_numpy()
     )
     about = describe_drives(used, ["a", "b", "c"])
@@ -721,7 +722,7 @@ MOVE = "".join(
         (HEAD + MOVE, "a drive for each of the 3 splits .* got 1 in .*--splits"),
         (
             HEAD + "".join(MOVE.replace("a\n", f"{name}\n") for name in "abc"),
-            "ground for 3 splits|a drive of its own on the ground of each split, got none for valid, test/site",
+            "terrain for 3 splits|a drive of its own on the terrain of each split, got none for valid, test/site",
         ),
     ],
 )
@@ -740,7 +741,7 @@ def test_a_drive_on_the_ground_of_each_split_is_needed(dem: Path) -> None:
     rows = rows[(rows["x"] < 30) | (rows["drive"] == "drive-11")]
     path = log_of(rows, dem.parent / "log.csv")
     with pytest.raises(
-        DatasetError, match="on the ground of each split, got none for valid in"
+        DatasetError, match="on the terrain of each split, got none for valid in"
     ):
         imported(dem, path)
 
@@ -807,7 +808,7 @@ def test_the_command_says_what_was_used_and_what_was_not(
         ("between_maps", "lie between the maps"),
         (
             "other_split",
-            "lie on the ground of a split that their drive does not belong to",
+            "lie on the terrain of a split that their drive does not belong to",
         ),
     ):
         assert f"{about['left_out'][reason]} rows are left out: they {why}" in said

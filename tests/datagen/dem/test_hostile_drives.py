@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from benchnav.datagen.dem.raster import transformed
+from benchnav.datagen.dem.crs import transformed
 from benchnav.datagen.files.reader import TerrainDataset
 from tests.commands import call
 from tests.datagen.dem.rasters import SOUTH, WEST, write

@@ -460,7 +460,7 @@ def mended(line: str, fix: str, case: Case, words: list[str]) -> list[str]:
     if corrected := re.search(r"benchnav-datagen (import-dem .*)", line):
         return shlex.split(corrected[1])
     command = line[line.rindex("rio ", 0, line.index(fix) + 4) :]
-    command = re.split(r"\. (?:Where|Else) ", command)[0]
+    command = re.split(r"\. (?:If|Otherwise,) ", command)[0]
     for blank, value in case.fill.items():
         command = command.replace(blank, value)
     _, tool, *arguments = shlex.split(command)

@@ -13,9 +13,10 @@ import scipy.ndimage
 
 from benchnav.core.errors import BenchnavError, ConfigError, DatasetError
 from benchnav.datagen.dem import importer
-from benchnav.datagen.dem.extent import GroundError
 from benchnav.datagen.dem.importer import import_dem
-from benchnav.datagen.dem.raster import Cut, GroundOptions, Layer
+from benchnav.datagen.dem.options import Cut, GroundOptions
+from benchnav.datagen.dem.raster import Layer
+from benchnav.datagen.dem.recipe_fit import GroundError
 from benchnav.datagen.files.check import find_faults
 from benchnav.datagen.files.merge import merge
 from benchnav.datagen.files.reader import TerrainDataset

@@ -10,7 +10,7 @@ import pytest
 
 from benchnav.core.errors import ConfigError
 from benchnav.datagen.dem.layer import read_layer
-from benchnav.datagen.dem.raster import Rasters
+from benchnav.datagen.dem.options import Rasters
 from benchnav.datagen.files.reader import TerrainDataset
 from tests.commands import call
 from tests.datagen.dem.rasters import (
@@ -238,7 +238,7 @@ def test_a_raster_that_does_not_cover_the_ground_is_refused(tmp_path: Path) -> N
     for raster in (half, elsewhere):
         message = refusal(dem, f"vegetation_m={raster}")
         assert (
-            f"Expected `layer vegetation_m` over all of the ground, WEST SOUTH EAST NORTH {ours} in EPSG:32654"
+            f"Expected `layer vegetation_m` over all of the terrain, WEST SOUTH EAST NORTH {ours} in EPSG:32654"
             in message
         )
         assert raster.name in message

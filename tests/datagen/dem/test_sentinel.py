@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from benchnav.datagen.dem.raster import Raster
 from benchnav.datagen.dem.sentinel import (
-    is_certain,
+    is_certain_sentinel,
     is_missing,
     widest_gap_m,
     zero_gap_m,
@@ -97,6 +97,8 @@ def test_layers_of_many_values_down_to_a_common_one_are_kept_where_another_is_de
     scale: float,
 ) -> None:
     values = np.linspace(-9999, 9000, 50) * scale
-    assert not is_certain(raster(True, scale), values[0], values)
-    assert is_certain(raster(False, scale), values[0], values)
-    assert is_certain(raster(True, scale), values[0], np.array([values[0], 0, np.nan]))
+    assert not is_certain_sentinel(raster(True, scale), values[0], values)
+    assert is_certain_sentinel(raster(False, scale), values[0], values)
+    assert is_certain_sentinel(
+        raster(True, scale), values[0], np.array([values[0], 0, np.nan])
+    )

@@ -824,10 +824,10 @@ def test_zeros_for_missing_heights_are_refused_unless_something_is_declared(
     values = 900 + rough(64, 96)
     values[:20, :30] = 0
     message = refusal(write(tmp_path / "dem.tif", values, cell))
-    assert "If 0 stands for missing, declare it: rio edit-info --nodata 0" in message
+    assert "If 0 marks missing cells, declare it: rio edit-info --nodata 0" in message
     declared = read(write(tmp_path / "zero.tif", values, cell, nodata=0))
     assert source_of(declared)["left_out"]["missing_elevation"] > 0
-    assert "replace it by what is declared" in refusal(
+    assert "replace it by the declared value" in refusal(
         write(tmp_path / "other.tif", values, cell, nodata=-9999)
     )
     cliff = np.where(values > 0, values - 940, 0)  # 60 m above the sea, by their word

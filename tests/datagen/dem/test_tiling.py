@@ -64,7 +64,7 @@ def test_maps_lie_on_the_ground_and_splits_a_map_apart(
         )
         assert high[0] - low[1] >= shape[axis]
     assert tiling.maps == sum(map(len, found.values()))
-    assert tiling.maps + tiling.between == tiling.tiles[0] * tiling.tiles[1]
+    assert tiling.maps + tiling.n_omitted == tiling.tiles[0] * tiling.tiles[1]
     lines = sum(map(len, tiling.strips.values()))
     for split, share in shares.items():
         assert abs(len(tiling.strips[split]) - share * lines) <= len(shares)
@@ -77,14 +77,14 @@ def test_shares_are_kept_and_no_more_is_lost_than_the_gaps() -> None:
         "valid": 50,
         "test/site": 100,
     }
-    assert tiling.between == 2 * 5
+    assert tiling.n_omitted == 2 * 5
     northward = cut((64 * 102, 64 * 5), (64, 64), (64, 64), SHARES)
     assert (northward.strips, northward.maps) == (tiling.strips, tiling.maps)
     assert {row for row, _ in places(northward)["valid"]} == set(range(71, 81))
     # At half the stride a gap of a map's width takes three maps.
-    assert cut((64, 64 * 60), (64, 64), (32, 32), {"a": 0.5, "b": 0.5}).between == 3
+    assert cut((64, 64 * 60), (64, 64), (32, 32), {"a": 0.5, "b": 0.5}).n_omitted == 3
     # Maps that lie further apart than their width need none.
-    assert cut((64, 64 * 60), (64, 64), (128, 128), {"a": 0.5, "b": 0.5}).between == 0
+    assert cut((64, 64 * 60), (64, 64), (128, 128), {"a": 0.5, "b": 0.5}).n_omitted == 0
 
 
 def test_a_small_share_is_one_strip_and_small_ground_is_refused() -> None:
@@ -92,7 +92,7 @@ def test_a_small_share_is_one_strip_and_small_ground_is_refused() -> None:
     assert [
         len(strip) for strip in cut((8, 56), (8, 8), (8, 8), shares).strips.values()
     ] == [3, 1, 1]
-    with pytest.raises(DatasetError, match=r"ground for 3 splits.*got 4 maps"):
+    with pytest.raises(DatasetError, match=r"terrain for 3 splits.*got 4 maps"):
         cut((8, 39), (8, 8), (8, 8), shares)
 
 
