@@ -112,7 +112,7 @@ def test_the_robot_stands_where_it_was_and_its_end_is_marked() -> None:
 
 def test_the_legend_names_what_there_is_alone() -> None:
     recording = made.learning_recording(100)
-    ground = ["edge of where λ was sensed", "not seen", "reach of the sensors"]
+    ground = ["edge of cells with measured λ", "not observed", "reach of the sensors"]
     names = names_in_legend(draw_knowledge(recording))
     assert set(names) == {"driven", "start", "goal", "robot", "immobilised", *ground}
     bare: list[Any] = [
