@@ -93,8 +93,9 @@ def _titles(line: FailedLine, letters: int) -> list[str]:
 
 def _ending(row: Mapping[Any, Any]) -> str:
     outcome = outcome_in_words(row["outcome"])
-    end = f"{row['end_time_s']:.0f}\N{NO-BREAK SPACE}s"
-    return f"{row['scenario']}, map\N{NO-BREAK SPACE}{row['map']}: {outcome}, {end}"
+    map_name = _unbroken(f"{row['scenario']}, map {row['map']}:")
+    end = _unbroken(f"{outcome}, {row['end_time_s']:.0f} s")
+    return f"{map_name} {end}"
 
 
 def _traversability(recording: Recording, row: Mapping[Any, Any]) -> str:
@@ -105,7 +106,12 @@ def _traversability(recording: Recording, row: Mapping[Any, Any]) -> str:
         words = ["outside the map"]
     if not np.isnan(observed):
         words.append(f"observed λ = {observed:.2f}")
-    return ", ".join(words)
+    return ", ".join(map(_unbroken, words))
+
+
+def _unbroken(words: str) -> str:
+    """Return words that stay in one line of a wrapped title."""
+    return words.replace(" ", "\N{NO-BREAK SPACE}")
 
 
 def _draw_failure(panel: Axes, recording: Recording) -> None:

@@ -68,7 +68,7 @@ def test_one_that_is_not_worse_and_the_next_that_is() -> None:
         == "1 other setting is not significantly worse (p ≥ 0.05): MPPI, VaR."
     )
     assert sentences[2].startswith(
-        "MPPI, mean is significantly worse: 40 %, 50.0 points less (95 % interval of this pair only "
+        "MPPI, mean is significantly worse: 40 %, 50.0 points less (95 % interval "
     )
 
 
@@ -102,7 +102,7 @@ def test_the_interval_is_that_of_the_difference_and_the_power_that_of_the_hardes
     row = summary[summary["risk"] == "mean"].iloc[0]
     low, high = 100 * row["best_low"], 100 * row["best_high"]
     told = findings(summary, NONE, {})["std"][2]
-    assert f"(95 % interval of this pair only {low:.1f} to {high:.1f})" in told
+    assert f"(95 % interval {low:.1f} to {high:.1f}, of this pair only)" in told
     alike = summary_of(
         condition(90, risk="a"), condition(89, risk="b"), [*condition(87, risk="c")]
     )
