@@ -153,9 +153,11 @@ def _rank(
         )
         return
     if alike.empty:
-        subject = "The other setting is"
-        if len(worse) != 1:
-            subject = f"All {len(worse)} other settings are"
+        subject = f"All {len(worse)} other settings are"
+        if len(worse) == 1:
+            subject = "The other setting is"
+        elif len(worse) == 2:
+            subject = "Both other settings are"
         yield f"{subject} significantly worse."
     else:
         listed = list(alike["name"])

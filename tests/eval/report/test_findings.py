@@ -39,7 +39,7 @@ def test_a_best_that_all_others_are_worse_than() -> None:
     assert sentences[0] == (
         "MPPI, CVaR₀.₉ has the highest success rate: 90 % of the episodes reached the goal (95 % interval 83 to 94 %)."
     )
-    assert sentences[1] == "All 2 other settings are significantly worse."
+    assert sentences[1] == "Both other settings are significantly worse."
     assert sentences[2].startswith(
         "MPPI, mean is the best of those that are significantly worse: 40 %, 50.0 points less (95 % interval of this "
         "pair only "
