@@ -22,14 +22,8 @@ from benchnav.datagen.recipe.classes import TerrainClass, look_alike_classes
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.datagen.synth.appearance import light_direction, shade
 from benchnav.datagen.synth.elevation import horn_gradient, pad_missing
-from benchnav.viz.maps import (
-    draw_lines,
-    hatching,
-    lacking_handle,
-    mark,
-    mark_handle,
-    show_map,
-)
+from benchnav.viz.drives import mark, mark_handle
+from benchnav.viz.maps import draw_lines, hatching, lacking_handle, show_map
 from benchnav.viz.sheet import (
     LETTER,
     LINE,

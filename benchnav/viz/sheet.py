@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.artist import Artist
+from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
@@ -63,7 +64,7 @@ def layer_column(name: str, values: np.ndarray, unit: str) -> SheetColumn:
     Args:
         name: name of the layer.
         values: values of the layer, shape [R, H, W].
-        unit: unit of the values, `1` if there is none.
+        unit: unit of the values; `1` for values without a unit.
     """
     words = name.removesuffix(f"_{unit}").replace("_", " ")
     unit_text = {"1": "", "deg": " [°]"}.get(unit, f" [{unit}]")
@@ -98,41 +99,27 @@ def sheet_of_maps(
         if there are many columns.
     """
     ratio = extent_m[1] / extent_m[0]
-    across = len(columns)
-    max_width = max((TWO_COLUMNS_IN - _SIDES) / across, _COLUMN)
-    high = min(max_width * ratio, 2.0, max((_PAGE - _ENDS) / len(rows), 0.8))
-    width = across * max(high / ratio, _COLUMN) + _SIDES
+    n_rows = len(rows)
+    n_columns = len(columns)
+    max_width = max((TWO_COLUMNS_IN - _SIDES) / n_columns, _COLUMN)
+    max_height = max((_PAGE - _ENDS) / n_rows, 0.8)
+    high = min(max_width * ratio, 2.0, max_height)
+    width = n_columns * max(high / ratio, _COLUMN) + _SIDES
     letters = max((len(str(patch.get_label())) for patch in classes), default=0)
     legend_columns = max(1, int(width / (0.4 + LETTER * letters)))
-    ends = _ENDS + LINE * -(-len(classes) // legend_columns)
-    height = len(rows) * max(high, 0.5) + ends
+    legend_lines = -(-len(classes) // legend_columns)
+    ends = _ENDS + LINE * legend_lines
+    height = n_rows * max(high, 0.5) + ends
     figure = Figure(figsize=(width, height), dpi=_DPI, layout="constrained")
-    panels = figure.subplots(len(rows), across, squeeze=False, sharex=True, sharey=True)
+    shared = {"sharex": True, "sharey": True}
+    panels = figure.subplots(n_rows, n_columns, squeeze=False, **shared)
     for column, below in zip(columns, panels.T, strict=True):
-        for row, panel in enumerate(below):
-            panel.set(label=f"{column.name} {row}", facecolor=LACKING)
-            image = show_map(panel, column.layers[row], extent_m, **column.shades)
-            frame_map(panel)
-        below[0].set_title(column.title)
-        if column.unit is not None:
-            ticks = MaxNLocator(column.max_intervals, steps=[1, 2, 2.5, 5, 10])
-            bar = figure.colorbar(
-                image,
-                ax=list(below),
-                location="bottom",
-                extend=column.extend,
-                aspect=14,
-                panchor=False,
-                ticks=ticks,
-                format="%g",
-            )
-            bar.set_label(column.unit, size=TEXT)
-            bar.ax.set_label(f"{column.name} bar")
+        _draw_column(figure, column, list(below), extent_m)
     _set_ticks(panels[0, 0].xaxis, high / ratio)
     _set_ticks(panels[0, 0].yaxis, high)
     for panel, name in zip(panels[:, 0], rows, strict=True):
         panel.set_ylabel(name, size=TEXT)
-    panels[-1, across // 2].set_xlabel("x [m]", size=TEXT)
+    panels[-1, n_columns // 2].set_xlabel("x [m]", size=TEXT)
     figure.supylabel("y [m]", size=TEXT, y=0.5 + (ends / 2 - 0.45) / height)
     figure.suptitle(heading, x=0.01, ha="left", parse_math=False)
     if marks:
@@ -142,10 +129,39 @@ def sheet_of_maps(
     return figure
 
 
+def _draw_column(
+    figure: Figure,
+    column: SheetColumn,
+    panels: list[Axes],
+    extent_m: tuple[float, float],
+) -> None:
+    """Draw the maps of a column, downward, and its colour bar below them."""
+    for row, panel in enumerate(panels):
+        panel.set(label=f"{column.name} {row}", facecolor=LACKING)
+        image = show_map(panel, column.layers[row], extent_m, **column.shades)
+        frame_map(panel)
+    panels[0].set_title(column.title)
+    if column.unit is None:
+        return
+    ticks = MaxNLocator(column.max_intervals, steps=[1, 2, 2.5, 5, 10])
+    bar = figure.colorbar(
+        image,
+        ax=panels,
+        location="bottom",
+        extend=column.extend,
+        aspect=14,
+        panchor=False,
+        ticks=ticks,
+        format="%g",
+    )
+    bar.set_label(column.unit, size=TEXT)
+    bar.ax.set_label(f"{column.name} bar")
+
+
 def _set_ticks(axis: Axis, length_in: float) -> None:
     """Place the ticks of an axis with a length in inches."""
     max_intervals = min(max(int(length_in / 0.2), 1), 4)
-    # Without a tick at the end: its number would touch the first of the next panel.
+    # Omit a tick at the end: its number would touch the first of the next panel.
     locator = MaxNLocator(max_intervals, steps=[1, 2, 5, 10], prune="upper")
     axis.set_major_locator(locator)
 

@@ -12,7 +12,7 @@ from benchnav.eval.words import (
     contender_names,
     outcome_in_words,
 )
-from benchnav.viz import maps
+from benchnav.viz import drives, maps
 from benchnav.viz.figure import Figure
 from benchnav.viz.style import (
     LINE_COLOURS,
@@ -80,9 +80,9 @@ class DrivenPaths(Figure):
             outcome = outcome_in_words(row["outcome"])
             label = f"{names[index]}: {outcome}, {row['end_time_s']:.0f} s"
             look = {"ls": line_style(index), "label": label}
-            maps.draw_path(panel, tracks[index], thickness, colours[index], **look)
-        maps.mark(panel, "start", tracks[0][0])
-        maps.mark(panel, "goal", ground.goal_m)
+            drives.draw_path(panel, tracks[index], thickness, colours[index], **look)
+        drives.mark(panel, "start", tracks[0][0])
+        drives.mark(panel, "goal", ground.goal_m)
         maps.name_immobilising(panel, ground.immobilising)
         title = "λ field of the episode; lighter is higher"
         if ground.field is None:
@@ -92,9 +92,9 @@ class DrivenPaths(Figure):
         failed = np.flatnonzero(~rows["success"].to_numpy(bool))
         outcomes = [rows["outcome"].iloc[index] for index in failed]
         handles, _ = panel.get_legend_handles_labels()
-        for name in dict.fromkeys(map(maps.end_mark, outcomes)):
+        for name in dict.fromkeys(map(drives.end_mark, outcomes)):
             words = f"{name}, in the colour of its path"
-            handles.append(maps.mark_handle(name, label=words))
+            handles.append(drives.mark_handle(name, label=words))
         corner = (1.02, 1.01)
         if is_wide:
             corner = (0, -0.18 * wide / high)
@@ -107,7 +107,7 @@ class DrivenPaths(Figure):
         )
         failed_tracks = [tracks[index] for index in failed]
         failed_colours = [colours[index] for index in failed]
-        maps.mark_ends(panel, failed_tracks, outcomes, failed_colours)
+        drives.mark_ends(panel, failed_tracks, outcomes, failed_colours)
         return figure
 
 

@@ -13,7 +13,7 @@ from benchnav.eval.figures.data import RunData
 from benchnav.eval.figures.moment import drive_at
 from benchnav.eval.recording import Recording
 from benchnav.eval.words import outcome_in_words
-from benchnav.viz import maps
+from benchnav.viz import drives, maps
 from benchnav.viz.figure import Figure
 from benchnav.viz.style import ONE_COLUMN_IN, TWO_COLUMNS_IN, legend_outside
 
@@ -121,6 +121,6 @@ def _draw_failure(panel: Axes, recording: Recording) -> None:
     maps.show_map(panel, recording.predicted, extent_m, alpha=_LIGHT, **maps.LAMBDA)
     maps.overlay(panel, recording.immobilising, extent_m, maps.IMMOBILISING, 0.75)
     maps.name_immobilising(panel, recording.immobilising)
-    maps.draw_drive(panel, drive, width=1.1, scale=0.9, label="driven")
+    drives.draw_drive(panel, drive, width=1.1, scale=0.9, label="driven")
     panel.spines[:].set_visible(False)
     panel.set(xticks=[], yticks=[])

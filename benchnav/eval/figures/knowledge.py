@@ -13,7 +13,7 @@ from benchnav.eval.figures import moment
 from benchnav.eval.figures.data import RunData, choose_recordings
 from benchnav.eval.recording import Recording
 from benchnav.eval.words import contender_names
-from benchnav.viz import maps
+from benchnav.viz import drives, maps
 from benchnav.viz.figure import Figure
 from benchnav.viz.style import TWO_COLUMNS_IN, legend_outside
 
@@ -94,5 +94,5 @@ def _draw_belief(panel: Axes, recording: Recording, step: int, name: str) -> Non
         words = "edge of cells with measured λ"
         panel.plot([], [], color="white", lw=0.5, path_effects=stroke, label=words)
     drive = moment.drive_at(recording, step)
-    maps.draw_drive(panel, drive, width=1.2, scale=0.8, label="driven")
+    drives.draw_drive(panel, drive, width=1.2, scale=0.8, label="driven")
     maps.frame_map(panel)

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.recording import Recording
-from benchnav.viz import maps, plans
+from benchnav.viz import drives, maps, plans
 from benchnav.viz.style import bytes_of
 
 # Red, green and blue of unobserved cells, observed cells, and cells with measured λ.
@@ -102,10 +102,10 @@ def draw_plan(panel: Axes, recording: Recording, step: int) -> None:
         plans.draw_plan(panel, plan.lines)
 
 
-def drive_at(recording: Recording, step: int) -> maps.Drive:
+def drive_at(recording: Recording, step: int) -> drives.Drive:
     """Return the path of a recording up to a step."""
     outcome = recording.about["outcome"] if has_ended(recording, step) else ""
-    return maps.Drive(
+    return drives.Drive(
         track=recording.track[: step + 1],
         goal_m=recording.goal_m,
         outcome=outcome,

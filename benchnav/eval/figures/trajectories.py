@@ -15,7 +15,7 @@ from benchnav.eval.figures import moment
 from benchnav.eval.figures.data import RunData, choose_recordings
 from benchnav.eval.recording import Recording
 from benchnav.eval.words import chosen_in_words, episode_names
-from benchnav.viz import maps, plans
+from benchnav.viz import drives, maps, plans
 from benchnav.viz.figure import Figure
 from benchnav.viz.style import (
     ONE_COLUMN_IN,
@@ -138,7 +138,7 @@ def _draw_terrain(panel: Axes, recording: Recording, title: str) -> None:
         maps.name_terrain(panel, "soft terrain, which no image shows", **look)
     moment.draw_plan(panel, recording, recording.now)
     drive = moment.drive_at(recording, recording.now)
-    maps.draw_drive(panel, drive, 2)
+    drives.draw_drive(panel, drive, 2)
     panel.add_collection(plans.driven_colours(drive.track, recording.traversability, 2))
     panel.set_title(title)
 
@@ -148,12 +148,12 @@ def _draw_predicted(panel: Axes, recording: Recording) -> None:
     moment.show_known(panel, recording, recording.now)
     moment.draw_plan(panel, recording, recording.now)
     words = "driven; above in the colour of the observed λ"
-    maps.draw_drive(panel, moment.drive_at(recording, recording.now), label=words)
+    drives.draw_drive(panel, moment.drive_at(recording, recording.now), label=words)
     panel.set_title(moment.known_in_words(recording))
 
 
 def _draw_field(panel: Axes, recording: Recording) -> None:
     """Draw the λ field and the driven path."""
     moment.show_truth(panel, recording)
-    maps.draw_drive(panel, moment.drive_at(recording, len(recording.traversability)))
+    drives.draw_drive(panel, moment.drive_at(recording, len(recording.traversability)))
     panel.set_title("whole path, over the λ field")

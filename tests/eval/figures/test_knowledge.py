@@ -20,7 +20,8 @@ from benchnav.eval.folder.sealed import read_sealed
 from benchnav.eval.recording import Recording
 from benchnav.eval.report import write
 from benchnav.stats.bootstrap import LEAST_MAPS
-from benchnav.viz.maps import MARKS, hatching, robot_marker
+from benchnav.viz.drives import MARKS, robot_marker
+from benchnav.viz.maps import hatching
 from benchnav.viz.style import TWO_COLUMNS_IN
 from tests.eval.forged import forge_steps
 from tests.eval.report import made

@@ -11,7 +11,8 @@ from benchnav.eval.figures.data import choose_recordings
 from benchnav.eval.figures.moment import known_colours
 from benchnav.eval.figures.trajectories import draw_trajectories
 from benchnav.eval.recording import Recording
-from benchnav.viz.maps import CLOSED, MARKS, field_colours, hatching, robot_marker
+from benchnav.viz.drives import MARKS, robot_marker
+from benchnav.viz.maps import CLOSED, field_colours, hatching
 from benchnav.viz.style import TWO_COLUMNS_IN, bytes_of, save_twice
 from tests.eval.report import made
 

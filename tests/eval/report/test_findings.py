@@ -41,8 +41,7 @@ def test_a_best_that_all_others_are_worse_than() -> None:
     )
     assert sentences[1] == "Both other settings are significantly worse."
     assert sentences[2].startswith(
-        "MPPI, mean is the best of those that are significantly worse: 40 %, 50.0 points less (95 % interval of this "
-        "pair only "
+        "MPPI, mean is the best of those that are significantly worse: 40 %, 50.0 points less (95 % interval "
     )
     assert sentences[2].endswith(
         ", p = 0.0005 (max-T bootstrap test by map over 3 settings)."

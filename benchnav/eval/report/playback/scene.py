@@ -18,14 +18,8 @@ from benchnav.core.grid import outline
 from benchnav.eval.figures.moment import known_colours, true_colours
 from benchnav.eval.recorded_plans import thinned
 from benchnav.eval.recording import Recording, drawing_interval
-from benchnav.viz.maps import (
-    MARKS,
-    REACH,
-    SOFT,
-    hatching,
-    layer_colours,
-    shades,
-)
+from benchnav.viz.drives import MARKS
+from benchnav.viz.maps import REACH, SOFT, hatching, layer_colours, shades
 from benchnav.viz.plans import STYLES
 from benchnav.viz.style import bytes_of
 

@@ -20,7 +20,7 @@ from benchnav.core.store import replacing
 from benchnav.eval.figures import moment
 from benchnav.eval.recording import Recording
 from benchnav.eval.words import episode_names
-from benchnav.viz import maps
+from benchnav.viz import drives, maps
 from benchnav.viz.style import (
     TEXT,
     condition_colours,
@@ -226,7 +226,7 @@ class Frames:
         label = "driven, in the colour of its title" if several else "driven"
         drive = moment.drive_at(self._recordings[index], step)
         look = {"colour": self._colours[index], "ls": line_style(index)}
-        maps.draw_drive(panel, drive, 1.8, label=label, **look)
+        drives.draw_drive(panel, drive, 1.8, label=label, **look)
 
 
 def _step(recording: Recording, time_s: float) -> int:
