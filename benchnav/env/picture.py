@@ -124,7 +124,7 @@ class Picture:
         light = np.where(seen > 0, 1.0, _UNSEEN)[..., None]
         image = matplotlib.colormaps[colours](values)[..., :3] * light
         is_off_map = (seen <= 0) & (spread == 0) & (scene.crop[0] == 0)
-        image[is_off_map] = to_rgb(maps.LACKING)
+        image[is_off_map] = to_rgb(maps.MISSING)
         cells = len(values)
         # Ahead is up, and the robot's left is left.
         maps.show_map(panel, image.transpose(1, 0, 2)[:, ::-1], (cells, cells))

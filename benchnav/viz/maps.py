@@ -22,14 +22,14 @@ TRAVERSABILITY_COLOURS = "viridis"
 LAMBDA: dict[str, Any] = {"cmap": TRAVERSABILITY_COLOURS, "vmin": 0, "vmax": 1}
 SPREAD_COLOURS = "magma"  # certain cells are dark
 MAX_SPREAD = 0.5  # maximum standard deviation of a quantity in [0, 1]
-LACKING = "0.7"  # cells without a value
+MISSING = "0.7"  # cells without a value
 # Dark red differs from all colours of λ, for all kinds of colour vision.
 IMMOBILISING = "#a00000"
 SOFT = "white"
 CLOSED = "0.25"  # non-free cells
 UNSEEN, VEIL = "0.6", 0.55  # colour over unobserved cells, and its opacity
 ROBOT = "#ff7800"  # not a colour of λ
-REACH = ROBOT  # outline of the sensors' range
+FOOTPRINT = ROBOT  # outline of the sensors' range
 SEEN, SENSED = "0.9", SKY
 _LAYER_COLOURS, _DIRECTION_COLOURS = "YlGnBu", "twilight"
 _HATCH_CELLS = 4  # distance of hatching lines
@@ -187,29 +187,29 @@ def layer_scale(name: str, values: np.ndarray) -> dict[str, Any]:
         values: values of any shape, NaN for unknown ones.
     """
     if is_azimuth(name):
-        return {"cmap": with_lacking(_DIRECTION_COLOURS), "vmin": 0.0, "vmax": 360.0}
+        return {"cmap": with_missing(_DIRECTION_COLOURS), "vmin": 0.0, "vmax": 360.0}
     finite = values[np.isfinite(values)]
     low = float(np.min(finite, initial=0.0))
     high = float(np.max(finite, initial=0.0))
     if high <= low:
         high = low + 1.0
-    return {"cmap": with_lacking(_LAYER_COLOURS), "vmin": low, "vmax": high}
+    return {"cmap": with_missing(_LAYER_COLOURS), "vmin": low, "vmax": high}
 
 
-def with_lacking(colours: str | np.ndarray) -> Colormap:
+def with_missing(colours: str | np.ndarray) -> Colormap:
     """Return a colour map with grey for masked cells.
 
     Args:
         colours: name of a colour map, or its colours of shape [C, 3].
     """
     if isinstance(colours, str):
-        return matplotlib.colormaps[colours].with_extremes(bad=LACKING)
-    return ListedColormap(list(colours)).with_extremes(bad=LACKING)
+        return matplotlib.colormaps[colours].with_extremes(bad=MISSING)
+    return ListedColormap(list(colours)).with_extremes(bad=MISSING)
 
 
-def lacking_handle() -> Patch:
+def missing_handle() -> Patch:
     """Return the entry of a legend for cells without a value."""
-    return Patch(facecolor=LACKING, label="unknown")
+    return Patch(facecolor=MISSING, label="unknown")
 
 
 def shades(values: np.ndarray, colours: str = TRAVERSABILITY_COLOURS) -> np.ndarray:

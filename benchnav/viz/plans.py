@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.patheffects import AbstractPathEffect, Normal, withStroke
 
-from benchnav.viz.maps import REACH, TRAVERSABILITY_COLOURS
+from benchnav.viz.maps import FOOTPRINT, TRAVERSABILITY_COLOURS
 
 _LINE_WIDTH = 0.4  # of the thinnest line of a plan
 
@@ -82,7 +82,7 @@ def driven_colours(
     return path
 
 
-def draw_reach(panel: Axes, outline_m: np.ndarray) -> None:
+def draw_footprint(panel: Axes, outline_m: np.ndarray) -> None:
     """Draw the outline of the sensors' range on a map.
 
     Args:
@@ -92,4 +92,4 @@ def draw_reach(panel: Axes, outline_m: np.ndarray) -> None:
     edge = [withStroke(linewidth=1.1, foreground="black"), Normal()]
     style: dict[str, Any] = {"lw": 0.6, "path_effects": edge, "zorder": 2.2}
     # A single line with gaps, so that no segment's edge covers another segment.
-    panel.plot(*outline_m.T, color=REACH, label="reach of the sensors", **style)
+    panel.plot(*outline_m.T, color=FOOTPRINT, label="footprint of the sensors", **style)

@@ -18,12 +18,12 @@ from matplotlib.ticker import MaxNLocator
 
 from benchnav.core.grid import is_azimuth
 from benchnav.viz.maps import (
-    LACKING,
     LAMBDA,
+    MISSING,
     frame_map,
     layer_scale,
     show_map,
-    with_lacking,
+    with_missing,
 )
 from benchnav.viz.style import TEXT, TWO_COLUMNS_IN, legend_outside, styled
 
@@ -32,8 +32,9 @@ _DPI = 300.0
 _SIDES, _ENDS = 0.7, 1.5  # width and height of a sheet without its maps
 LINE, LETTER = 0.135, 0.054  # height of a line and mean width of a letter
 _COLUMN = 1.15  # minimum width of a column
+_BAR_GAP = 0.08  # between a column and its colour bar
 _TITLE_LETTERS = 20  # of a layer's name per line, which fit in a column
-SHARES: dict[str, Any] = {**LAMBDA, "cmap": with_lacking("viridis")}
+FRACTIONS: dict[str, Any] = {**LAMBDA, "cmap": with_missing("viridis")}
 
 
 class SheetColumn(NamedTuple):
@@ -114,7 +115,11 @@ def sheet_of_maps(
     shared = {"sharex": True, "sharey": True}
     panels = figure.subplots(n_rows, n_columns, squeeze=False, **shared)
     for column, below in zip(columns, panels.T, strict=True):
-        _draw_column(figure, column, list(below), extent_m)
+        image = _draw_column(column, below, extent_m)
+        if column.unit is not None:
+            # Matplotlib expects the gap as a fraction of the height of all maps.
+            gap = _BAR_GAP / (height - ends)
+            _draw_bar(figure, column, image, list(below), gap)
     _set_ticks(panels[0, 0].xaxis, high / ratio)
     _set_ticks(panels[0, 0].yaxis, high)
     for panel, name in zip(panels[:, 0], rows, strict=True):
@@ -130,24 +135,27 @@ def sheet_of_maps(
 
 
 def _draw_column(
-    figure: Figure,
-    column: SheetColumn,
-    panels: list[Axes],
-    extent_m: tuple[float, float],
-) -> None:
-    """Draw the maps of a column, downward, and its colour bar below them."""
+    column: SheetColumn, panels: Sequence[Axes], extent_m: tuple[float, float]
+) -> Any:
+    """Draw the maps of a column, downward; return the last image."""
     for row, panel in enumerate(panels):
-        panel.set(label=f"{column.name} {row}", facecolor=LACKING)
+        panel.set(label=f"{column.name} {row}", facecolor=MISSING)
         image = show_map(panel, column.layers[row], extent_m, **column.shades)
         frame_map(panel)
     panels[0].set_title(column.title)
-    if column.unit is None:
-        return
+    return image
+
+
+def _draw_bar(
+    figure: Figure, column: SheetColumn, image: Any, panels: list[Axes], gap: float
+) -> None:
+    """Draw the colour bar of an image below the panels of its column."""
     ticks = MaxNLocator(column.max_intervals, steps=[1, 2, 2.5, 5, 10])
     bar = figure.colorbar(
         image,
         ax=panels,
         location="bottom",
+        pad=gap,
         extend=column.extend,
         aspect=14,
         panchor=False,
@@ -189,4 +197,4 @@ def class_scale(colours: np.ndarray) -> dict[str, Any]:
     Args:
         colours: colours of the classes, shape [C, 3].
     """
-    return {"cmap": with_lacking(colours), "vmin": -0.5, "vmax": len(colours) - 0.5}
+    return {"cmap": with_missing(colours), "vmin": -0.5, "vmax": len(colours) - 0.5}

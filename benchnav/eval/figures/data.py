@@ -25,7 +25,7 @@ class Driven:
 
     Args:
         ground: the map.
-        rows: an episode a condition.
+        rows: one episode per condition.
         tracks: positions of each episode, shape [N + 1, 2].
     """
 
@@ -46,15 +46,15 @@ class RunData:
     Args:
         about: contents of `run.json`; if the run is not finished, only with conditions
             that have rows.
-        summary: a row a condition, from `summary.summarise`, joined with
+        summary: one row per condition, from `summary.summarise`, joined with
             `best.against_best`.
         episodes: rows of episodes.
-        tests: a row a hypothesis, from `hypotheses.test_hypotheses`; empty if the suite
-            has none.
+        tests: one row per hypothesis, from `hypotheses.test_hypotheses`; empty without
+            hypotheses.
         regret: from `regret.split_regret`; empty if the run has no chain.
-        failures: a row a failed episode.
+        failures: one row per failed episode.
         sheets: failures on their maps.
-        folder: the run folder; None if the run was not saved, and thus has no steps or
+        folder: the run folder; None if the run was not saved and has no steps or
             recordings.
         record_driven: records driven episodes again, such as
             `run.recordings.record_driven`.
@@ -139,7 +139,7 @@ def read_driven(folder: Path, episodes: pd.DataFrame) -> Driven | None:
 def choose_recordings(
     recordings: Sequence[Recording], conditions: Sequence[str]
 ) -> list[Recording]:
-    """Choose one recording a condition, up to `MAX_PANELS`, on one map if possible.
+    """Choose one recording per condition, up to `MAX_PANELS`, on one map if possible.
 
     The map is one that the first condition was recorded on: the first on which outcomes
     differ, else the first on which an episode failed.

@@ -23,7 +23,7 @@ _LINE_IN = 0.12  # height of a line of a title
 
 
 class Failures(Figure):
-    """Failures of the best setting of a block and of the worst, a line a condition.
+    """Failures of the best and the worst setting of a block, one line per condition.
 
     Attributes:
         index: index of the sheet among those of the run.
@@ -33,7 +33,7 @@ class Failures(Figure):
     index = 0
 
     def variants(self, data: RunData) -> Sequence[Self]:
-        """Return a figure a block."""
+        """Return one figure per block."""
         return self.numbered(len(data.sheets.shown))
 
     def caption(self, data: RunData) -> str:
@@ -47,7 +47,7 @@ class Failures(Figure):
         )
 
     def draw(self, data: RunData) -> Drawing:
-        """Draw a line a condition, a panel a failure."""
+        """Draw a line of panels for each condition, with one panel per failure."""
         _, lines = data.sheets.shown[self.index]
         across = max(len(line.recordings) for line in lines)
         height, width = lines[0].recordings[0].grid.shape

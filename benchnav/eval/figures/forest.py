@@ -64,7 +64,7 @@ class Forest(Figure):
         return " ".join(sentences)
 
     def draw(self, data: RunData) -> Drawing:
-        """Draw a row a hypothesis and a panel a metric, with a band a margin allows."""
+        """Draw one row per hypothesis, one panel per metric, and bands of margins."""
         all_quantities = quantities(further_quantities(data.about))
         numbered = data.tests.assign(number=range(1, len(data.tests) + 1))
         panels = {

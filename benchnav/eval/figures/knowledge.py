@@ -37,7 +37,7 @@ class KnowledgeMaps(Figure):
     index = 0
 
     def variants(self, data: RunData) -> Sequence[Self]:
-        """Return a figure a condition."""
+        """Return one figure per condition."""
         return self.numbered(len(_learners(data)))
 
     def caption(self, data: RunData) -> str:

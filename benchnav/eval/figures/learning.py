@@ -103,10 +103,10 @@ def read_learning(folder: Path, episodes: pd.DataFrame) -> pd.DataFrame:
         episodes: rows of the run.
 
     Returns:
-        A row a condition and time bin with at least `LEAST_MAPS` maps, or groups of
+        One row per condition and time bin with at least `LEAST_MAPS` maps, or groups of
         maps: `condition`; `time_s`, the middle of the bin; `maps`, their number; and
         the mean of each of `METRICS` over them, with its 95 % interval in the columns
-        `_low` and `_high`. Empty if no robot learnt, or no steps were stored.
+        `_low` and `_high`. Empty if no robot learnt or no steps were stored.
     """
     names = list(METRICS)
     first_name = names[0]

@@ -21,7 +21,7 @@ def divide_lines(
     A blind planner is repeated in all panels of its scenario that have other lines.
 
     Args:
-        labels: a row a line, indexed from 0, a column a kind of label.
+        labels: one row per line, indexed from 0, and one column per kind of label.
         alternatives: columns that panels differ in.
 
     Returns:

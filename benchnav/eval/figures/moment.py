@@ -72,7 +72,7 @@ def show_known(
         look = {"fc": maps.UNSEEN, "ec": "black", "hatch": "////"}
         maps.name_terrain(panel, "not observed", lw=0, **look)
     if known_map.outlines:
-        plans.draw_reach(panel, known_map.outline)
+        plans.draw_footprint(panel, known_map.outline)
 
 
 def known_in_words(recording: Recording) -> str:

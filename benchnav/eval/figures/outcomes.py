@@ -1,4 +1,4 @@
-"""Fractions of outcomes, a bar a condition."""
+"""Fractions of outcomes, one bar per condition."""
 
 from typing import Any
 
@@ -36,7 +36,7 @@ class Outcomes(Figure):
     text = "Outcomes of the episodes."
 
     def draw(self, data: RunData) -> Drawing:
-        """Draw a bar a condition."""
+        """Draw one bar per condition."""
         occurring = [name for name in LOOKS if data.summary[f"{name}_count"].sum()]
         legend_lines = 1 + len(occurring) // 3
         label = "fraction of episodes [%]"

@@ -1,4 +1,4 @@
-"""Sweeps of a run as curves: conditions that differ in one number of three values."""
+"""Sweeps of a run as curves: conditions that differ in one number only."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -68,7 +68,7 @@ class Line:
 
     Args:
         values: values of the number, ascending.
-        conditions: ids, one a value.
+        conditions: ids, one per value.
         rest: all other settings of the conditions, by dotted name.
     """
 
@@ -175,7 +175,7 @@ class Over(Figure):
     lines: Sequence[Line] = ()
 
     def variants(self, data: RunData) -> Sequence[Self]:
-        """Return a figure a sweep."""
+        """Return one figure per sweep."""
         sweeps = find_sweeps(data.about["conditions"])
         counts = Counter(map(sweep_name, sweeps))
         figures = []
@@ -347,7 +347,7 @@ def _reference_handles(references: Sequence[Reference]) -> list[Line2D]:
 def _label_lines(
     number: str, lines: Sequence[Line], rows: pd.DataFrame
 ) -> pd.DataFrame:
-    """Return `_LABELS`, `planner` and `name` of each line, a row a line.
+    """Return `_LABELS`, `planner` and `name` in one row per line.
 
     A swept part is named without its label, which contains the number.
     """

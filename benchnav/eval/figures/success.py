@@ -23,7 +23,7 @@ _POINT: dict[str, Any] = {"marker": "o", "ms": 4, "ls": "none", "color": "0.2"}
 
 
 class Success(Figure):
-    """Success rate of each condition with its 95 % interval, a panel a block."""
+    """Success rate of each condition with its 95 % interval, one panel per block."""
 
     name = "success"
     text = (
@@ -34,7 +34,7 @@ class Success(Figure):
     )
 
     def draw(self, data: RunData) -> Drawing:
-        """Draw a point a condition, and a blind planner as a line through its panel."""
+        """Draw one point per condition, and blind planners as lines through panels."""
         handles = _handles(data.summary)
         legend_in = 0.15 * len(handles)
         figure, panels = lay_out(data.summary, ["success [%]"], legend_in)

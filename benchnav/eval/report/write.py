@@ -86,7 +86,7 @@ class Report(RunData):
             return table
         return replace(table, notes=(_capital(self.mark), *table.notes))
 
-    def says(self, text: str) -> str:
+    def marked_text(self, text: str) -> str:
         """Return a text, preceded by the mark of a run that is not finished."""
         return f"{_capital(self.mark)}. {text}" if self.mark else text
 
@@ -226,10 +226,12 @@ def write_report(
     texts["failures.csv"] = report.csv(report.failures, digits=4)
     comment_lines = (*report.header, *report.table.notes, *report.warnings)
     comments = "".join(f"% {line}\n" for line in comment_lines)
-    paper = paper_table(report.summary, report.name, report.says(""))
+    paper = paper_table(report.summary, report.name, report.marked_text(""))
     texts["summary.tex"] = comments + paper
     if not report.tests.empty:
-        caption = report.says("Tests of the hypotheses that were fixed before the run.")
+        caption = report.marked_text(
+            "Tests of the hypotheses that were fixed before the run."
+        )
         label = f"{report.name}-hypotheses"
         texts["hypotheses.tex"] = to_latex([report.hypotheses], caption, label)
     for name, text in texts.items():
@@ -299,7 +301,7 @@ def _save_figures(
             raise ConfigError(
                 f"Expected a figure with a unique name, got {figure.name!r}. Rename it."
             )
-        caption = report.says(figure.caption(report))
+        caption = report.marked_text(figure.caption(report))
         mark = _capital(report.mark)
         save_twice(figure(report), path, trim=figure.trim, mark=mark)
         captions[path] = caption

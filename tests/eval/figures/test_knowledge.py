@@ -72,7 +72,7 @@ def test_four_moments_from_start_to_end_show_what_was_known_by_then() -> None:
             (reach,) = [
                 line
                 for line in panel.lines
-                if line.get_label() == "reach of the sensors"
+                if line.get_label() == "footprint of the sensors"
             ]
             np.testing.assert_array_equal(np.transpose(reach.get_data()), known.outline)
             (driven,) = [line for line in panel.lines if line.get_label() == "driven"]
@@ -113,7 +113,11 @@ def test_the_robot_stands_where_it_was_and_its_end_is_marked() -> None:
 
 def test_the_legend_names_what_there_is_alone() -> None:
     recording = made.learning_recording(100)
-    ground = ["edge of cells with measured λ", "not observed", "reach of the sensors"]
+    ground = [
+        "edge of cells with measured λ",
+        "not observed",
+        "footprint of the sensors",
+    ]
     names = names_in_legend(draw_knowledge(recording))
     assert set(names) == {"driven", "start", "goal", "robot", "immobilised", *ground}
     bare: list[Any] = [

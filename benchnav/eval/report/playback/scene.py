@@ -19,7 +19,7 @@ from benchnav.eval.figures.moment import known_colours, true_colours
 from benchnav.eval.recorded_plans import thinned
 from benchnav.eval.recording import Recording, drawing_interval
 from benchnav.viz.drives import MARKS
-from benchnav.viz.maps import REACH, SOFT, hatching, layer_colours, shades
+from benchnav.viz.maps import FOOTPRINT, SOFT, hatching, layer_colours, shades
 from benchnav.viz.plans import STYLES
 from benchnav.viz.style import bytes_of
 
@@ -220,7 +220,7 @@ def _log_known(stage: Stage, driver: Driver) -> None:
         edge = outline(~free, recording.resolution_m)
         stage.edges(driver.entity("map/closed"), edge, _CLOSED, 0.08, not learns)
     entities = driver.entities("reach")
-    colours = [driver.colour if driver.name else bytes_of(REACH)]
+    colours = [driver.colour if driver.name else bytes_of(FOOTPRINT)]
     for known_map in recording.known:
         stage.at(known_map.step)
         lines = known_map.outlines

@@ -265,7 +265,7 @@ def test_the_map_changes_when_more_is_known_and_only_then() -> None:
     np.testing.assert_array_equal(
         panel.collections[0].get_segments(), hatching(~known.seen, 0.5)
     )
-    reach = labelled(panel)["reach of the sensors"]
+    reach = labelled(panel)["footprint of the sensors"]
     np.testing.assert_array_equal(np.transpose(reach.get_data()), known.outline)
     assert "λ̂ of the belief at that time" in words_of(panel)
     # Back in time as well.
@@ -292,7 +292,7 @@ def test_ground_that_was_not_seen_lies_under_a_veil() -> None:
 def test_the_legend_names_what_learning_shows() -> None:
     learning, words = (
         made.learning_recording(20),
-        {"not observed", "reach of the sensors"},
+        {"not observed", "footprint of the sensors"},
     )
     assert words < named(learning)
     seen = replace(
