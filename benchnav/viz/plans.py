@@ -4,7 +4,7 @@ Letters in shapes: N positions.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -31,7 +31,7 @@ class LayerStyle(NamedTuple):
     label: str
     colour: str
     width: float
-    dashes: str = "solid"
+    dashes: Literal["solid", "dashed"] = "solid"
     effects: Sequence[AbstractPathEffect] = ()
 
 

@@ -112,7 +112,7 @@ def sheet_of_maps(
     ends = _ENDS + LINE * legend_lines
     height = n_rows * max(high, 0.5) + ends
     figure = Figure(figsize=(width, height), dpi=_DPI, layout="constrained")
-    shared = {"sharex": True, "sharey": True}
+    shared: dict[str, Any] = {"sharex": True, "sharey": True}
     panels = figure.subplots(n_rows, n_columns, squeeze=False, **shared)
     for column, below in zip(columns, panels.T, strict=True):
         image = _draw_column(column, below, extent_m)
@@ -162,7 +162,7 @@ def _draw_bar(
         ticks=ticks,
         format="%g",
     )
-    bar.set_label(column.unit, size=TEXT)
+    bar.set_label(str(column.unit), size=TEXT)
     bar.ax.set_label(f"{column.name} bar")
 
 

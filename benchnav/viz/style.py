@@ -216,7 +216,7 @@ def legend_outside(
     if figure.get_figwidth() < TWO_COLUMNS_IN:
         columns = -(-columns // 2)
     all_handles = [*labelled.values(), *handles]
-    return figure.legend(handles=all_handles, loc=f"outside {side}", ncols=columns)
+    return figure.legend(handles=all_handles, loc="outside " + side, ncols=columns)
 
 
 def page_width(count: int, across: int) -> float:

@@ -117,7 +117,7 @@ def _draw_tests(panel: Axes, rows: pd.DataFrame, quantity: Quantity) -> None:
             low = row[f"low{suffix}"]
             high = row[f"high{suffix}"]
             draw_interval(panel, low, high, height, BLUE, width)
-        look = {"ms": 4.5, "mfc": BLUE if row["supported"] else "white"}
+        look: dict[str, Any] = {"ms": 4.5, "mfc": BLUE if row["supported"] else "white"}
         panel.plot(row["difference"], height, "o", color=BLUE, zorder=3, **look)
         p = p_in_words(row["p_holm"])
         panel.text(1.01, height, p, transform=side, va="center", size=TEXT)

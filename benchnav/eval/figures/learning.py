@@ -36,11 +36,11 @@ class Learning(Figure):
 
     name = "learning"
     text = (
-        f"Belief of robots about the terrain ahead of them, within {AHEAD_M:g} m and "
-        f"{AHEAD_DEG:g}° to either side, where they have not measured λ: RMSE of E[λ] "
-        "and mean log score, over the time since the start. Lines are means over the "
-        f"maps on which a robot still drives, one for every {_BIN_S:g} s; bands are "
-        "95 % intervals (bootstrap over maps). Times with fewer than "
+        "Accuracy of the belief about the terrain ahead of a robot: cells within "
+        f"{AHEAD_M:g} m and {AHEAD_DEG:g}° to either side whose λ was not measured. "
+        "RMSE of E[λ] and mean log score, over the time since the start. Lines are "
+        f"means for every {_BIN_S:g} s, over the maps on which a robot still drives. "
+        "Bands are 95 % intervals (bootstrap over maps). Times with fewer than "
         f"{LEAST_MAPS} maps are left out."
     )
 

@@ -54,7 +54,7 @@ class Regret(Figure):
         chains = data.regret["chain"].nunique()
         sentences = [
             "Regret against the near-optimal reference, which plans on λ itself and is "
-            "no bound: paired differences in each step from a planner to the "
+            "not a bound: paired differences in each step from a planner to the "
             "reference, on common episodes.",
             "Black lines are 95 % intervals.",
         ]
@@ -138,8 +138,8 @@ def _draw_chain(panel: Axes, rows: pd.DataFrame, measure: str) -> None:
         colour = ORANGE if improves else BLUE
         panel.barh(height, width, left=start, color=colour, **_BAR)
         maximum = None if more_is_worse else factor
-        interval = np.clip([start - high, start - low], 0, maximum)
-        draw_interval(panel, *interval, height, "black", 0.9)
+        from_x, to_x = np.clip([start - high, start - low], 0, maximum)
+        draw_interval(panel, from_x, to_x, height, "black", 0.9)
         words = signed(-difference)
         if not np.isnan(low):  # few maps have no interval
             words += f" ({signed_interval(-high, -low)})"

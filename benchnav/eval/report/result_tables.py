@@ -113,8 +113,8 @@ _RESULTS = (
     Column(
         _TOTAL_TIME.heading,
         _total_time,
-        f"mean {_TOTAL_TIME.meaning}, with its 95 % interval in brackets; no interval "
-        f"below {LEAST_MAPS} maps.",
+        f"mean {_TOTAL_TIME.meaning}. In brackets: its 95 % interval, with "
+        f"{LEAST_MAPS} maps or more.",
     ),
     Column(
         "T if success [s]",
@@ -258,7 +258,8 @@ def learning_table(summary: pd.DataFrame) -> Table | None:
         Column(
             "planning [ms]",
             cell_of("planning_ms_median", _times),
-            "time of a step for planning, likewise: median over steps.",
+            "planning time of a step of a batch, divided by its number of episodes: "
+            "median over steps.",
         ),
     ]
     columns += _columns_to_full(rows, summary)

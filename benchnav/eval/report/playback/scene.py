@@ -167,8 +167,8 @@ def log_terrain(stage: Stage) -> None:
     radii = (0.35, 0.7)
     for name, position in (("start", recording.track[0]), ("goal", recording.goal_m)):
         entities = (f"world/{name}", f"map/places/{name}")
-        look = {"static": True, "colors": [bytes_of(MARKS[name]["color"])]}
-        stage.on_both(entities, _POINTS, [position], radii, **look)
+        colours = [bytes_of(MARKS[name]["color"])]
+        stage.on_both(entities, _POINTS, [position], radii, static=True, colors=colours)
 
 
 def _mesh(recording: Recording) -> Any:
@@ -220,11 +220,11 @@ def _log_known(stage: Stage, driver: Driver) -> None:
         edge = outline(~free, recording.resolution_m)
         stage.edges(driver.entity("map/closed"), edge, _CLOSED, 0.08, not learns)
     entities = driver.entities("reach")
-    colours = [driver.colour if driver.name else bytes_of(FOOTPRINT)]
+    line_colours = [driver.colour if driver.name else bytes_of(FOOTPRINT)]
     for known_map in recording.known:
         stage.at(known_map.step)
         lines = known_map.outlines
-        stage.on_both(entities, _STRIPS, lines, (0.05, 0.15), colors=colours)
+        stage.on_both(entities, _STRIPS, lines, (0.05, 0.15), colors=line_colours)
 
 
 def _log_robot(stage: Stage, driver: Driver) -> None:
@@ -243,14 +243,14 @@ def _log_robot(stage: Stage, driver: Driver) -> None:
     ):
         robot = driver.entity(root, "robot")
         moving = dots.columns(positions=positions)
-        look = dots.from_fields(radii=[radius], colors=[driver.colour])
+        dot = dots.from_fields(radii=[radius], colors=[driver.colour])
         stage.stream.send_columns(robot, [times], moving)
-        stage.stream.log(robot, look, static=True)
+        stage.stream.log(robot, dot, static=True)
         heading = driver.entity(root, "heading")
         turning = arrows.columns(origins=positions, vectors=vectors)
-        look = arrows.from_fields(radii=[radius / 3], colors=[driver.colour])
+        arrow = arrows.from_fields(radii=[radius / 3], colors=[driver.colour])
         stage.stream.send_columns(heading, [times], turning)
-        stage.stream.log(heading, look, static=True)
+        stage.stream.log(heading, arrow, static=True)
 
 
 def _times(recording: Recording, count: int) -> Any:
