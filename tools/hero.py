@@ -27,7 +27,7 @@ from benchnav.eval.folder.results import read_results
 from benchnav.eval.recording import Recording
 from benchnav.eval.report.playback.video import SPEED, Frames
 from benchnav.eval.run.recordings import record_driven
-from benchnav.viz import maps
+from benchnav.viz import drives, maps
 from benchnav.viz.style import BLUE, ORANGE, save, styled
 
 FIGURES = Path(__file__).parents[1] / "docs/figures"
@@ -111,7 +111,7 @@ def draw_terrain(panel: Axes3D, pair: Pair) -> None:
             [x_m],
             [y_m],
             [top + 0.4],
-            **maps.MARKS[name] | {"ms": 1.3 * maps.MARKS[name]["ms"]},
+            **drives.MARKS[name] | {"ms": 1.3 * drives.MARKS[name]["ms"]},
         )
     panel.set_box_aspect((1, rows / columns, 0.22), zoom=1.15)
     panel.view_init(elev=50, azim=-62)
@@ -135,7 +135,7 @@ def draw_hero(pair: Pair) -> Figure:
         name, colour = RISKS[own.about["risk"]]
         image = maps.show_map(panel, own.predicted, own.grid.extent_m, **maps.LAMBDA)
         maps.overlay(panel, own.immobilising, own.grid.extent_m, maps.IMMOBILISING)
-        maps.draw_drive(panel, drive_at(own, len(own.actions)), 2.2, 1.2, colour)
+        drives.draw_drive(panel, drive_at(own, len(own.actions)), 2.2, 1.2, colour)
         panel.set(xticks=[], yticks=[])
         panel.set_title(
             f"λ̂ = {name}: {own.outcome} after {own.end_s:.0f} s", fontsize=9

@@ -22,18 +22,12 @@ from benchnav.datagen.recipe.classes import TerrainClass, look_alike_classes
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.datagen.synth.appearance import light_direction, shade
 from benchnav.datagen.synth.elevation import horn_gradient, pad_missing
-from benchnav.viz.maps import (
-    draw_lines,
-    hatching,
-    lacking_handle,
-    mark,
-    mark_handle,
-    show_map,
-)
+from benchnav.viz.drives import mark, mark_handle
+from benchnav.viz.maps import draw_lines, hatching, missing_handle, show_map
 from benchnav.viz.sheet import (
+    FRACTIONS,
     LETTER,
     LINE,
-    SHARES,
     SheetColumn,
     class_patches,
     class_scale,
@@ -94,7 +88,7 @@ def preview_figure(
         ),
         SheetColumn("slope_deg", "Slope [°]", maps["slope_deg"], slopes, "", "max"),
         SheetColumn(
-            "traversability", "Traversability λ", maps["traversability"], SHARES, ""
+            "traversability", "Traversability λ", maps["traversability"], FRACTIONS, ""
         ),
         *(layer_column(name, maps[name], dataset.fields[name].unit) for name in layers),
     ]
@@ -105,7 +99,7 @@ def preview_figure(
     if unlabelled.any() or any(
         np.isnan(maps[name]).any() for name in ("traversability", *layers)
     ):
-        marks.append(lacking_handle())
+        marks.append(missing_handle())
     if soft.any():
         marks.append(
             Patch(
@@ -237,7 +231,7 @@ def contact_sheet_figure(dataset: TerrainDataset, split: str) -> Figure:
         if "class_id" in stored:
             values = np.ma.masked_invalid(stored["traversability"])
             image = np.concatenate(
-                [image, SHARES["cmap"](values, bytes=True)[..., :3]], axis=1
+                [image, FRACTIONS["cmap"](values, bytes=True)[..., :3]], axis=1
             )
             edges = outline(
                 soft_ground(stored["class_id"], classes), high / grid.height

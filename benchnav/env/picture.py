@@ -18,7 +18,7 @@ from matplotlib.patches import Polygon
 from benchnav.core.errors import ConfigError
 from benchnav.core.grid import Grid
 from benchnav.env.view import CHANNELS
-from benchnav.viz import maps
+from benchnav.viz import drives, maps
 
 SIZE = (640, 480)  # width and height in pixels
 _DPI = 100
@@ -104,13 +104,13 @@ class Picture:
             )
         outcome = scene.outcome.replace("running", "")
         track = np.vstack((scene.track, scene.state[:2]))
-        drive = maps.Drive(
+        drive = drives.Drive(
             track=track,
             goal_m=scene.goal_m,
             outcome=outcome,
             heading_rad=scene.state[2],
         )
-        maps.draw_drive(panel, drive, 1.6, _MARKS)
+        drives.draw_drive(panel, drive, 1.6, _MARKS)
         title = f"t = {scene.time_s:.1f} s    λ = {scene.observed:.2f}    "
         title += outcome.replace("_", " ")
         panel.set_title(title, fontsize=_TEXT + 1, loc="left", pad=5)
@@ -124,13 +124,13 @@ class Picture:
         light = np.where(seen > 0, 1.0, _UNSEEN)[..., None]
         image = matplotlib.colormaps[colours](values)[..., :3] * light
         is_off_map = (seen <= 0) & (spread == 0) & (scene.crop[0] == 0)
-        image[is_off_map] = to_rgb(maps.LACKING)
+        image[is_off_map] = to_rgb(maps.MISSING)
         cells = len(values)
         # Ahead is up, and the robot's left is left.
         maps.show_map(panel, image.transpose(1, 0, 2)[:, ::-1], (cells, cells))
-        ahead = maps.robot_marker(np.pi / 2)
+        ahead = drives.robot_marker(np.pi / 2)
         robot = (cells / 2, scene.behind * cells)
-        maps.mark(panel, "robot", robot, _MARKS, marker=ahead)
+        drives.mark(panel, "robot", robot, _MARKS, marker=ahead)
         panel.set_title(title, fontsize=_TEXT, loc="left", pad=4)
         bar = panel.inset_axes((0.72, 1.03, 0.2, 0.06), xticks=[], yticks=[])
         bar.imshow(np.linspace(0, 1, 32)[None], cmap=colours, aspect="auto")

@@ -6,7 +6,8 @@ __getattr__, __dir__, __all__ = face(
     __name__,
     {
         "benchnav.viz.figure": ("Figure",),
-        "benchnav.viz.maps": ("Drive", "draw_drive", "draw_path", "mark", "show_map"),
+        "benchnav.viz.drives": ("Drive", "draw_drive", "draw_path", "mark"),
+        "benchnav.viz.maps": ("show_map",),
         "benchnav.viz.panels": (
             "Curves",
             "draw_estimates",

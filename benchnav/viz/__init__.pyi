@@ -1,5 +1,6 @@
+from benchnav.viz.drives import Drive, draw_drive, draw_path, mark
 from benchnav.viz.figure import Figure
-from benchnav.viz.maps import Drive, draw_drive, draw_path, mark, show_map
+from benchnav.viz.maps import show_map
 from benchnav.viz.panels import (
     Curves,
     draw_estimates,

@@ -1,7 +1,7 @@
 """The base class of figures: an object with requirements, a caption and a drawing.
 
-A figure does not write files. `data` is a single value for all figures of a kind; for
-those of runs it is `benchnav.eval.figures.RunData`.
+A figure does not write files. All figures of a kind have the same type of `data`; for
+those of runs, it is `benchnav.eval.figures.RunData`.
 """
 
 from abc import ABC, abstractmethod
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import matplotlib.figure
 
 
-_DPI = 200  # of a figure that is saved without another
+_DPI = 200  # default resolution of a saved figure
 
 
 class Figure(Specified, ABC):
@@ -25,9 +25,9 @@ class Figure(Specified, ABC):
 
     Attributes:
         name: name of its files.
-        title: heading above it on a page; if empty, none.
+        title: heading above it on a page; if empty, there is no heading.
         text: caption in sentences, if it does not depend on the data.
-        trim: whether white borders are cut, as for maps, whose aspect ratio is fixed.
+        trim: whether to cut white borders, as for maps, whose aspect ratio is fixed.
     """
 
     name: str = ""
@@ -36,7 +36,7 @@ class Figure(Specified, ABC):
     trim: bool = False
 
     def variants(self, data: Any) -> Sequence[Self]:
-        """Return the figures to draw, with distinct names; by default only itself."""
+        """Return the figures to draw, with distinct names; by default, only itself."""
         return [self] if self.needs(data) else []
 
     def variant(self, **changes: Any) -> Self:

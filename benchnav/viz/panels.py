@@ -37,13 +37,10 @@ def line_looks(
     for index, name in enumerate(dict.fromkeys(names)):
         turn, colour_index = divmod(index, len(LINE_COLOURS))
         colour = colours[index] if colours else LINE_COLOURS[colour_index]
-        look = {"color": colour, "lw": 1.1}
-        if dashed:
-            look["ls"] = line_style(index)
-        else:
-            look["marker"] = MARKERS[index % len(MARKERS)]
-            look["ms"] = 3.5
-            look["ls"] = line_style(turn)
+        look = {"color": colour, "lw": 1.1, "ls": line_style(index)}
+        if not dashed:
+            marker = MARKERS[index % len(MARKERS)]
+            look |= {"marker": marker, "ms": 3.5, "ls": line_style(turn)}
         looks[name] = look
     return looks
 
@@ -52,7 +49,7 @@ def panel_grid(
     titles: Sequence[str],
     across: int,
     high_in: float,
-    rest_in: float = 0.5,
+    ends_in: float = 0.5,
     width_in: float = 0.0,
     layers: int = 1,
     **shared: Any,
@@ -63,7 +60,7 @@ def panel_grid(
         titles: titles of the stacks.
         across: maximum number of stacks next to each other.
         high_in: height of a stack in inches.
-        rest_in: height of everything else, such as the legend, in inches.
+        ends_in: height of everything else, such as the legend, in inches.
         width_in: width of the figure in inches; if 0, one column of a page for a single
             stack across, else both columns.
         layers: panels of a stack.
@@ -73,9 +70,10 @@ def panel_grid(
         The figure, and the panels of each stack, downward.
     """
     across = max(1, min(across, len(titles)))
-    width = width_in or (ONE_COLUMN_IN if across == 1 else TWO_COLUMNS_IN)
+    if not width_in:
+        width_in = ONE_COLUMN_IN if across == 1 else TWO_COLUMNS_IN
     n_rows = -(-len(titles) // across)
-    size = (width, high_in * n_rows + rest_in)
+    size = (width_in, high_in * n_rows + ends_in)
     figure = Figure(figsize=size, layout="constrained")
     stacks = stack_panels(figure, len(titles), across, layers, **shared)
     for (panel, *_), title in zip(stacks, titles, strict=True):
@@ -102,7 +100,7 @@ def draw_estimates(
         low: lower ends of the intervals, NaN for no interval, shape [N].
         high: upper ends of the intervals, shape [N].
         look: keywords of `Axes.plot`.
-        label: entry of the legend; if empty, there is none.
+        label: entry of the legend; if empty, the line has no entry.
         bars: whether intervals are bars instead of a band.
     """
     if bars:
@@ -149,8 +147,8 @@ class Curves:
     def draw(self) -> tuple[Figure, dict[tuple[str, str], Axes]]:
         """Draw the curves.
 
-        Measures of a single group stand next to each other with their labels as titles;
-        those of several groups are stacked.
+        Measures of a single group are side by side with their labels as titles; those
+        of several groups are stacked.
 
         Returns:
             The figure, without a legend, and its panels by group and measure.
@@ -179,24 +177,27 @@ class Curves:
         keys = itertools.product(groups, self.measures)
         panels = dict(zip(keys, itertools.chain(*stacks), strict=True))
         for (group, measure), panel in panels.items():
-            rows = self.table[self.table["panel"] == group]
-            for line, points in rows.groupby("line", sort=False):
-                y = points[measure]
-                low = points.get(f"{measure}_low", y)
-                high = points.get(f"{measure}_high", y)
-                look = self.looks[line]
-                x = points["x"]
-                draw_estimates(panel, x, y, low, high, look, str(line), self.bars)
-            panel.grid(axis="y", color=GRID)
+            self._draw_lines(panel, group, measure)
         return figure, panels
+
+    def _draw_lines(self, panel: Axes, group: str, measure: str) -> None:
+        rows = self.table[self.table["panel"] == group]
+        for line, points in rows.groupby("line", sort=False):
+            x = points["x"]
+            y = points[measure]
+            low = points.get(f"{measure}_low", y)
+            high = points.get(f"{measure}_high", y)
+            look = self.looks[line]
+            draw_estimates(panel, x, y, low, high, look, str(line), self.bars)
+        panel.grid(axis="y", color=GRID)
 
 
 def draw_baseline(
     panel: Axes, value: float, label: str, horizontal: bool = True
 ) -> None:
     """Draw a reference value, such as that of a calibrated model, as a dashed line."""
-    line = panel.axhline if horizontal else panel.axvline
-    line(value, color="0.4", lw=0.8, ls="--", zorder=1, label=label)
+    draw_line = panel.axhline if horizontal else panel.axvline
+    draw_line(value, color="0.4", lw=0.8, ls="--", zorder=1, label=label)
 
 
 def ticks_of(panel: Axes, axis: Literal["x", "y"], max_intervals: int = 4) -> None:

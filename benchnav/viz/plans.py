@@ -4,14 +4,14 @@ Letters in shapes: N positions.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.patheffects import AbstractPathEffect, Normal, withStroke
 
-from benchnav.viz.maps import REACH, TRAVERSABILITY_COLOURS
+from benchnav.viz.maps import FOOTPRINT, TRAVERSABILITY_COLOURS
 
 _LINE_WIDTH = 0.4  # of the thinnest line of a plan
 
@@ -23,15 +23,15 @@ class LayerStyle(NamedTuple):
         label: entry of the legend.
         colour: red, green, blue and opacity, in hexadecimal digits.
         width: width relative to the thinnest line.
-        dashes: dashes of the line, where the format supports them.
-        effects: effects of the line, where the format supports them, such as a white
-            edge on dark terrain.
+        dashes: dashes of the line, if the format supports them.
+        effects: effects of the line, if the format supports them, such as a white edge
+            on dark terrain.
     """
 
     label: str
     colour: str
     width: float
-    dashes: str = "solid"
+    dashes: Literal["solid", "dashed"] = "solid"
     effects: Sequence[AbstractPathEffect] = ()
 
 
@@ -53,16 +53,15 @@ def draw_plan(panel: Axes, lines: Mapping[str, Sequence[np.ndarray]]) -> None:
         lines: lines of each layer of `STYLES`, each of shape [N, 2].
     """
     for name, style in STYLES.items():
-        if len(lines.get(name, ())):
-            layer = LineCollection(
-                list(lines[name]),
-                colors=[style.colour],
-                linewidths=_LINE_WIDTH * style.width,
-                linestyles=style.dashes,
-                label=style.label,
-                path_effects=list(style.effects),
-            )
-            panel.add_collection(layer)
+        segments = list(lines.get(name, ()))
+        if not segments:
+            continue
+        layer = LineCollection(segments, label=style.label)
+        layer.set_color(style.colour)
+        layer.set_linewidth(_LINE_WIDTH * style.width)
+        layer.set_linestyle(style.dashes)
+        layer.set_path_effects(list(style.effects))
+        panel.add_collection(layer)
 
 
 def driven_colours(
@@ -76,19 +75,14 @@ def driven_colours(
         width: width in points.
     """
     segments = list(np.stack((track[:-1], track[1:]), axis=1))
-    path = LineCollection(
-        segments,
-        cmap=TRAVERSABILITY_COLOURS,
-        linewidths=width,
-        capstyle="round",
-        zorder=2.5,
-    )
+    style: dict[str, Any] = {"linewidths": width, "capstyle": "round", "zorder": 2.5}
+    path = LineCollection(segments, cmap=TRAVERSABILITY_COLOURS, **style)
     path.set_clim(0, 1)
     path.set_array(traversability[: len(segments)])
     return path
 
 
-def draw_reach(panel: Axes, outline_m: np.ndarray) -> None:
+def draw_footprint(panel: Axes, outline_m: np.ndarray) -> None:
     """Draw the outline of the sensors' range on a map.
 
     Args:
@@ -96,12 +90,6 @@ def draw_reach(panel: Axes, outline_m: np.ndarray) -> None:
         outline_m: lines in metres, separated by NaN, shape [N, 2].
     """
     edge = [withStroke(linewidth=1.1, foreground="black"), Normal()]
+    style: dict[str, Any] = {"lw": 0.6, "path_effects": edge, "zorder": 2.2}
     # A single line with gaps, so that no segment's edge covers another segment.
-    panel.plot(
-        *outline_m.T,
-        color=REACH,
-        lw=0.6,
-        path_effects=edge,
-        label="reach of the sensors",
-        zorder=2.2,
-    )
+    panel.plot(*outline_m.T, color=FOOTPRINT, label="footprint of the sensors", **style)

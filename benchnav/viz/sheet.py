@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.artist import Artist
+from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
@@ -17,12 +18,12 @@ from matplotlib.ticker import MaxNLocator
 
 from benchnav.core.grid import is_azimuth
 from benchnav.viz.maps import (
-    LACKING,
     LAMBDA,
+    MISSING,
     frame_map,
     layer_scale,
     show_map,
-    with_lacking,
+    with_missing,
 )
 from benchnav.viz.style import TEXT, TWO_COLUMNS_IN, legend_outside, styled
 
@@ -31,8 +32,9 @@ _DPI = 300.0
 _SIDES, _ENDS = 0.7, 1.5  # width and height of a sheet without its maps
 LINE, LETTER = 0.135, 0.054  # height of a line and mean width of a letter
 _COLUMN = 1.15  # minimum width of a column
+_BAR_GAP = 0.08  # between a column and its colour bar
 _TITLE_LETTERS = 20  # of a layer's name per line, which fit in a column
-SHARES: dict[str, Any] = {**LAMBDA, "cmap": with_lacking("viridis")}
+FRACTIONS: dict[str, Any] = {**LAMBDA, "cmap": with_missing("viridis")}
 
 
 class SheetColumn(NamedTuple):
@@ -63,7 +65,7 @@ def layer_column(name: str, values: np.ndarray, unit: str) -> SheetColumn:
     Args:
         name: name of the layer.
         values: values of the layer, shape [R, H, W].
-        unit: unit of the values, `1` if there is none.
+        unit: unit of the values; `1` for values without a unit.
     """
     words = name.removesuffix(f"_{unit}").replace("_", " ")
     unit_text = {"1": "", "deg": " [°]"}.get(unit, f" [{unit}]")
@@ -98,41 +100,31 @@ def sheet_of_maps(
         if there are many columns.
     """
     ratio = extent_m[1] / extent_m[0]
-    across = len(columns)
-    max_width = max((TWO_COLUMNS_IN - _SIDES) / across, _COLUMN)
-    high = min(max_width * ratio, 2.0, max((_PAGE - _ENDS) / len(rows), 0.8))
-    width = across * max(high / ratio, _COLUMN) + _SIDES
+    n_rows = len(rows)
+    n_columns = len(columns)
+    max_width = max((TWO_COLUMNS_IN - _SIDES) / n_columns, _COLUMN)
+    max_height = max((_PAGE - _ENDS) / n_rows, 0.8)
+    high = min(max_width * ratio, 2.0, max_height)
+    width = n_columns * max(high / ratio, _COLUMN) + _SIDES
     letters = max((len(str(patch.get_label())) for patch in classes), default=0)
     legend_columns = max(1, int(width / (0.4 + LETTER * letters)))
-    ends = _ENDS + LINE * -(-len(classes) // legend_columns)
-    height = len(rows) * max(high, 0.5) + ends
+    legend_lines = -(-len(classes) // legend_columns)
+    ends = _ENDS + LINE * legend_lines
+    height = n_rows * max(high, 0.5) + ends
     figure = Figure(figsize=(width, height), dpi=_DPI, layout="constrained")
-    panels = figure.subplots(len(rows), across, squeeze=False, sharex=True, sharey=True)
+    shared: dict[str, Any] = {"sharex": True, "sharey": True}
+    panels = figure.subplots(n_rows, n_columns, squeeze=False, **shared)
     for column, below in zip(columns, panels.T, strict=True):
-        for row, panel in enumerate(below):
-            panel.set(label=f"{column.name} {row}", facecolor=LACKING)
-            image = show_map(panel, column.layers[row], extent_m, **column.shades)
-            frame_map(panel)
-        below[0].set_title(column.title)
+        image = _draw_column(column, below, extent_m)
         if column.unit is not None:
-            ticks = MaxNLocator(column.max_intervals, steps=[1, 2, 2.5, 5, 10])
-            bar = figure.colorbar(
-                image,
-                ax=list(below),
-                location="bottom",
-                extend=column.extend,
-                aspect=14,
-                panchor=False,
-                ticks=ticks,
-                format="%g",
-            )
-            bar.set_label(column.unit, size=TEXT)
-            bar.ax.set_label(f"{column.name} bar")
+            # Matplotlib expects the gap as a fraction of the height of all maps.
+            gap = _BAR_GAP / (height - ends)
+            _draw_bar(figure, column, image, list(below), gap)
     _set_ticks(panels[0, 0].xaxis, high / ratio)
     _set_ticks(panels[0, 0].yaxis, high)
     for panel, name in zip(panels[:, 0], rows, strict=True):
         panel.set_ylabel(name, size=TEXT)
-    panels[-1, across // 2].set_xlabel("x [m]", size=TEXT)
+    panels[-1, n_columns // 2].set_xlabel("x [m]", size=TEXT)
     figure.supylabel("y [m]", size=TEXT, y=0.5 + (ends / 2 - 0.45) / height)
     figure.suptitle(heading, x=0.01, ha="left", parse_math=False)
     if marks:
@@ -142,10 +134,42 @@ def sheet_of_maps(
     return figure
 
 
+def _draw_column(
+    column: SheetColumn, panels: Sequence[Axes], extent_m: tuple[float, float]
+) -> Any:
+    """Draw the maps of a column, downward; return the last image."""
+    for row, panel in enumerate(panels):
+        panel.set(label=f"{column.name} {row}", facecolor=MISSING)
+        image = show_map(panel, column.layers[row], extent_m, **column.shades)
+        frame_map(panel)
+    panels[0].set_title(column.title)
+    return image
+
+
+def _draw_bar(
+    figure: Figure, column: SheetColumn, image: Any, panels: list[Axes], gap: float
+) -> None:
+    """Draw the colour bar of an image below the panels of its column."""
+    ticks = MaxNLocator(column.max_intervals, steps=[1, 2, 2.5, 5, 10])
+    bar = figure.colorbar(
+        image,
+        ax=panels,
+        location="bottom",
+        pad=gap,
+        extend=column.extend,
+        aspect=14,
+        panchor=False,
+        ticks=ticks,
+        format="%g",
+    )
+    bar.set_label(str(column.unit), size=TEXT)
+    bar.ax.set_label(f"{column.name} bar")
+
+
 def _set_ticks(axis: Axis, length_in: float) -> None:
     """Place the ticks of an axis with a length in inches."""
     max_intervals = min(max(int(length_in / 0.2), 1), 4)
-    # Without a tick at the end: its number would touch the first of the next panel.
+    # Omit a tick at the end: its number would touch the first of the next panel.
     locator = MaxNLocator(max_intervals, steps=[1, 2, 5, 10], prune="upper")
     axis.set_major_locator(locator)
 
@@ -173,4 +197,4 @@ def class_scale(colours: np.ndarray) -> dict[str, Any]:
     Args:
         colours: colours of the classes, shape [C, 3].
     """
-    return {"cmap": with_lacking(colours), "vmin": -0.5, "vmax": len(colours) - 0.5}
+    return {"cmap": with_missing(colours), "vmin": -0.5, "vmax": len(colours) - 0.5}

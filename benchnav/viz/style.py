@@ -21,9 +21,10 @@ from matplotlib.transforms import Bbox, ScaledTranslation
 from benchnav.core.store import replacing
 
 # Widths of a journal's column and of a page.
-ONE_COLUMN_IN, TWO_COLUMNS_IN = 88 / 25.4, 180 / 25.4
+ONE_COLUMN_IN = 88 / 25.4
+TWO_COLUMNS_IN = 180 / 25.4
 TEXT, TITLE = 7.0, 8.0
-_STRIP_IN = 0.2
+_STRIP_IN = 0.2  # height of a mark above a figure
 _MIN_WIDTH_IN = 4.4  # of a figure with a legend of several columns
 DPI = 200
 
@@ -147,12 +148,11 @@ def condition_colours(
         palette: colours, which repeat if there are too few.
     """
     by_planner = planner_colours(planners)
+    own_colours = [by_planner[planner] for planner in planners]
     if len(by_planner) == len(planners):
-        return [by_planner[planner] for planner in planners]
+        return own_colours
     turn = itertools.cycle(palette)
-    return [
-        BLIND if by_planner[planner] == BLIND else next(turn) for planner in planners
-    ]
+    return [BLIND if colour == BLIND else next(turn) for colour in own_colours]
 
 
 def bytes_of(colour: Any) -> tuple[int, ...]:
@@ -168,7 +168,7 @@ def line_style(index: int) -> Any:
 def stack_panels(
     figure: Figure, count: int, across: int, layers: int = 1, **shared: Any
 ) -> list[Any]:
-    """Divide a figure into stacks of panels, row by row; remove surplus panels.
+    """Divide a figure into stacks of panels, row by row, without surplus panels.
 
     Args:
         figure: empty figure.
@@ -210,18 +210,19 @@ def legend_outside(
     """
     labelled: dict[str, Artist] = {}
     for panel in figure.axes:
-        for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
+        of_panel, labels = panel.get_legend_handles_labels()
+        for handle, label in zip(of_panel, labels, strict=True):
             labelled.setdefault(label, handle)
     if figure.get_figwidth() < TWO_COLUMNS_IN:
         columns = -(-columns // 2)
-    return figure.legend(
-        handles=[*labelled.values(), *handles], loc="outside " + side, ncols=columns
-    )
+    all_handles = [*labelled.values(), *handles]
+    return figure.legend(handles=all_handles, loc="outside " + side, ncols=columns)
 
 
 def page_width(count: int, across: int) -> float:
     """Return a figure's width in inches for `count` panels, `across` per page width."""
-    return max(TWO_COLUMNS_IN * (min(count, across) / across), _MIN_WIDTH_IN)
+    fraction = min(count, across) / across
+    return max(TWO_COLUMNS_IN * fraction, _MIN_WIDTH_IN)
 
 
 def save(
@@ -242,16 +243,15 @@ def save(
         trim: whether to cut white borders.
         strip_in: height of a strip above the figure to include, in inches.
     """
-    box: Any = "tight" if trim else None
-    padding_in = 0.05 if trim else 0
-    if strip_in and not trim:
+    area: dict[str, Any] = {"bbox_inches": None, "pad_inches": 0}
+    if trim:
+        area = {"bbox_inches": "tight", "pad_inches": 0.05}
+    elif strip_in:
         width_in = figure.get_figwidth()
         height_in = figure.get_figheight() + strip_in
-        box = Bbox.from_extents(0, 0, width_in, height_in)
+        area["bbox_inches"] = Bbox.from_extents(0, 0, width_in, height_in)
     with matplotlib.rc_context(_SAVED):
-        figure.savefig(
-            path, format=kind, dpi=dpi, bbox_inches=box, pad_inches=padding_in
-        )
+        figure.savefig(path, format=kind, dpi=dpi, **area)
 
 
 def save_twice(
@@ -264,19 +264,21 @@ def save_twice(
         path: path of the PNG; its folder is created.
         trim: whether to cut white borders; without it, the figure keeps its width.
         dpi: dots per inch.
-        mark: line in a strip above the figure; if empty, there is none.
+        mark: line in a strip above the figure; if empty, there is no strip.
     """
-    # Fix the layout, so that it is computed once and both files are identical.
+    # Compute the layout only once, so that both files have the same.
     figure.set_dpi(dpi)
     engine = figure.get_layout_engine()
     if engine is not None:
         engine.execute(figure)
         figure.set_layout_engine(None)
+    strip_in = 0.0
     if mark:
+        strip_in = _STRIP_IN
         scale = figure.dpi_scale_trans
         above = scale + ScaledTranslation(0, figure.get_figheight(), scale)
         style: dict[str, Any] = {"fontsize": TITLE, "color": ORANGE, "weight": "bold"}
         figure.text(0.05, 0.04, mark, transform=above, va="bottom", **style)
-    for suffix in (".png", ".pdf"):
-        with replacing(path.with_suffix(suffix)) as partial:
-            save(figure, partial, suffix[1:], dpi, trim, _STRIP_IN if mark else 0.0)
+    for kind in ("png", "pdf"):
+        with replacing(path.with_suffix(f".{kind}")) as partial:
+            save(figure, partial, kind, dpi, trim, strip_in)

@@ -11,16 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from benchnav.planning.world.outcome import Outcome
-from benchnav.viz.maps import (
-    IMMOBILISING,
-    MARKS,
-    Drive,
-    draw_drive,
-    draw_scale,
-    end_mark,
-    field_colours,
-    scale_length,
-)
+from benchnav.viz.drives import MARKS, Drive, draw_drive, end_mark
+from benchnav.viz.maps import IMMOBILISING, draw_scale, field_colours, scale_length
 from benchnav.viz.style import bytes_of
 
 # Machado, Oliveira and Fernandes (2009), full severity, on linear RGB.

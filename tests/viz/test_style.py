@@ -10,7 +10,8 @@ from matplotlib.figure import Figure
 
 from benchnav.core.grid import outline
 from benchnav.core.registry import find, names
-from benchnav.viz.maps import hatching, layer_scale, robot_marker
+from benchnav.viz.drives import robot_marker
+from benchnav.viz.maps import hatching, layer_scale
 from benchnav.viz.style import (
     _RISKS,
     BLIND,

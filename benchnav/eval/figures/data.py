@@ -25,7 +25,7 @@ class Driven:
 
     Args:
         ground: the map.
-        rows: an episode a condition.
+        rows: one episode per condition.
         tracks: positions of each episode, shape [N + 1, 2].
     """
 
@@ -46,15 +46,15 @@ class RunData:
     Args:
         about: contents of `run.json`; if the run is not finished, only with conditions
             that have rows.
-        summary: a row a condition, from `summary.summarise`, joined with
+        summary: one row per condition, from `summary.summarise`, joined with
             `best.against_best`.
         episodes: rows of episodes.
-        tests: a row a hypothesis, from `hypotheses.test_hypotheses`; empty if the suite
-            has none.
+        tests: one row per hypothesis, from `hypotheses.test_hypotheses`; empty without
+            hypotheses.
         regret: from `regret.split_regret`; empty if the run has no chain.
-        failures: a row a failed episode.
+        failures: one row per failed episode.
         sheets: failures on their maps.
-        folder: the run folder; None if the run was not saved, and thus has no steps or
+        folder: the run folder; None if the run was not saved and has no steps or
             recordings.
         record_driven: records driven episodes again, such as
             `run.recordings.record_driven`.
@@ -92,13 +92,10 @@ class RunData:
         if self.driven is None:
             return []
         chosen = self.driven.rows.iloc[self.driven.chosen(MAX_PANELS)]
-        stored = {
-            tuple(str(own.about[name]) for name in _EPISODE): own
-            for own in self.recordings
-        }
+        stored = {_episode_key(stored.about): stored for stored in self.recordings}
         recordings = []
         for index, row in chosen.iterrows():
-            recording = stored.get(tuple(str(row[name]) for name in _EPISODE))
+            recording = stored.get(_episode_key(row))
             if recording is None and self.record_driven is not None:
                 try:
                     (recording,) = self.record_driven(chosen.loc[[index]])
@@ -108,6 +105,10 @@ class RunData:
                 return []
             recordings.append(recording)
         return recordings
+
+
+def _episode_key(labels: Any) -> tuple[str, ...]:
+    return tuple(str(labels[name]) for name in _EPISODE)
 
 
 def read_driven(folder: Path, episodes: pd.DataFrame) -> Driven | None:
@@ -121,54 +122,47 @@ def read_driven(folder: Path, episodes: pd.DataFrame) -> Driven | None:
     if not path.exists() or not (folder / STEPS).is_dir():
         return None
     ground = Ground.load(path)
-    rows = episodes[
-        (episodes[list(ground.about)] == pd.Series(ground.about)).all(axis=1)
-    ]
+    keys = pd.Series(ground.about)
+    is_on_map = (episodes[list(ground.about)] == keys).all(axis=1)
+    rows = episodes[is_on_map]
     draw = {name: ground.about[name] for name in ("seed", "realisation", "map")}
-    steps = read_steps(folder, condition=list(rows["condition"]), **draw).groupby(
-        "condition"
-    )
+    all_steps = read_steps(folder, condition=list(rows["condition"]), **draw)
+    steps = all_steps.groupby("condition")
     rows = rows[rows["condition"].isin(steps.groups)]
-    tracks = [
-        steps.get_group(condition)[["x_m", "y_m"]].to_numpy()
-        for condition in rows["condition"]
-    ]
+    tracks = []
+    for condition in rows["condition"]:
+        positions = steps.get_group(condition)[["x_m", "y_m"]]
+        tracks.append(positions.to_numpy())
     return Driven(ground=ground, rows=rows, tracks=tracks) if tracks else None
 
 
 def choose_recordings(
     recordings: Sequence[Recording], conditions: Sequence[str]
 ) -> list[Recording]:
-    """Choose one recording a condition, up to `MAX_PANELS`, on one map if possible.
+    """Choose one recording per condition, up to `MAX_PANELS`, on one map if possible.
 
-    The map is the first on which outcomes differ, among those that the first condition
-    was recorded on, else the first on which an episode failed.
+    The map is one that the first condition was recorded on: the first on which outcomes
+    differ, else the first on which an episode failed.
 
     Args:
         recordings: all recordings.
         conditions: ids in order.
     """
-    table = pd.DataFrame(
-        [recording.about for recording in recordings],
-        columns=["condition", "outcome", *_SAME_MAP],
-    )
+    labels = [recording.about for recording in recordings]
+    table = pd.DataFrame(labels, columns=["condition", "outcome", *_SAME_MAP])
     table = table.astype({"condition": pd.CategoricalDtype(conditions), "map": int})
-    table = table.dropna(subset="condition").sort_values(
-        ["condition", "map"], kind="stable"
-    )
+    table = table.dropna(subset="condition")
+    table = table.sort_values(["condition", "map"], kind="stable")
     if table.empty:
         return []
-    maps = table.groupby(_SAME_MAP)
-    table["differing"] = maps["outcome"].transform("nunique") > 1
-    table["failed"] = maps["outcome"].transform(
-        lambda outcomes: set(outcomes) != {"success"}
-    )
-    firsts = table[table["condition"] == table["condition"].iloc[0]]
-    shown = firsts.sort_values(
-        ["differing", "failed"], ascending=False, kind="stable"
-    ).iloc[0]
+    outcomes = table.groupby(_SAME_MAP)["outcome"]
+    table["differing"] = outcomes.transform("nunique") > 1
+    table["failed"] = outcomes.transform(lambda names: set(names) != {"success"})
+    of_first = table[table["condition"] == table["condition"].iloc[0]]
+    order = ["differing", "failed"]
+    of_first = of_first.sort_values(order, ascending=False, kind="stable")
+    shown = of_first.iloc[0]
     table["other"] = (table[_SAME_MAP] != shown[_SAME_MAP]).any(axis=1)
-    chosen = table.sort_values(["condition", "other"], kind="stable").drop_duplicates(
-        "condition"
-    )
+    table = table.sort_values(["condition", "other"], kind="stable")
+    chosen = table.drop_duplicates("condition")
     return [recordings[index] for index in chosen.index[:MAX_PANELS]]

@@ -1,5 +1,6 @@
 """T_total and λ̄ of every episode."""
 
+import itertools
 from typing import Any
 
 import pandas as pd
@@ -18,7 +19,7 @@ _QUANTITIES = {
     "traversability": "λ̄, mean observed λ",
 }
 _ENDS = {"success": (BLUE, "o"), "failure": (ORANGE, "x")}  # colour and marker of a dot
-_SPREAD = 0.32  # of a row's height, to either side
+_SPREAD = 0.32  # maximum offset of a dot from the middle of its row
 
 
 class Distributions(Figure):
@@ -33,25 +34,27 @@ class Distributions(Figure):
 
     def draw(self, data: RunData) -> Drawing:
         """Draw the episodes of each condition at its height."""
-        figure, panels = lay_out(
-            data.summary, list(_QUANTITIES.values()), legend_in=0.15
-        )
-        for index, (panel, rows) in enumerate(panels):
-            _draw_dots(
-                panel, rows, data.episodes, list(_QUANTITIES)[index % len(_QUANTITIES)]
-            )
-        panels[0][0].set_xlim(left=0)
-        panels[1][0].set_xlim(0, 1)
-        handles = [
-            Line2D([], [], ls="none", ms=3, color=colour, marker=marker, label=label)
-            for label, (colour, marker) in _ENDS.items()
-        ]
-        words = "median and quartiles of all"
-        handles.append(
-            Line2D([], [], color="black", marker="|", ms=6, lw=1.2, label=words)
-        )
-        legend_outside(figure, handles)
+        labels = list(_QUANTITIES.values())
+        figure, panels = lay_out(data.summary, labels, legend_in=0.15)
+        columns = itertools.cycle(_QUANTITIES)
+        for (panel, rows), column in zip(panels, columns, strict=False):
+            _draw_dots(panel, rows, data.episodes, column)
+        (time_panel, _), (traversability_panel, _) = panels[:2]
+        time_panel.set_xlim(left=0)
+        traversability_panel.set_xlim(0, 1)
+        legend_outside(figure, _handles())
         return figure
+
+
+def _handles() -> list[Line2D]:
+    handles = []
+    for label, (colour, marker) in _ENDS.items():
+        look: dict[str, Any] = {"ls": "none", "ms": 3, "marker": marker}
+        handles.append(Line2D([], [], color=colour, label=label, **look))
+    look = {"marker": "|", "ms": 6, "lw": 1.2}
+    words = "median and quartiles of all"
+    handles.append(Line2D([], [], color="black", label=words, **look))
+    return handles
 
 
 def _draw_dots(
@@ -59,19 +62,21 @@ def _draw_dots(
 ) -> None:
     """Draw a quantity of all episodes, each condition at its height."""
     dots = rows[["condition", "height"]].merge(episodes, on="condition")
-    turn = dots.groupby("condition").cumcount()
-    dots["up"] = dots["height"] + jitter(len(dots), _SPREAD)[turn]
+    index_in_condition = dots.groupby("condition").cumcount()
+    offsets = jitter(len(dots), _SPREAD)
+    dots["up"] = dots["height"] + offsets[index_in_condition]
     dots = dots[dots[name].notna()]
-    for (colour, marker), is_success in zip(_ENDS.values(), (True, False), strict=True):
-        group = dots[dots["success"] == is_success]
-        size, line = (5, 0.5) if marker == "x" else (3, 0)
-        looks: dict[str, Any] = {
+    is_success = dots["success"].astype(bool)
+    groups = (dots[is_success], dots[~is_success])
+    for (colour, marker), group in zip(_ENDS.values(), groups, strict=True):
+        is_cross = marker == "x"
+        look: dict[str, Any] = {
             "color": colour,
             "marker": marker,
-            "s": size,
-            "lw": line,
+            "s": 5 if is_cross else 3,
+            "lw": 0.5 if is_cross else 0,
         }
-        panel.scatter(group[name], group["up"], alpha=0.45, rasterized=True, **looks)
+        panel.scatter(group[name], group["up"], alpha=0.45, rasterized=True, **look)
     for height, values in dots.groupby("height")[name]:
         low, middle, high = values.quantile([0.25, 0.5, 0.75])
         draw_interval(panel, low, high, height, "black")

@@ -12,7 +12,7 @@ from benchnav.eval.words import (
     contender_names,
     outcome_in_words,
 )
-from benchnav.viz import maps
+from benchnav.viz import drives, maps
 from benchnav.viz.figure import Figure
 from benchnav.viz.style import (
     LINE_COLOURS,
@@ -41,15 +41,14 @@ class DrivenPaths(Figure):
         assert data.driven is not None
         map_keys = data.driven.ground.about
         rows = data.driven.rows
-        differing = rows["success"].nunique() > 1
         reason = "Outcomes differ on no map."
-        if differing:
+        if rows["success"].nunique() > 1:
             reason = "On this map outcomes differ most."
+        n_shown = min(len(rows), _MAX_PATHS)
+        template = "{scenario}, map {map}, seed {seed}, realisation {realisation}"
         return (
-            f"Driven paths on {map_keys['scenario']}, map {map_keys['map']}, seed "
-            f"{map_keys['seed']}, realisation "
-            f"{map_keys['realisation']}. "
-            f"{reason}{chosen_in_words(min(len(rows), _MAX_PATHS), len(rows))}"
+            f"Driven paths on {template.format(**map_keys)}. "
+            f"{reason}{chosen_in_words(n_shown, len(rows))}"
         )
 
     def draw(self, data: RunData) -> Drawing:
@@ -62,37 +61,28 @@ class DrivenPaths(Figure):
         tracks = [driven.tracks[index] for index in indices]
         high, wide = ground.grid.shape
         is_wide = wide >= 2 * high
-        width = TWO_COLUMNS_IN if is_wide else ONE_COLUMN_IN
         # The legend stands at the side of a map, and below a wide one.
-        tall = min(width * high / wide, 7.0) + (
-            0.15 * (len(rows) + 4) + 0.4 if is_wide else 0.4
-        )
+        width = ONE_COLUMN_IN
+        legend_in = 0.0
+        if is_wide:
+            width = TWO_COLUMNS_IN
+            legend_in = 0.15 * (len(rows) + 4)
+        tall = min(width * high / wide, 7.0) + legend_in + 0.4
         figure = Drawing(figsize=(TWO_COLUMNS_IN, tall), layout="compressed")
         panel = figure.subplots()
         maps.show_map(panel, _backdrop(ground), ground.grid.extent_m)
-        names = contender_names(
-            rows[[name for name in NAMING if name in rows]].to_dict("records")
-        )
+        labels = rows[[name for name in NAMING if name in rows]]
+        names = contender_names(labels.to_dict("records"))
         colours = condition_colours(list(rows["planner"]), LINE_COLOURS)
-        for index, (row, track) in enumerate(
-            zip(rows.to_dict("records"), tracks, strict=True)
-        ):
-            # Later ones are thinner, so that paths that coincide are all seen.
+        for index, row in enumerate(rows.to_dict("records")):
+            # Later paths are thinner, so that all of several coinciding ones are seen.
             thickness = 0.9 + 2.2 * (1 - index / max(len(rows), 2))
-            label = (
-                f"{names[index]}: {outcome_in_words(row['outcome'])}, "
-                f"{row['end_time_s']:.0f} s"
-            )
-            maps.draw_path(
-                panel,
-                track,
-                thickness,
-                colours[index],
-                ls=line_style(index),
-                label=label,
-            )
-        maps.mark(panel, "start", tracks[0][0])
-        maps.mark(panel, "goal", ground.goal_m)
+            outcome = outcome_in_words(row["outcome"])
+            label = f"{names[index]}: {outcome}, {row['end_time_s']:.0f} s"
+            look = {"ls": line_style(index), "label": label}
+            drives.draw_path(panel, tracks[index], thickness, colours[index], **look)
+        drives.mark(panel, "start", tracks[0][0])
+        drives.mark(panel, "goal", ground.goal_m)
         maps.name_immobilising(panel, ground.immobilising)
         title = "λ field of the episode; lighter is higher"
         if ground.field is None:
@@ -102,23 +92,22 @@ class DrivenPaths(Figure):
         failed = np.flatnonzero(~rows["success"].to_numpy(bool))
         outcomes = [rows["outcome"].iloc[index] for index in failed]
         handles, _ = panel.get_legend_handles_labels()
-        for name in dict.fromkeys(map(maps.end_mark, outcomes)):
-            handles.append(
-                maps.mark_handle(name, label=f"{name}, in the colour of its path")
-            )
+        for name in dict.fromkeys(map(drives.end_mark, outcomes)):
+            words = f"{name}, in the colour of its path"
+            handles.append(drives.mark_handle(name, label=words))
+        corner = (1.02, 1.01)
+        if is_wide:
+            corner = (0, -0.18 * wide / high)
         panel.legend(
             handles=handles,
             loc="upper left",
-            bbox_to_anchor=(0, -0.18 * wide / high) if is_wide else (1.02, 1.01),
+            bbox_to_anchor=corner,
             borderaxespad=0,
             ncols=2 if is_wide else 1,
         )
-        maps.mark_ends(
-            panel,
-            [tracks[index] for index in failed],
-            outcomes,
-            [colours[index] for index in failed],
-        )
+        failed_tracks = [tracks[index] for index in failed]
+        failed_colours = [colours[index] for index in failed]
+        drives.mark_ends(panel, failed_tracks, outcomes, failed_colours)
         return figure
 
 

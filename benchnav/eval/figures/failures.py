@@ -1,25 +1,29 @@
-"""Sheets of failures: what was predicted, the path driven on it, and where it ended."""
+"""Sheets of failures: the predicted λ̂, the driven path on it, and its end."""
 
-from collections.abc import Sequence
-from typing import Self
+import textwrap
+from collections.abc import Mapping, Sequence
+from typing import Any, Self
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Drawing
 
+from benchnav.eval.failures import FailedLine
 from benchnav.eval.figures.data import RunData
 from benchnav.eval.figures.moment import drive_at
 from benchnav.eval.recording import Recording
 from benchnav.eval.words import outcome_in_words
-from benchnav.viz import maps
+from benchnav.viz import drives, maps
 from benchnav.viz.figure import Figure
 from benchnav.viz.style import ONE_COLUMN_IN, TWO_COLUMNS_IN, legend_outside
 
 _LIGHT = 0.5  # opacity of a map under marks and dark red
+_LETTER_IN = 0.048  # mean width of a letter of a title
+_LINE_IN = 0.12  # height of a line of a title
 
 
 class Failures(Figure):
-    """Failures of the best setting of a block and of the worst, a line a condition.
+    """Failures of the best and the worst setting of a block, one line per condition.
 
     Attributes:
         index: index of the sheet among those of the run.
@@ -29,7 +33,7 @@ class Failures(Figure):
     index = 0
 
     def variants(self, data: RunData) -> Sequence[Self]:
-        """Return a figure a block."""
+        """Return one figure per block."""
         return self.numbered(len(data.sheets.shown))
 
     def caption(self, data: RunData) -> str:
@@ -37,58 +41,86 @@ class Failures(Figure):
         title, _ = data.sheets.shown[self.index]
         return (
             "Failures of the settings with the highest and the lowest success rate, "
-            f"{title}: predicted λ̂ (colour), driven path and its end. λ̂ in the titles "
-            "is that of the last cell, observed λ the mean of the last 2 s."
+            f"{title}: predicted λ̂ (colour), driven path and its end. In the titles, "
+            "λ̂ is the prediction for the last cell, and observed λ is the mean of the "
+            "last 2 s."
         )
 
     def draw(self, data: RunData) -> Drawing:
-        """Draw a line a condition, a panel a failure."""
+        """Draw a line of panels for each condition, with one panel per failure."""
         _, lines = data.sheets.shown[self.index]
         across = max(len(line.recordings) for line in lines)
         height, width = lines[0].recordings[0].grid.shape
-        page = TWO_COLUMNS_IN if across > 2 else ONE_COLUMN_IN
-        tall = page / (across + 0.9) * min(height / width, 2.0) + 0.4
-        figure = Drawing(figsize=(page, tall * len(lines) + 0.6), layout="constrained")
+        page_in = TWO_COLUMNS_IN if across > 2 else ONE_COLUMN_IN
+        panel_in = page_in / (across + 0.9)
+        letters = int(panel_in / _LETTER_IN)
+        titles = [_titles(line, letters) for line in lines]
+        all_titles = [title for of_line in titles for title in of_line]
+        title_in = _LINE_IN * max(title.count("\n") + 1 for title in all_titles)
+        map_in = panel_in * min(height / width, 2.0)
+        tall_in = (map_in + title_in + 0.16) * len(lines) + 0.6
+        figure = Drawing(figsize=(page_in, tall_in), layout="constrained")
         panels = figure.subplots(len(lines), across, squeeze=False)
         for panel in panels.flat:
             panel.set_visible(False)
-        for row_of_panels, line in zip(panels, lines, strict=True):
-            rows = line.failures.to_dict("records")
-            for panel, recording, row in zip(
-                row_of_panels, line.recordings, rows, strict=False
+        for row_of_panels, line, of_line in zip(panels, lines, titles, strict=True):
+            n_shown = len(line.recordings)
+            shown_panels = row_of_panels[:n_shown]
+            for panel, recording, title in zip(
+                shown_panels, line.recordings, of_line, strict=True
             ):
                 _draw_failure(panel, recording)
-                predicted = recording.predicted_at_end
-                words = [
-                    "outside the map" if np.isnan(predicted) else f"λ̂ = {predicted:.2f}"
-                ]
-                if not np.isnan(row["last_traversability"]):
-                    words.append(f"observed λ = {row['last_traversability']:.2f}")
-                ended = f"{outcome_in_words(row['outcome'])}, {row['end_time_s']:.0f} s"
-                panel.set_title(
-                    f"{row['scenario']}, map {row['map']}: {ended}\n{', '.join(words)}",
-                    fontsize="small",
-                )
+                panel.set_title(title, fontsize="small")
+            name = textwrap.fill(line.name, int(map_in / _LETTER_IN))
             count = f"({len(line.failures)} of {line.among} failures)"
-            row_of_panels[0].set_ylabel(f"{line.name}\n{count}", fontsize="small")
+            row_of_panels[0].set_ylabel(f"{name}\n{count}", fontsize="small")
         maps.draw_scale(panels[-1, 0], lines[-1].recordings[0].grid.extent_m)
         maps.draw_bar(figure, "predicted λ̂", aspect=30, alpha=_LIGHT)
         legend_outside(figure, columns=6)
         return figure
 
 
+def _titles(line: FailedLine, letters: int) -> list[str]:
+    """Return the title of each panel of a line, wrapped to a number of letters."""
+    rows = line.failures.to_dict("records")
+    titles = []
+    for recording, row in zip(line.recordings, rows, strict=False):
+        parts = [_ending(row), _traversability(recording, row)]
+        wrapped = [textwrap.fill(part, letters) for part in parts]
+        titles.append("\n".join(wrapped))
+    return titles
+
+
+def _ending(row: Mapping[Any, Any]) -> str:
+    outcome = outcome_in_words(row["outcome"])
+    map_name = _unbroken(f"{row['scenario']}, map {row['map']}:")
+    end = _unbroken(f"{outcome}, {row['end_time_s']:.0f} s")
+    return f"{map_name} {end}"
+
+
+def _traversability(recording: Recording, row: Mapping[Any, Any]) -> str:
+    predicted = recording.predicted_at_end
+    observed = row["last_traversability"]
+    words = [f"λ̂ = {predicted:.2f}"]
+    if np.isnan(predicted):
+        words = ["outside the map"]
+    if not np.isnan(observed):
+        words.append(f"observed λ = {observed:.2f}")
+    return ", ".join(map(_unbroken, words))
+
+
+def _unbroken(words: str) -> str:
+    """Return words that stay in one line of a wrapped title."""
+    return words.replace(" ", "\N{NO-BREAK SPACE}")
+
+
 def _draw_failure(panel: Axes, recording: Recording) -> None:
     panel.set_visible(True)
     extent_m = recording.grid.extent_m
+    drive = drive_at(recording, len(recording.traversability))
     maps.show_map(panel, recording.predicted, extent_m, alpha=_LIGHT, **maps.LAMBDA)
     maps.overlay(panel, recording.immobilising, extent_m, maps.IMMOBILISING, 0.75)
     maps.name_immobilising(panel, recording.immobilising)
-    maps.draw_drive(
-        panel,
-        drive_at(recording, len(recording.traversability)),
-        1.1,
-        0.9,
-        label="driven",
-    )
+    drives.draw_drive(panel, drive, width=1.1, scale=0.9, label="driven")
     panel.spines[:].set_visible(False)
     panel.set(xticks=[], yticks=[])

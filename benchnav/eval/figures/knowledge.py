@@ -4,14 +4,16 @@ from collections.abc import Sequence
 from typing import Self
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Drawing
+from matplotlib.patheffects import Normal, withStroke
 
 from benchnav.core.grid import outline
 from benchnav.eval.figures import moment
 from benchnav.eval.figures.data import RunData, choose_recordings
 from benchnav.eval.recording import Recording
 from benchnav.eval.words import contender_names
-from benchnav.viz import maps
+from benchnav.viz import drives, maps
 from benchnav.viz.figure import Figure
 from benchnav.viz.style import TWO_COLUMNS_IN, legend_outside
 
@@ -35,7 +37,7 @@ class KnowledgeMaps(Figure):
     index = 0
 
     def variants(self, data: RunData) -> Sequence[Self]:
-        """Return a figure a condition."""
+        """Return one figure per condition."""
         return self.numbered(len(_learners(data)))
 
     def caption(self, data: RunData) -> str:
@@ -67,22 +69,10 @@ def draw_knowledge(recording: Recording) -> Drawing:
     tall = (TWO_COLUMNS_IN - 0.9) / _MOMENTS * ratio
     figure = Drawing(figsize=(TWO_COLUMNS_IN, 2 * tall + 1.1), layout="compressed")
     panels = figure.subplots(2, len(steps), squeeze=False, sharex=True, sharey=True)
-    for row, (name, (label, colours, maximum)) in zip(
-        panels, _SHOWN.items(), strict=True
-    ):
+    for row, (name, look) in zip(panels, _SHOWN.items(), strict=True):
+        label, colours, maximum = look
         for panel, step in zip(row, steps, strict=True):
-            moment.show_known(panel, recording, step, name)
-            known_map = recording.known_at(step)
-            if known_map is not None and known_map.sensed.any():
-                edge = outline(known_map.sensed, recording.resolution_m)
-                maps.draw_lines(panel, edge, "white", 0.5)
-                maps.name_terrain(
-                    panel, "edge of where λ was sensed", fc="0.6", ec="white"
-                )
-            maps.draw_drive(
-                panel, moment.drive_at(recording, step), 1.2, 0.8, label="driven"
-            )
-            maps.frame_map(panel)
+            _draw_belief(panel, recording, step, name)
         row[0].set_ylabel("y [m]")
         maps.draw_bar(figure, label, row, (colours, maximum), aspect=20)
     for (above, below), step in zip(panels.T, steps, strict=True):
@@ -91,3 +81,18 @@ def draw_knowledge(recording: Recording) -> Drawing:
         below.set_xlabel("x [m]")
     legend_outside(figure, columns=5)
     return figure
+
+
+def _draw_belief(panel: Axes, recording: Recording, step: int, name: str) -> None:
+    """Draw a map of the belief at a step, with the cells whose λ was measured."""
+    moment.show_known(panel, recording, step, name)
+    known_map = recording.known_at(step)
+    if known_map is not None and known_map.sensed.any():
+        edge = outline(known_map.sensed, recording.resolution_m)
+        maps.draw_lines(panel, edge, "white", 0.5)
+        stroke = [withStroke(linewidth=1.5, foreground="black"), Normal()]
+        words = "edge of cells with measured λ"
+        panel.plot([], [], color="white", lw=0.5, path_effects=stroke, label=words)
+    drive = moment.drive_at(recording, step)
+    drives.draw_drive(panel, drive, width=1.2, scale=0.8, label="driven")
+    maps.frame_map(panel)

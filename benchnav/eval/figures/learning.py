@@ -19,20 +19,15 @@ from benchnav.viz.figure import Figure
 from benchnav.viz.panels import Curves, line_looks
 from benchnav.viz.style import TWO_COLUMNS_IN, legend_outside
 
-# Title of each column's panels, with the better direction.
-METRICS = dict(
-    zip(
-        AHEAD_COLUMNS,
-        (
-            "RMSE of E[λ] ahead\n(lower is better)",
-            "log score ahead\n(higher is better)",
-        ),
-        strict=True,
-    )
+_TITLES = (
+    "RMSE of E[λ] ahead\n(lower is better)",
+    "log score ahead\n(higher is better)",
 )
-_BIN_S = 2.0
+# Title of each column's panels, with the better direction.
+METRICS = dict(zip(AHEAD_COLUMNS, _TITLES, strict=True))
+_BIN_S = 2.0  # length of a time bin
 _PANEL_COLUMNS = ((), ("model",), ("planner", "model"), ("planner", "risk", "model"))
-_LETTER_IN = 0.055
+_LETTER_IN = 0.055  # mean width of a letter of a title
 _EPISODE = ["condition", "seed", "realisation", "map"]
 
 
@@ -41,11 +36,11 @@ class Learning(Figure):
 
     name = "learning"
     text = (
-        f"Belief of robots about the terrain ahead of them, within {AHEAD_M:g} m and "
-        f"{AHEAD_DEG:g}° to either side, where they have not measured λ: RMSE of E[λ] "
-        "and mean log score, over the time since the start. Lines are means over the "
-        f"maps on which a robot still drives, one for every {_BIN_S:g} s; bands are "
-        "95 % intervals (bootstrap over maps). Times with fewer than "
+        "Accuracy of the belief about the terrain ahead of a robot: cells within "
+        f"{AHEAD_M:g} m and {AHEAD_DEG:g}° to either side whose λ was not measured. "
+        "RMSE of E[λ] and mean log score, over the time since the start. Lines are "
+        f"means for every {_BIN_S:g} s, over the maps on which a robot still drives. "
+        "Bands are 95 % intervals (bootstrap over maps). Times with fewer than "
         f"{LEAST_MAPS} maps are left out."
     )
 
@@ -53,49 +48,51 @@ class Learning(Figure):
 
     def variants(self, data: RunData) -> Sequence[Self]:
         """Return one figure if robots learnt on enough maps and steps were stored."""
-        curves = (
-            read_learning(data.folder, data.episodes) if data.folder else self.curves
-        )
+        curves = self.curves
+        if data.folder:
+            curves = read_learning(data.folder, data.episodes)
         return [self.variant(curves=curves)] if len(curves) else []
 
     def draw(self, data: RunData) -> Drawing:
         """Draw a line with a band for each condition, in several panels if many."""
-        rows = data.summary[
-            data.summary["condition"].isin(self.curves["condition"])
-        ].reset_index(drop=True)
-        differing = [
-            name
-            for name in dict.fromkeys((*BLOCK, *NAMING))
-            if name in rows and rows[name].nunique() > 1
-        ]
-        titled, groups = divide_lines(
-            rows, [(*BLOCK, *extra) for extra in _PANEL_COLUMNS]
-        )
-        named = [name for name in differing if name not in titled]
-        labels = (
-            [reading_name(name, row[name]) for name in named]
-            for row in rows.to_dict("records")
-        )
-        names = [joined(row_labels) or "mean over maps" for row_labels in labels]
-        letters = int(
-            (TWO_COLUMNS_IN / min(len(groups), MAX_ACROSS) - 0.4) / _LETTER_IN
-        )
+        has_curve = data.summary["condition"].isin(self.curves["condition"])
+        rows = data.summary[has_curve].reset_index(drop=True)
+        panel_columns = [(*BLOCK, *extra) for extra in _PANEL_COLUMNS]
+        titled, groups = divide_lines(rows, panel_columns)
+        names = _line_names(rows, titled)
+        across = min(len(groups), MAX_ACROSS)
+        panel_in = TWO_COLUMNS_IN / across - 0.4
+        letters = int(panel_in / _LETTER_IN)
         points = []
         for title, shown in groups:
             panel = textwrap.fill(title, letters)
             for index in shown:
-                is_line = self.curves["condition"] == rows["condition"][index]
-                points.append(
-                    self.curves[is_line].assign(panel=panel, line=names[index])
-                )
-        table = pd.concat(points).rename(columns={"time_s": "x"})
-        looks = line_looks(names, dashed=True)
-        figure, panels = Curves(
-            table=table, measures=METRICS, looks=looks, x_label="seconds of experience"
-        ).draw()
-        next(iter(panels.values())).set_xlim(left=0)
+                is_of_line = self.curves["condition"] == rows["condition"][index]
+                curve = self.curves[is_of_line]
+                points.append(curve.assign(panel=panel, line=names[index]))
+        curves = Curves(
+            table=pd.concat(points).rename(columns={"time_s": "x"}),
+            measures=METRICS,
+            looks=line_looks(names, dashed=True),
+            x_label="time since the start [s]",
+        )
+        figure, panels = curves.draw()
+        first_panel = next(iter(panels.values()))
+        first_panel.set_xlim(left=0)
         legend_outside(figure)
         return figure
+
+
+def _line_names(rows: pd.DataFrame, titled: Sequence[str]) -> list[str]:
+    """Name lines by the labels that differ and are in no panel's title."""
+    columns = [name for name in dict.fromkeys((*BLOCK, *NAMING)) if name in rows]
+    differing = [name for name in columns if rows[name].nunique() > 1]
+    named = [name for name in differing if name not in titled]
+    names = []
+    for row in rows.to_dict("records"):
+        name = joined(reading_name(column, row[column]) for column in named)
+        names.append(name or "mean over maps")
+    return names
 
 
 def read_learning(folder: Path, episodes: pd.DataFrame) -> pd.DataFrame:
@@ -106,38 +103,37 @@ def read_learning(folder: Path, episodes: pd.DataFrame) -> pd.DataFrame:
         episodes: rows of the run.
 
     Returns:
-        A row a condition and time bin with at least `LEAST_MAPS` maps, or groups of
+        One row per condition and time bin with at least `LEAST_MAPS` maps, or groups of
         maps: `condition`; `time_s`, the middle of the bin; `maps`, their number; and
         the mean of each of `METRICS` over them, with its 95 % interval in the columns
-        `_low` and `_high`. Empty if no robot learnt, or no steps were stored.
+        `_low` and `_high`. Empty if no robot learnt or no steps were stored.
     """
     names = list(METRICS)
-    columns = [
-        "condition",
-        "time_s",
-        "maps",
-        *(f"{name}{end}" for name in names for end in ("", "_low", "_high")),
-    ]
-    tables = [
-        rows.loc[rows[names[0]].notna(), [*_EPISODE, "time_s", *names]]
-        for rows in step_files(folder)
-        if names[0] in rows
-    ]
+    first_name = names[0]
+    metric_columns = [f"{name}{end}" for name in names for end in ("", "_low", "_high")]
+    columns = ["condition", "time_s", "maps", *metric_columns]
+    tables = []
+    for rows in step_files(folder):
+        if first_name in rows:
+            is_known = rows[first_name].notna()
+            tables.append(rows.loc[is_known, [*_EPISODE, "time_s", *names]])
     if not tables:
         return pd.DataFrame(columns=columns)
     steps = pd.concat(tables).merge(episodes[[*_EPISODE, "group"]], on=_EPISODE)
     steps["bin"] = (steps["time_s"] / _BIN_S + 1e-6).astype(int)
     # Each episode counts once in a bin, and each map once, however many episodes.
-    once = steps.groupby([*_EPISODE, "group", "bin"])[names].mean()
-    by_map = once.groupby(["condition", "bin", "group"])[names].mean()
-    rows = []
+    by_episode = steps.groupby([*_EPISODE, "group", "bin"])[names].mean()
+    by_map = by_episode.groupby(["condition", "bin", "group"])[names].mean()
+    points = []
     for (condition, bin_index), group in by_map.groupby(["condition", "bin"]):
-        if len(group) < LEAST_MAPS:
+        n_maps = len(group)
+        if n_maps < LEAST_MAPS:
             continue
         values = group.to_numpy(np.float64)
-        low, high = np.quantile(
-            bootstrap_counts(len(group)) @ values / len(group), [0.025, 0.975], axis=0
-        )
-        numbers = np.stack((values.mean(axis=0), low, high), axis=1).ravel()
-        rows.append((condition, (bin_index + 0.5) * _BIN_S, len(group), *numbers))
-    return pd.DataFrame(rows, columns=columns)
+        bootstrap_means = bootstrap_counts(n_maps) @ values / n_maps
+        low, high = np.quantile(bootstrap_means, [0.025, 0.975], axis=0)
+        means = values.mean(axis=0)
+        numbers = np.stack((means, low, high), axis=1).ravel()
+        time_s = (bin_index + 0.5) * _BIN_S
+        points.append((condition, time_s, n_maps, *numbers))
+    return pd.DataFrame(points, columns=columns)

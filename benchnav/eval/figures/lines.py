@@ -9,6 +9,7 @@ from benchnav.eval.words import joined, reading_name
 
 MAX_ACROSS = 4  # panels side by side
 _MAX_LINES = 7  # of a panel
+# Labels that a blind planner does not depend on.
 _BLIND_TO = ("model", "sensor", "ground", "belief", "who", "planner", "risk")
 
 
@@ -20,7 +21,7 @@ def divide_lines(
     A blind planner is repeated in all panels of its scenario that have other lines.
 
     Args:
-        labels: a row a line, indexed from 0, a column a kind of label.
+        labels: one row per line, indexed from 0, and one column per kind of label.
         alternatives: columns that panels differ in.
 
     Returns:
@@ -29,22 +30,19 @@ def divide_lines(
     is_blind = labels["model"] == NOT_USED
     numbered = labels.assign(line=labels.index)
     for columns in alternatives:
+        seeing = numbered.loc[~is_blind, [*columns, "line"]]
+        settings = seeing[list(columns)].drop_duplicates()
         fixed_columns = [name for name in columns if name not in _BLIND_TO]
-        panels = numbered.loc[~is_blind, list(columns)].drop_duplicates()
-        blind = numbered.loc[is_blind, [*fixed_columns, "line"]].merge(
-            panels, "left", fixed_columns
-        )
-        blind = blind.fillna(NOT_USED)
-        shown = pd.concat([numbered.loc[~is_blind, [*columns, "line"]], blind])
-        groups = (
-            shown.groupby(list(columns), sort=False)["line"].agg(list).reset_index()
-        )
+        blind = numbered.loc[is_blind, [*fixed_columns, "line"]]
+        blind = blind.merge(settings, "left", fixed_columns).fillna(NOT_USED)
+        shown = pd.concat([seeing, blind])
+        by_panel = shown.groupby(list(columns), sort=False)["line"]
+        groups = by_panel.agg(list).reset_index()
         if groups["line"].map(len).max() <= _MAX_LINES:
             break
     titled = [name for name in columns if groups[name].nunique() > 1]
-    rows = groups.to_dict("records")
-    panels_ = []
-    for row in rows:
+    panels = []
+    for row in groups.to_dict("records"):
         title = joined(reading_name(name, row[name]) for name in titled)
-        panels_.append((title, row["line"]))
-    return titled, panels_
+        panels.append((title, row["line"]))
+    return titled, panels

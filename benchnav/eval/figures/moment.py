@@ -8,9 +8,10 @@ from matplotlib.axes import Axes
 
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.recording import Recording
-from benchnav.viz import maps, plans
+from benchnav.viz import drives, maps, plans
 from benchnav.viz.style import bytes_of
 
+# Red, green and blue of unobserved cells, observed cells, and cells with measured λ.
 _SEEN_COLOURS = np.array(
     [bytes_of(colour)[:3] for colour in (maps.UNSEEN, maps.SEEN, maps.SENSED)], np.uint8
 )
@@ -41,9 +42,8 @@ def known_colours(recording: Recording, step: int) -> dict[str, np.ndarray]:
         name: maps.veiled(shown, known_map.seen) for name, shown in colours.items()
     }
     # λ may be measured in a cell whose appearance was not observed.
-    return veiled | {
-        "seen": _SEEN_COLOURS[np.where(known_map.sensed, 2, known_map.seen.astype(int))]
-    }
+    kind = np.where(known_map.sensed, 2, known_map.seen.astype(int))
+    return veiled | {"seen": _SEEN_COLOURS[kind]}
 
 
 def true_colours(recording: Recording) -> np.ndarray:
@@ -57,22 +57,22 @@ def show_known(
     panel: Axes, recording: Recording, step: int, name: str = "risk"
 ) -> None:
     """Show a map of `known_colours`, with unobserved cells and the sensors' footprint."""
-    maps.show_map(panel, known_colours(recording, step)[name], recording.grid.extent_m)
+    colours = known_colours(recording, step)[name]
+    maps.show_map(panel, colours, recording.grid.extent_m)
     known_map = recording.known_at(step)
     _, free = recording.given_at(step)
     if name == "risk" and not free.all():
         maps.name_terrain(panel, "not free", color=maps.CLOSED)
     if known_map is None:
         return
-    if not known_map.seen.all():
-        maps.draw_lines(
-            panel, maps.hatching(~known_map.seen, recording.resolution_m), "black", 0.3
-        )
-        maps.name_terrain(
-            panel, "not seen", fc=maps.UNSEEN, ec="black", hatch="////", lw=0
-        )
+    unseen = ~known_map.seen
+    if unseen.any():
+        lines = maps.hatching(unseen, recording.resolution_m)
+        maps.draw_lines(panel, lines, "black", 0.3)
+        look = {"fc": maps.UNSEEN, "ec": "black", "hatch": "////"}
+        maps.name_terrain(panel, "not observed", lw=0, **look)
     if known_map.outlines:
-        plans.draw_reach(panel, known_map.outline)
+        plans.draw_footprint(panel, known_map.outline)
 
 
 def known_in_words(recording: Recording) -> str:
@@ -80,10 +80,10 @@ def known_in_words(recording: Recording) -> str:
     if recording.about["model"] == NOT_USED:
         return "true E[λ]; the planner uses no map"
     if recording.known:
-        return "λ̂ known by then"
-    sensor = recording.about.get("sensor", "full")
-    belief = recording.about.get("belief", "static")
-    if (sensor, belief) == ("full", "static"):
+        return "λ̂ of the belief at that time"
+    sees_all = recording.about.get("sensor", "full") == "full"
+    is_static = recording.about.get("belief", "static") == "static"
+    if sees_all and is_static:
         return "λ̂ given to the planner"
     return "λ̂ at the start"  # updates were not recorded
 
@@ -98,14 +98,16 @@ def show_truth(panel: Axes, recording: Recording) -> None:
 def draw_plan(panel: Axes, recording: Recording, step: int) -> None:
     """Draw the plan of a step; nothing once the episode has ended."""
     if not has_ended(recording, step):
-        plans.draw_plan(panel, recording.plan_at(step * recording.dt_s).lines)
+        plan = recording.plan_at(step * recording.dt_s)
+        plans.draw_plan(panel, plan.lines)
 
 
-def drive_at(recording: Recording, step: int) -> maps.Drive:
+def drive_at(recording: Recording, step: int) -> drives.Drive:
     """Return the path of a recording up to a step."""
-    return maps.Drive(
+    outcome = recording.about["outcome"] if has_ended(recording, step) else ""
+    return drives.Drive(
         track=recording.track[: step + 1],
         goal_m=recording.goal_m,
-        outcome=recording.about["outcome"] if has_ended(recording, step) else "",
+        outcome=outcome,
         heading_rad=recording.states[step, 2],
     )

@@ -1,4 +1,4 @@
-"""Fractions of outcomes, a bar a condition."""
+"""Fractions of outcomes, one bar per condition."""
 
 from typing import Any
 
@@ -26,6 +26,7 @@ LOOKS = {
     "belief_error": ("#A6A6A6", "+++++"),
 }
 SUCCESS_COLOUR = "#E4E4E4"
+_BAR = 0.78  # thickness of a bar over the distance of rows
 
 
 class Outcomes(Figure):
@@ -35,41 +36,23 @@ class Outcomes(Figure):
     text = "Outcomes of the episodes."
 
     def draw(self, data: RunData) -> Drawing:
-        """Draw a bar a condition."""
-        ended = [name for name in LOOKS if data.summary[f"{name}_count"].sum()]
+        """Draw one bar per condition."""
+        occurring = [name for name in LOOKS if data.summary[f"{name}_count"].sum()]
+        legend_lines = 1 + len(occurring) // 3
         label = "fraction of episodes [%]"
-        figure, panels = lay_out(
-            data.summary, [label], legend_in=0.15 + 0.15 * (len(ended) // 3)
-        )
+        figure, panels = lay_out(data.summary, [label], 0.15 * legend_lines)
         for panel, rows in panels:
+            heights = rows["height"]
             offset = np.zeros(len(rows))
-            for name in ended:
+            for name in occurring:
                 fraction = 100 * rows[f"{name}_count"] / rows["n_episodes"]
                 colour, hatch = LOOKS[name]
-                look: dict[str, Any] = {
-                    "fc": colour,
-                    "hatch": hatch,
-                    "ec": "white",
-                    "lw": 0,
-                }
-                panel.barh(
-                    rows["height"],
-                    fraction,
-                    0.78,
-                    offset,
-                    label=outcome_in_words(name),
-                    **look,
-                )
+                look: dict[str, Any] = {"fc": colour, "hatch": hatch, "ec": "white"}
+                words = outcome_in_words(name)
+                panel.barh(heights, fraction, _BAR, offset, label=words, lw=0, **look)
                 offset = offset + fraction
-            panel.barh(
-                rows["height"],
-                100 - offset,
-                0.78,
-                offset,
-                color=SUCCESS_COLOUR,
-                lw=0,
-                label="success",
-            )
+            look = {"color": SUCCESS_COLOUR, "lw": 0}
+            panel.barh(heights, 100 - offset, _BAR, offset, label="success", **look)
         panel.set_xlim(0, 100)
         legend_outside(figure, columns=6)
         return figure

@@ -1,7 +1,7 @@
-"""Sweeps of a run as curves: conditions that differ in one number of three values."""
+"""Sweeps of a run as curves: conditions that differ in one number only."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Self
 
@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Drawing
+from matplotlib.lines import Line2D
 
 from benchnav.core import registry
 from benchnav.datagen.recipe.scenario import find_series
@@ -18,10 +19,11 @@ from benchnav.eval.figures.lines import MAX_ACROSS, divide_lines
 from benchnav.eval.words import joined
 from benchnav.planning.free_space import Rules
 from benchnav.viz.figure import Figure
-from benchnav.viz.panels import Curves, line_looks
+from benchnav.viz.panels import Curves, Looks, line_looks, ticks_of
 from benchnav.viz.style import (
     BLIND,
     LINE_COLOURS,
+    TWO_COLUMNS_IN,
     condition_colours,
     legend_outside,
     planner_name,
@@ -33,6 +35,8 @@ MIN_VALUES = 3
 
 _LEVEL = "risk.options.level"
 _NAMES = {_LEVEL: "level α", SEVERITY: "severity of the scenario"}
+_LABEL_IN = 0.26  # width of the label of a tick, with a gap
+_SIDE_IN = 0.35  # between the axes of neighbouring panels
 # Columns of the summary of each measure, and their factor.
 _MEASURES = {
     "success [%]": ("success_rate", "success_low", "success_high", 100.0),
@@ -64,13 +68,28 @@ class Line:
 
     Args:
         values: values of the number, ascending.
-        conditions: ids, one a value.
+        conditions: ids, one per value.
         rest: all other settings of the conditions, by dotted name.
     """
 
     values: tuple[float, ...]
     conditions: tuple[str, ...]
     rest: Mapping[str, Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reference:
+    """A setting without the number of a sweep, drawn as a horizontal line.
+
+    Args:
+        condition: id.
+        name: name of the setting in the legend.
+        look: style of the line, as in `Axes.axhline`.
+    """
+
+    condition: str
+    name: str
+    look: Mapping[str, Any]
 
 
 def find_sweeps(conditions: Mapping[str, Mapping[str, Any]]) -> dict[str, list[Line]]:
@@ -93,49 +112,45 @@ def find_sweeps(conditions: Mapping[str, Mapping[str, Any]]) -> dict[str, list[L
     flat = [pd.json_normalize(value).to_dict("records")[0] for value in values.values()]
     table_of_values = pd.DataFrame(flat, index=list(values), dtype=object)
     tables = [(number, table_of_values) for number in sorted(table_of_values)]
-    for scenario, pairs in find_series(
-        dict.fromkeys(table_of_values.get("split", ()))
-    ).items():
-        severities = {split: severity for severity, split in pairs}
-        of_series = table_of_values[table_of_values["split"].isin(list(severities))]
-        tables.append(
-            (
-                SEVERITY,
-                of_series.assign(
-                    severity=of_series["split"].map(severities), split=scenario
-                ),
-            )
-        )
+    tables += [(SEVERITY, table) for table in _series_tables(table_of_values)]
     sweeps: dict[str, list[Line]] = {}
     for number, table in tables:
-        table = table[table[number].map(_is_number)]
-        fixed = table.drop(columns=number)
-        for _, group in table.groupby(
-            fixed.astype(str).apply(tuple, axis=1), sort=False
-        ):
-            if group[number].nunique() >= MIN_VALUES:
-                ordered = group[number].astype(float).sort_values(kind="stable")
-                line = Line(
-                    values=tuple(ordered),
-                    conditions=tuple(ordered.index),
-                    rest=fixed.loc[ordered.index[0]].dropna().to_dict(),
-                )
-                sweeps.setdefault(number, []).append(line)
+        numeric = table[table[number].map(_is_number)]
+        fixed = numeric.drop(columns=number)
+        keys = fixed.astype(str).apply(tuple, axis=1)
+        for _, group in numeric.groupby(keys, sort=False):
+            if group[number].nunique() < MIN_VALUES:
+                continue
+            ordered = group[number].astype(float).sort_values(kind="stable")
+            ids = tuple(ordered.index)
+            rest = fixed.loc[ids[0]].dropna().to_dict()
+            line = Line(values=tuple(ordered), conditions=ids, rest=rest)
+            sweeps.setdefault(number, []).append(line)
     return sweeps
+
+
+def _series_tables(values: pd.DataFrame) -> list[pd.DataFrame]:
+    """Return the rows of each series of scenarios, with their `severity`."""
+    splits = dict.fromkeys(values.get("split", ()))
+    tables = []
+    for scenario, pairs in find_series(splits).items():
+        severities = {split: severity for severity, split in pairs}
+        in_series = values["split"].isin(list(severities))
+        table = values[in_series]
+        severity = table["split"].map(severities)
+        tables.append(table.assign(severity=severity, split=scenario))
+    return tables
 
 
 def _with_defaults(value: Mapping[str, Any]) -> dict[str, Any]:
     """Return a condition's value completed by default rules and planner options."""
     planner = value["planner"]
-    later = {}
+    later_options = {}
     if planner["part"] in registry.names("planner"):
-        later = registry.later_options("planner", planner["part"])
-    options = {**later, **planner["options"]}
-    return {
-        **value,
-        "rules": {**asdict(Rules()), **value.get("rules", {})},
-        "planner": {**planner, "options": options},
-    }
+        later_options = registry.later_options("planner", planner["part"])
+    options = later_options | planner["options"]
+    rules = asdict(Rules()) | value.get("rules", {})
+    return {**value, "rules": rules, "planner": {**planner, "options": options}}
 
 
 def _is_number(value: Any) -> bool:
@@ -160,26 +175,35 @@ class Over(Figure):
     lines: Sequence[Line] = ()
 
     def variants(self, data: RunData) -> Sequence[Self]:
-        """Return a figure a sweep."""
+        """Return one figure per sweep."""
         sweeps = find_sweeps(data.about["conditions"])
         counts = Counter(map(sweep_name, sweeps))
-        short_names = {
-            sweep: sweep_name(sweep)
-            if counts[sweep_name(sweep)] == 1
-            else sweep.replace(".", "-")
-            for sweep in sweeps
-        }
-        return [
-            self.variant(number=number, lines=lines, name=f"over-{short_names[number]}")
-            for number, lines in sweeps.items()
-        ]
+        figures = []
+        for number, lines in sweeps.items():
+            short_name = sweep_name(number)
+            if counts[short_name] > 1:
+                short_name = number.replace(".", "-")
+            name = f"over-{short_name}"
+            figures.append(self.variant(number=number, lines=lines, name=name))
+        return figures
 
     def caption(self, data: RunData) -> str:
-        """Return which number it is."""
-        return (
-            f"Success and T_total over {self.name.removeprefix('over-')}. Bands are "
-            "95 % intervals; horizontal lines are settings without this number."
-        )
+        """Return the name of the number, and the meaning of bands, lines and axis."""
+        sentences = [
+            f"Success and T_total over {self.name.removeprefix('over-')}.",
+            "Points are conditions, and bands are their 95 % intervals.",
+        ]
+        if self.number.startswith("risk."):
+            sentences.append(
+                "Horizontal broken lines are settings without this number: in the "
+                "colour of their planner, or grey for a blind planner."
+            )
+        if self.number == _LEVEL:
+            sentences.append(
+                "The axis is spaced by the logarithm of 1 − α, the fraction of the "
+                "lower tail."
+            )
+        return " ".join(sentences)
 
     def draw(self, data: RunData) -> Drawing:
         """Draw success above with Wilson's band, T_total below with the bootstrap's.
@@ -190,19 +214,12 @@ class Over(Figure):
         """
         rows = data.summary.set_index("condition", drop=False)
         labels = _label_lines(self.number, self.lines, rows)
-        planners = labels.drop_duplicates("name").set_index("name")["planner"]
-        looks = line_looks(
-            planners.index, condition_colours(planners.tolist(), LINE_COLOURS)
-        )
+        looks = _looks_of_lines(labels)
         _, groups = divide_lines(labels, _PANEL_COLUMNS)
         groups = [
             (title or labels["scenario"][shown[0]], shown) for title, shown in groups
         ]
-        columns_of_measures: dict[str, pd.Series] = {}
-        for name, (*columns, scale) in _MEASURES.items():
-            for end, column in zip(("", "_low", "_high"), columns, strict=True):
-                columns_of_measures[name + end] = scale * rows[column]
-        measured = pd.DataFrame(columns_of_measures)
+        measured = _measured(rows)
         points = []
         for title, shown in groups:
             for index in shown:
@@ -211,115 +228,163 @@ class Over(Figure):
                 of_line = measured.loc[list(line.conditions)]
                 name = labels["name"][index]
                 points.append(of_line.assign(panel=title, line=name, x=x))
-        across = min(len(groups), MAX_ACROSS)
-        measures = {name: name for name in _MEASURES}
-        label = _NAMES.get(self.number, sweep_name(self.number))
         curves = Curves(
             table=pd.concat(points),
-            measures=measures,
+            measures={name: name for name in _MEASURES},
             looks=looks,
-            x_label=label,
-            across=across,
+            x_label=_NAMES.get(self.number, sweep_name(self.number)),
+            across=min(len(groups), MAX_ACROSS),
         )
         figure, panels = curves.draw()
-        ticks = sorted({value for line in self.lines for value in line.values})
-        for panel in panels.values():
-            panel.set_xticks(
-                _positions(self.number, ticks), [f"{value:g}" for value in ticks]
-            )
+        self._label_ticks(list(panels.values()), curves.across)
+        handles: list[Line2D] = []
         if self.number.startswith("risk."):
-            others = rows.drop(
-                [condition for line in self.lines for condition in line.conditions]
-            )
-            for title, shown in groups:
-                colours = {
-                    index: looks[labels["name"][index]]["color"] for index in shown
-                }
-                firsts = {
-                    index: rows.loc[self.lines[index].conditions[0]] for index in shown
-                }
-                for measure in _MEASURES:
-                    _draw_references(
-                        panels[title, measure],
-                        others,
-                        measured[measure],
-                        firsts,
-                        colours,
-                    )
-        legend_outside(figure)
+            by_panel = {
+                title: self._references(rows, labels["name"], looks, shown)
+                for title, shown in groups
+            }
+            for (title, measure), panel in panels.items():
+                for reference in by_panel[title]:
+                    value = measured.loc[reference.condition, measure]
+                    panel.axhline(value, label="_reference", **reference.look)
+            references = [line for lines in by_panel.values() for line in lines]
+            handles = _reference_handles(references)
+        legend_outside(figure, handles)
         return figure
 
+    def _label_ticks(self, panels: Sequence[Axes], across: int) -> None:
+        """Label the values of the number, except where labels would overlap."""
+        ticks = sorted({value for line in self.lines for value in line.values})
+        positions = _positions(self.number, ticks)
+        width_in = TWO_COLUMNS_IN / max(across, 2) - _SIDE_IN
+        min_gap = (positions[-1] - positions[0]) * _LABEL_IN / width_in
+        labels = [""] * len(ticks)
+        # From the last value on, since high levels are the closest to each other.
+        following = np.inf
+        for index in reversed(range(len(ticks))):
+            if following - positions[index] >= min_gap:
+                labels[index] = f"{ticks[index]:g}"
+                following = positions[index]
+        for panel in panels:
+            panel.set_xticks(positions, labels)
+            ticks_of(panel, "y", 5)
 
-def _draw_references(
-    panel: Axes,
-    others: pd.DataFrame,
-    values: pd.Series,
-    firsts: Mapping[int, pd.Series],
-    colours: Mapping[int, Any],
-) -> None:
-    """Draw settings without the number, of the same planner or blind, as lines."""
-    settings = [
-        risk_name(row["risk"])
-        if row["model"] != NOT_USED
-        else planner_name(row["planner"])
-        for row in others.to_dict("records")
-    ]
-    order = list(dict.fromkeys(settings))
-    for index, first_row in firsts.items():
-        for name, (condition, row) in zip(settings, others.iterrows(), strict=True):
-            is_blind = row["model"] == NOT_USED
-            shared = list(_SAME) if is_blind else [*_SAME, "model", "planner"]
-            if (row[shared] == first_row[shared]).all():
-                colour = BLIND if is_blind else colours[index]
+    def _references(
+        self,
+        rows: pd.DataFrame,
+        names: pd.Series,
+        looks: Looks,
+        shown: Sequence[int],
+    ) -> list[Reference]:
+        """Return the lines of a panel for settings without the number.
+
+        A setting is shown with its planner's line; a blind one with any line.
+
+        Args:
+            rows: rows of the summary, by condition.
+            names: name of each line of the sweep.
+            looks: style by name.
+            shown: indices of the panel's lines of the sweep.
+        """
+        swept = [condition for line in self.lines for condition in line.conditions]
+        others = rows.drop(swept)
+        settings = [_setting_name(row) for row in others.to_dict("records")]
+        order = list(dict.fromkeys(settings))
+        references = []
+        for index in shown:
+            first_row = rows.loc[self.lines[index].conditions[0]]
+            line_colour = looks[names[index]]["color"]
+            for name, (condition, row) in zip(settings, others.iterrows(), strict=True):
+                is_blind = row["model"] == NOT_USED
+                shared = list(_SAME) if is_blind else [*_SAME, "model", "planner"]
+                if (row[shared] != first_row[shared]).any():
+                    continue
+                colour = BLIND if is_blind else line_colour
                 # Dashes with an increasing number of dots distinguish settings.
                 dashes = (0, (6, 2, *(1, 1.5) * order.index(name)))
-                panel.axhline(
-                    values[condition],
-                    color=colour,
-                    ls=dashes,
-                    lw=1,
-                    zorder=1,
-                    label=name,
-                )
+                look = {"color": colour, "ls": dashes, "lw": 1, "zorder": 1}
+                reference = Reference(condition=str(condition), name=name, look=look)
+                references.append(reference)
+        return references
+
+
+def _looks_of_lines(labels: pd.DataFrame) -> dict[str, dict[str, Any]]:
+    planners = labels.drop_duplicates("name").set_index("name")["planner"]
+    colours = condition_colours(planners.tolist(), LINE_COLOURS)
+    return line_looks(planners.index, colours)
+
+
+def _measured(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return each measure of `_MEASURES` with the ends of its interval, by condition."""
+    measured: dict[str, pd.Series] = {}
+    for name, (*columns, scale) in _MEASURES.items():
+        for end, column in zip(("", "_low", "_high"), columns, strict=True):
+            measured[name + end] = scale * rows[column]
+    return pd.DataFrame(measured)
+
+
+def _setting_name(row: Mapping[Any, Any]) -> str:
+    if row["model"] == NOT_USED:
+        return planner_name(row["planner"])
+    return risk_name(row["risk"])
+
+
+def _reference_handles(references: Sequence[Reference]) -> list[Line2D]:
+    """Return an entry of the legend for each setting.
+
+    An entry is black if its lines have the colours of several planners.
+    """
+    handles = []
+    for name in dict.fromkeys(reference.name for reference in references):
+        of_name = [line.look for line in references if line.name == name]
+        look = dict(of_name[0])
+        if len({line_look["color"] for line_look in of_name}) > 1:
+            look["color"] = "black"
+        handles.append(Line2D([], [], label=name, **look))
+    return handles
 
 
 def _label_lines(
     number: str, lines: Sequence[Line], rows: pd.DataFrame
 ) -> pd.DataFrame:
-    """Return `_LABELS`, `planner` and `name` of each line, a row a line.
+    """Return `_LABELS`, `planner` and `name` in one row per line.
 
     A swept part is named without its label, which contains the number.
     """
-    labelled = rows.loc[[line.conditions[0] for line in lines]].reset_index(drop=True)
-    labelled["scenario"] = [
-        str(line.rest["split"]).removeprefix("test/") for line in lines
-    ]
+    first_conditions = [line.conditions[0] for line in lines]
+    labelled = rows.loc[first_conditions].reset_index(drop=True)
+    splits = [str(line.rest["split"]) for line in lines]
+    labelled["scenario"] = [split.removeprefix("test/") for split in splits]
     labelled["who"] = labelled["planner"]
     if number.startswith(("world.", "rules.")):
         labelled["world"] = labelled["world"].str.partition(" ")[0]
     part = number.partition(".")[0]
     column = "who" if part == "planner" else part
-    if f"{part}.part" in lines[0].rest:
-        parts = np.array([line.rest.get(f"{part}.part") for line in lines])
-        labelled[column] = labelled[column].where(labelled[column] == NOT_USED, parts)
+    key = f"{part}.part"
+    if key in lines[0].rest:
+        parts = np.array([line.rest.get(key) for line in lines])
+        is_unused = labelled[column] == NOT_USED
+        labelled[column] = labelled[column].where(is_unused, parts)
     labelled["who"] = labelled["who"].map(planner_name)
     labelled["risk"] = labelled["risk"].map(risk_name)
-    names = {}
+    names: dict[Any, str] = {}
     for _, group in labelled.groupby(list(_LABELS), sort=False):
-        rests = [lines[index].rest for index in group.index]
-        for index, rest in zip(group.index, rests, strict=True):
+        rests = {index: lines[index].rest for index in group.index}
+        for index, rest in rests.items():
             # Settings that no label shows are appended if lines would coincide.
-            differing = [
-                key
-                for key in rest
-                if len({repr(fixed.get(key)) for fixed in rests}) > 1
-            ]
-            extra = (f"{sweep_name(key)} {rest[key]}" for key in differing)
-            names[index] = joined([group["who"][index], group["risk"][index], *extra])
+            differing = [key for key in rest if _differs(key, rests.values())]
+            extra = [f"{sweep_name(key)} {rest[key]}" for key in differing]
+            words = [group["who"][index], group["risk"][index], *extra]
+            names[index] = joined(words)
     return labelled.assign(name=pd.Series(names))
+
+
+def _differs(key: str, settings: Iterable[Mapping[str, Any]]) -> bool:
+    return len({repr(setting.get(key)) for setting in settings}) > 1
 
 
 def _positions(number: str, values: Sequence[float]) -> np.ndarray:
     """Return positions of values; levels by the logarithm of the tail's weight."""
     numbers = np.asarray(values)
-    return -np.log(1 - numbers) if number == _LEVEL and numbers.max() < 1 else numbers
+    is_level = number == _LEVEL and numbers.max() < 1
+    return -np.log(1 - numbers) if is_level else numbers

@@ -1,6 +1,7 @@
 """Waterfall of regret: change of success and time in each step of a chain."""
 
-from itertools import pairwise
+from collections.abc import Sequence
+from itertools import pairwise, starmap
 from typing import Any
 
 import numpy as np
@@ -28,9 +29,10 @@ from benchnav.viz.style import (
 )
 
 MAX_CHAINS = 6
-_ROW_IN = 0.24
-_ENDS = "0.75"
-_BOUND = "0.25"
+_ROW_IN = 0.24  # height of a row
+_ENDS = "0.75"  # colour of the first and the last bar
+_BOUND: dict[str, Any] = {"color": "0.25", "ls": "--", "lw": 1.1}
+_BAR: dict[str, Any] = {"height": 0.7, "lw": 0}
 # Axis label, factor, and whether more is worse, for each measure.
 _MEASURES = {
     "success": ("success [%]", 100.0, False),
@@ -50,28 +52,33 @@ class Regret(Figure):
     def caption(self, data: RunData) -> str:
         """Return the meaning of a step, and how many chains are shown."""
         chains = data.regret["chain"].nunique()
-        shown = ""
-        if chains > MAX_CHAINS:
-            shown = f" The first {MAX_CHAINS} of {chains} chains are shown."
-        return (
+        sentences = [
             "Regret against the near-optimal reference, which plans on λ itself and is "
-            "no bound: paired differences in each step from a planner to the "
-            "reference, on common episodes. Black lines are 95 % intervals, the dashed "
-            "line is a lower bound. A step may be negative, and another order of steps "
-            f"would give other values, so that no step is a cause.{shown}"
+            "not a bound: paired differences in each step from a planner to the "
+            "reference, on common episodes.",
+            "Black lines are 95 % intervals.",
+        ]
+        if data.regret["time_bound"].notna().any():
+            sentences.append(
+                "The dashed line is a lower bound of T_total, and an upper bound of success."
+            )
+        sentences.append(
+            "A step may be negative, and another order of steps would give other "
+            "values, so that no step is a cause."
         )
+        if chains > MAX_CHAINS:
+            sentences.append(f"The first {MAX_CHAINS} of {chains} chains are shown.")
+        return " ".join(sentences)
 
     def draw(self, data: RunData) -> Drawing:
         """Draw each chain from its planner (top) to the reference: success, T_total."""
-        chains = [rows for _, rows in data.regret.groupby("chain", sort=True)][
-            :MAX_CHAINS
-        ]
-        steps = 2 + max(len(rows) for rows in chains)
-        height = len(chains) * (_ROW_IN * steps + 0.55) + 0.3
+        chains = [rows for _, rows in data.regret.groupby("chain", sort=True)]
+        chains = chains[:MAX_CHAINS]
+        n_rows = 2 + max(len(rows) for rows in chains)
+        height = len(chains) * (_ROW_IN * n_rows + 0.55) + 0.3
         figure = Drawing(figsize=(TWO_COLUMNS_IN, height), layout="constrained")
-        axes = figure.subplots(
-            len(chains), len(_MEASURES), squeeze=False, sharey="row", sharex="col"
-        )
+        shared: dict[str, Any] = {"sharey": "row", "sharex": "col"}
+        axes = figure.subplots(len(chains), len(_MEASURES), squeeze=False, **shared)
         differing = [name for name in BLOCK if data.regret[name].nunique() > 1]
         for line, rows in zip(axes, chains, strict=True):
             for panel, measure in zip(line, _MEASURES, strict=True):
@@ -80,99 +87,75 @@ class Regret(Figure):
             line[0].set_yticks(range(len(names)), names)
             line[0].set_ylim(len(rows) + 1.6, -0.6)
             first = rows.iloc[0]
-            title = joined(
-                [risk_name(first["risk"]), *(first[name] for name in differing)]
-            )
-            line[0].set_title(f"{title}, {first['n_maps']} maps", loc="left")
+            labels = [risk_name(first["risk"]), *first[differing]]
+            title = f"{joined(labels)}, {first['n_maps']} maps"
+            line[0].set_title(title, loc="left")
         for panel, (label, *_) in zip(axes[-1], _MEASURES.values(), strict=True):
             panel.set_xlabel(label)
             panel.set_xlim(left=0)
         handles: list[Artist] = [
-            Patch(color=ORANGE, label="the next is better"),
-            Patch(color=BLUE, label="the next is worse"),
-            Patch(color=_ENDS, label="of the first, of the near-optimal reference"),
+            Patch(color=_ENDS, label="first planner, reference"),
+            Patch(color=ORANGE, label="the step improves"),
+            Patch(color=BLUE, label="the step worsens"),
         ]
         if data.regret["time_bound"].notna().any():
-            handles.append(
-                Line2D(
-                    [],
-                    [],
-                    color=_BOUND,
-                    ls="--",
-                    lw=1.1,
-                    label="lower bound: no planner is better",
-                )
-            )
+            words = "bound: no planner is better"
+            handles.append(Line2D([], [], label=words, **_BOUND))
         legend_outside(figure, handles, len(handles))
         return figure
 
 
 def _row_names(rows: pd.DataFrame) -> list[str]:
     """Name the first condition of a chain, the change of each step, and the last."""
-    ends = [("one", rows.iloc[0]), *(("other", row) for _, row in rows.iterrows())]
-    named = [
-        (planner_name(row[f"{end}_planner"]), row[f"{end}_model"]) for end, row in ends
-    ]
-    steps = [
-        "\n".join(
-            f"{first} → {then}"
-            for first, then in zip(*pair, strict=True)
-            if first != then
-        )
-        for pair in pairwise(named)
-    ]
-    return [", ".join(named[0]), *steps, ", ".join(named[-1])]
+    planners = [rows["one_planner"].iloc[0], *rows["other_planner"]]
+    models = [rows["one_model"].iloc[0], *rows["other_model"]]
+    conditions = list(zip(map(planner_name, planners), models, strict=True))
+    first, *_, last = conditions
+    return [", ".join(first), *starmap(_change, pairwise(conditions)), ", ".join(last)]
+
+
+def _change(before: Sequence[str], after: Sequence[str]) -> str:
+    """Return the changed labels of a step, a line each."""
+    pairs = zip(before, after, strict=True)
+    return "\n".join(f"{old} → {new}" for old, new in pairs if old != new)
 
 
 def _draw_chain(panel: Axes, rows: pd.DataFrame, measure: str) -> None:
     """Draw bars of the first and last mean, and the differences between them."""
     _, factor, more_is_worse = _MEASURES[measure]
-    means = factor * np.array(
-        [*rows[f"{measure}_one"], rows[f"{measure}_other"].iloc[-1]]
-    )
-    looks: dict[str, Any] = {"height": 0.7, "lw": 0}
-    axes_and_data = panel.get_yaxis_transform()
+    last_mean = rows[f"{measure}_other"].iloc[-1]
+    means = factor * np.array([*rows[f"{measure}_one"], last_mean])
     for height, value in ((0, means[0]), (len(rows) + 1, means[-1])):
-        panel.barh(height, value, color=_ENDS, **looks)
-        panel.text(
-            1.02,
-            height,
-            f"{value:.1f}",
-            transform=axes_and_data,
-            va="center",
-            size=TEXT,
-        )
+        panel.barh(height, value, color=_ENDS, **_BAR)
+        _write(panel, height, f"{value:.1f}")
     for height, row in enumerate(rows.to_dict("records"), start=1):
-        difference, low, high = (
-            factor * row[f"{measure}_{end}"] for end in ("difference", "low", "high")
-        )
+        difference = factor * row[f"{measure}_difference"]
+        low = factor * row[f"{measure}_low"]
+        high = factor * row[f"{measure}_high"]
         start = means[height - 1]
-        end = means[height]
-        better = difference > 0 if more_is_worse else difference < 0
-        panel.barh(
-            height, end - start, left=start, color=ORANGE if better else BLUE, **looks
-        )
-        from_x, to_x = np.clip(
-            [start - high, start - low], 0, None if more_is_worse else factor
-        )
+        width = means[height] - start
+        improves = difference > 0 if more_is_worse else difference < 0
+        colour = ORANGE if improves else BLUE
+        panel.barh(height, width, left=start, color=colour, **_BAR)
+        maximum = None if more_is_worse else factor
+        from_x, to_x = np.clip([start - high, start - low], 0, maximum)
         draw_interval(panel, from_x, to_x, height, "black", 0.9)
         words = signed(-difference)
-        if low == low:  # few maps have no interval
+        if not np.isnan(low):  # few maps have no interval
             words += f" ({signed_interval(-high, -low)})"
-        panel.text(
-            1.02,
-            height,
-            words.replace("-", "−"),
-            transform=axes_and_data,
-            va="center",
-            size=TEXT,
-        )
+        _write(panel, height, words.replace("-", "−"))
     for height, value in enumerate(means):
         panel.plot([value, value], [height - 0.35, height + 1.35], color="0.5", lw=0.5)
     bound = factor * rows[f"{measure}_bound"].iloc[0]
-    if bound == bound:
-        panel.axvline(bound, color=_BOUND, ls="--", lw=1.1)
+    if not np.isnan(bound):
+        panel.axvline(bound, **_BOUND)
     panel.grid(axis="x", color=GRID)
     panel.set_axisbelow(True)
     panel.use_sticky_edges = False
     panel.tick_params(axis="y", length=0)
+
+
+def _write(panel: Axes, height: float, words: str) -> None:
+    """Write a value to the right of a panel."""
+    side = panel.get_yaxis_transform()
+    panel.text(1.02, height, words, transform=side, va="center", size=TEXT)

@@ -14,10 +14,12 @@ from matplotlib.figure import Figure
 from benchnav.eval.experiment.condition import KNOWLEDGE
 from benchnav.eval.words import blocks, with_names
 from benchnav.viz.panels import GRID, panel_grid
+from benchnav.viz.style import TWO_COLUMNS_IN
 
-_ROW_IN = 0.145
-_GAP_ROWS = 0.6
+_ROW_IN = 0.145  # height of a row
+_GAP_ROWS = 0.6  # between planners
 _PANELS_A_LINE = 4
+_MAX_LETTERS = 30  # of a name at the side of a single panel
 _SETTING = ["planner", "model", *KNOWLEDGE, "risk"]
 
 
@@ -37,37 +39,42 @@ def lay_out(
     """
     settings = with_names(summary[_SETTING].drop_duplicates())
     # A gap separates planners.
-    planner = settings["planner"].factorize()[0]
-    settings = settings.assign(gap=_GAP_ROWS * planner).sort_values(
-        "gap", kind="stable"
-    )
+    planner, _ = settings["planner"].factorize()
+    settings = settings.assign(gap=_GAP_ROWS * planner)
+    settings = settings.sort_values("gap", kind="stable")
     settings["height"] = np.arange(len(settings)) + settings.pop("gap")
     lowest = settings["height"].max()
     columns = len(measures)
     blocks_of_run = blocks(summary.merge(settings, on=_SETTING, how="left"))
     block_panels = [block for block in blocks_of_run for _ in measures]
-    across = columns if columns > 1 else min(len(block_panels), _PANELS_A_LINE)
+    across = min(len(block_panels), _PANELS_A_LINE)
+    shared = "all"
+    if columns > 1:
+        across = columns
+        shared = "col"
     tall = _ROW_IN * (lowest + 1.4) + 0.5
     titles = [title for title, _ in block_panels]
-    shared = "all" if columns == 1 else "col"
+    ends_in = 0.2 + legend_in
+    # Long names would leave little of a column's width for a single panel.
+    is_wide = settings["name"].str.len().max() > _MAX_LETTERS
+    width_in = TWO_COLUMNS_IN if is_wide else 0.0
     figure, grid = panel_grid(
-        titles, across, tall, 0.2 + legend_in, sharex=shared, sharey=True
+        titles, across, tall, ends_in, width_in, sharex=shared, sharey=True
     )
     panels = []
-    for index, ((panel,), (_, rows)) in enumerate(zip(grid, block_panels, strict=True)):
+    for index, (_, rows) in enumerate(block_panels):
+        (panel,) = grid[index]
         panels.append((panel, rows))
         panel.set_axisbelow(True)
         panel.tick_params(axis="y", length=0)
         panel.grid(axis="x", color=GRID)
         if index >= len(block_panels) - across:
             panel.set_xlabel(measures[index % columns])
-        for height in sorted(set(settings["height"]) - set(rows["height"])):
-            looks: dict[str, Any] = {
-                "transform": panel.get_yaxis_transform(),
-                "ha": "center",
-                "va": "center",
-            }
-            panel.text(0.5, height, "not run", color="0.5", size=6, **looks)
+        missing = set(settings["height"]) - set(rows["height"])
+        style: dict[str, Any] = {"color": "0.5", "ha": "center", "va": "center"}
+        for height in sorted(missing):
+            side = panel.get_yaxis_transform()
+            panel.text(0.5, height, "not run", size=6, transform=side, **style)
     first, _ = panels[0]
     first.set_yticks(settings["height"].tolist(), settings["name"].tolist())
     first.set_ylim(lowest + 0.7, -0.7)

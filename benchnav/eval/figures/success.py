@@ -1,9 +1,12 @@
 """Success rates with their intervals."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Drawing
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -20,7 +23,7 @@ _POINT: dict[str, Any] = {"marker": "o", "ms": 4, "ls": "none", "color": "0.2"}
 
 
 class Success(Figure):
-    """Success rate of each condition with its 95 % interval, a panel a block."""
+    """Success rate of each condition with its 95 % interval, one panel per block."""
 
     name = "success"
     text = (
@@ -31,54 +34,53 @@ class Success(Figure):
     )
 
     def draw(self, data: RunData) -> Drawing:
-        """Draw a point a condition, and a blind planner as a line through its panel."""
-        # The clairvoyant has a model and no risk setting, so risk cannot decide.
-        is_blind = data.summary["model"] == NOT_USED
-        is_marked = (
-            data.summary.get("best_marked", pd.Series(False, data.summary.index))
-            .fillna(False)
-            .astype(bool)
-        )
-        handles: list[Any] = []
-        if is_marked.any():
-            handles.append(
-                Line2D([], [], **_POINT, label="not significantly worse than the best")
-            )
-            if not is_marked.all():
-                handles.append(
-                    Line2D(
-                        [],
-                        [],
-                        **_POINT,
-                        mfc="white",
-                        label="significantly worse, or a baseline",
-                    )
-                )
-        if is_blind.any():
-            handles.append(
-                Line2D([], [], color=BLIND, lw=0.8, ls="--", label="blind planner")
-            )
-            handles.append(
-                Patch(color=BLIND, alpha=_BAND, lw=0, label="its 95 % interval")
-            )
-        figure, panels = lay_out(
-            data.summary, ["success [%]"], legend_in=0.15 * len(handles)
-        )
+        """Draw one point per condition, and blind planners as lines through panels."""
+        handles = _handles(data.summary)
+        legend_in = 0.15 * len(handles)
+        figure, panels = lay_out(data.summary, ["success [%]"], legend_in)
         colours = planner_colours(list(data.summary["planner"]))
         for panel, rows in panels:
             for row in rows.to_dict("records"):
-                blind = row["model"] == NOT_USED
-                colour = BLIND if blind else colours[row["planner"]]
-                face = colour if row.get("best_marked") else "white"
-                rate = 100 * row["success_rate"]
-                low = 100 * row["success_low"]
-                high = 100 * row["success_high"]
-                draw_interval(panel, low, high, row["height"], colour)
-                panel.plot(rate, row["height"], "o", color=colour, ms=4, mfc=face)
-                if blind:
-                    panel.axvline(rate, color=colour, lw=0.8, ls="--", zorder=0)
-                    panel.axvspan(low, high, color=colour, alpha=_BAND, lw=0, zorder=0)
+                _draw_rate(panel, row, colours[row["planner"]])
         panel.set(xticks=np.arange(0, 101, 25), xlim=(-4, 104))
         if handles:
             legend_outside(figure, handles, 2)
         return figure
+
+
+def _handles(summary: pd.DataFrame) -> list[Artist]:
+    """Return the entries of the legend for the kinds of points and lines drawn."""
+    # The clairvoyant has a model and no risk setting, so risk cannot decide.
+    is_blind = summary["model"] == NOT_USED
+    unmarked = pd.Series(False, summary.index)
+    marks = summary.get("best_marked", unmarked)
+    is_marked = marks.fillna(False).astype(bool)
+    handles: list[Artist] = []
+    if is_marked.any():
+        words = "not significantly worse than the best"
+        handles.append(Line2D([], [], **_POINT, label=words))
+        if not is_marked.all():
+            words = "significantly worse, or a baseline"
+            handles.append(Line2D([], [], **_POINT, mfc="white", label=words))
+    if is_blind.any():
+        line: dict[str, Any] = {"lw": 0.8, "ls": "--"}
+        handles.append(Line2D([], [], color=BLIND, label="blind planner", **line))
+        words = "its 95 % interval"
+        handles.append(Patch(color=BLIND, alpha=_BAND, lw=0, label=words))
+    return handles
+
+
+def _draw_rate(panel: Axes, row: Mapping[Any, Any], planner_colour: str) -> None:
+    """Draw a success rate with its interval; a blind planner's through the panel."""
+    blind = row["model"] == NOT_USED
+    colour = BLIND if blind else planner_colour
+    face = colour if row.get("best_marked") else "white"
+    height = row["height"]
+    rate = 100 * row["success_rate"]
+    low = 100 * row["success_low"]
+    high = 100 * row["success_high"]
+    draw_interval(panel, low, high, height, colour)
+    panel.plot(rate, height, "o", color=colour, ms=4, mfc=face)
+    if blind:
+        panel.axvline(rate, color=colour, lw=0.8, ls="--", zorder=0)
+        panel.axvspan(low, high, color=colour, alpha=_BAND, lw=0, zorder=0)

@@ -15,7 +15,7 @@ from benchnav.eval.figures import moment
 from benchnav.eval.figures.data import RunData, choose_recordings
 from benchnav.eval.recording import Recording
 from benchnav.eval.words import chosen_in_words, episode_names
-from benchnav.viz import maps, plans
+from benchnav.viz import drives, maps, plans
 from benchnav.viz.figure import Figure
 from benchnav.viz.style import (
     ONE_COLUMN_IN,
@@ -25,7 +25,8 @@ from benchnav.viz.style import (
 )
 
 _PANELS_A_LINE = 4
-_LETTER_IN = 0.048
+_UNIT = "\N{NO-BREAK SPACE}s"  # stays next to its number in wrapped titles
+_LETTER_IN = 0.048  # mean width of a letter of a title
 
 
 class Trajectories(Figure):
@@ -46,10 +47,11 @@ class Trajectories(Figure):
     def caption(self, data: RunData) -> str:
         """Return which map is shown, and how conditions were chosen."""
         shown = self._shown(data)
-        pairs = {
-            (recording.about["scenario"], recording.about["map"]) for recording in shown
-        }
-        where = " on {}, map {}".format(*pairs.pop()) if len(pairs) == 1 else ""
+        labels = [recording.about for recording in shown]
+        map_names = {f"{label['scenario']}, map {label['map']}" for label in labels}
+        where = ""
+        if len(map_names) == 1:
+            where = f" on {map_names.pop()}"
         subject = "Driven paths"
         if any(recording.own_plans for recording in shown):
             subject = "Plans and driven paths"
@@ -78,35 +80,29 @@ def draw_trajectories(recordings: Sequence[Recording]) -> Drawing:
     layers = 2 if all(recording.field is None for recording in recordings) else 3
     width = ONE_COLUMN_IN if across == 1 else TWO_COLUMNS_IN
     panel_in = (width - 0.9) / across - 0.1
-    tallest = max(
-        recording.grid.height / recording.grid.width for recording in recordings
-    )
-    tall = panel_in * min(max(tallest, 0.3), 2.0) + 0.35
-    figure = Drawing(
-        figsize=(width, (layers * tall + 0.2) * lines + 0.8), layout="compressed"
-    )
+    grids = [recording.grid for recording in recordings]
+    max_ratio = max(grid.height / grid.width for grid in grids)
+    tall = panel_in * min(max(max_ratio, 0.3), 2.0) + 0.35
+    size = (width, (layers * tall + 0.2) * lines + 0.8)
+    figure = Drawing(figsize=size, layout="compressed")
     stacks = stack_panels(figure, len(recordings), across, layers)
-    for index, (recording, heading, stack) in enumerate(
-        zip(recordings, _headings(recordings), stacks, strict=True)
-    ):
-        _draw_terrain(stack[0], recording, heading)
+    headings = _headings(recordings)
+    letters = int(panel_in / _LETTER_IN)
+    for index, (recording, stack) in enumerate(zip(recordings, stacks, strict=True)):
+        _draw_terrain(stack[0], recording, headings[index])
         _draw_predicted(stack[1], recording)
         if recording.field is not None:
             _draw_field(stack[2], recording)
         elif len(stack) > 2:
             stack.pop().remove()
+        is_leftmost = index % across == 0
         for panel in stack:
             maps.frame_map(panel)
-            panel.tick_params(
-                labelleft=index % across == 0, labelbottom=panel is stack[-1]
-            )
-            panel.set_ylabel("y [m]" if index % across == 0 else "")
-            # Titles are wrapped to the width of the panel.
-            title = (
-                textwrap.fill(line, int(panel_in / _LETTER_IN))
-                for line in panel.get_title().splitlines()
-            )
-            panel.set_title("\n".join(title), fontsize="small")
+            panel.tick_params(labelleft=is_leftmost, labelbottom=panel is stack[-1])
+            panel.set_ylabel("y [m]" if is_leftmost else "")
+            title_lines = panel.get_title().splitlines()
+            wrapped = [textwrap.fill(line, letters) for line in title_lines]
+            panel.set_title("\n".join(wrapped), fontsize="small")
         stack[-1].set_xlabel("x [m]")
     legend_outside(figure)
     shrink = min(1.0, 4 / figure.get_figheight())
@@ -117,17 +113,17 @@ def draw_trajectories(recordings: Sequence[Recording]) -> Drawing:
 def _headings(recordings: Sequence[Recording]) -> list[str]:
     """Return titles: labels that differ, time shown, and outcome."""
     names = episode_names([recording.about for recording in recordings])
-    map_names = [
-        f", {recording.about['scenario']}, map {recording.about['map']}"
-        for recording in recordings
-    ]
+    labels = [recording.about for recording in recordings]
+    map_names = [f", {label['scenario']}, map {label['map']}" for label in labels]
+    if len(set(map_names)) == 1:
+        map_names = [""] * len(recordings)
     headings = []
     for recording, name, map_name in zip(recordings, names, map_names, strict=True):
-        shown = f"{recording.outcome} after {recording.end_s:g} s"
+        shown = f"{recording.outcome} after {recording.end_s:g}{_UNIT}"
         if not moment.has_ended(recording, recording.now):
-            shown = f"t = {recording.now * recording.dt_s:g} s; {shown}"
-        where = map_name if len(set(map_names)) > 1 else ""
-        headings.append(f"{name}{where}\n{shown}")
+            time_s = recording.now * recording.dt_s
+            shown = f"t = {time_s:g}{_UNIT}; {shown}"
+        headings.append(f"{name}{map_name}\n{shown}")
     return headings
 
 
@@ -135,15 +131,14 @@ def _draw_terrain(panel: Axes, recording: Recording, title: str) -> None:
     """Draw the terrain, and the driven path so far in colours of the observed λ."""
     maps.show_map(panel, np.moveaxis(recording.rgb, 0, -1), recording.grid.extent_m)
     if recording.field is not None and recording.soft.any():
-        for lines in (outline, maps.hatching):
-            maps.draw_lines(
-                panel, lines(recording.soft, recording.resolution_m), maps.SOFT, 0.4
-            )
+        for lines_of in (outline, maps.hatching):
+            lines = lines_of(recording.soft, recording.resolution_m)
+            maps.draw_lines(panel, lines, maps.SOFT, 0.4)
         look = {"fc": "0.45", "ec": maps.SOFT, "hatch": "////"}
         maps.name_terrain(panel, "soft terrain, which no image shows", **look)
     moment.draw_plan(panel, recording, recording.now)
     drive = moment.drive_at(recording, recording.now)
-    maps.draw_drive(panel, drive, 2)
+    drives.draw_drive(panel, drive, 2)
     panel.add_collection(plans.driven_colours(drive.track, recording.traversability, 2))
     panel.set_title(title)
 
@@ -153,12 +148,12 @@ def _draw_predicted(panel: Axes, recording: Recording) -> None:
     moment.show_known(panel, recording, recording.now)
     moment.draw_plan(panel, recording, recording.now)
     words = "driven; above in the colour of the observed λ"
-    maps.draw_drive(panel, moment.drive_at(recording, recording.now), label=words)
+    drives.draw_drive(panel, moment.drive_at(recording, recording.now), label=words)
     panel.set_title(moment.known_in_words(recording))
 
 
 def _draw_field(panel: Axes, recording: Recording) -> None:
     """Draw the λ field and the driven path."""
     moment.show_truth(panel, recording)
-    maps.draw_drive(panel, moment.drive_at(recording, len(recording.traversability)))
+    drives.draw_drive(panel, moment.drive_at(recording, len(recording.traversability)))
     panel.set_title("whole path, over the λ field")

@@ -1,1 +1,1 @@
-"""What people look at: tables, figures and playback."""
+"""Reports of runs: findings, tables, pages, and playback of episodes."""

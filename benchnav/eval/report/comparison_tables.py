@@ -1,4 +1,4 @@
-"""The tables of a comparison: a row a pair of conditions."""
+"""The tables of a comparison: one row per pair of conditions."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -32,16 +32,10 @@ def comparison_table(table: pd.DataFrame, difference: float, by: str) -> Table:
         difference: difference of success that `maps_needed` is for.
         by: column in which the conditions of a pair differ.
     """
-    in_fractions = "time_difference_share" in table
-    scale = 100 if in_fractions else 1
-    suffix = "share" if in_fractions else "s"
-    unit = "% of T" if in_fractions else "s"
-    fraction_note = ""
-    if in_fractions:
+    scale, suffix, unit, fraction_note = 1, "s", "s", ""
+    if "time_difference_share" in table:
+        scale, suffix, unit = 100, "share", "% of T"
         fraction_note = "; in fractions of each condition's own T, since T differs"
-    points = "Δ [points], 95 %"
-    times = f"Δ T_total [{unit}], 95 %"
-    arrivals = "Δ T if both arrive [s], 95 %, on maps"
 
     def success_rates(row: Row) -> str:
         rates = [short(100 * row[f"success_{side}"]) for side in ("one", "other")]
@@ -51,13 +45,9 @@ def comparison_table(table: pd.DataFrame, difference: float, by: str) -> Table:
         return f"{100 * value:.0f}" if value <= 1 else NOT_USED
 
     columns = [
-        Column(
-            "Succ. [%]",
-            success_rates,
-            "success rates of the two conditions.",
-        ),
+        Column("Succ. [%]", success_rates, "success rates of the two conditions."),
         *_difference_columns(
-            points,
+            "Δ [points], 95 %",
             "success",
             "",
             100,
@@ -73,26 +63,25 @@ def comparison_table(table: pd.DataFrame, difference: float, by: str) -> Table:
         Column(
             "detectable",
             cell_of("success_detectable", detectable),
-            "minimum detectable difference of success [points] with 80 % power, the "
-            "power of the number of maps needed too; a dash if there are too few maps.",
+            "minimum detectable difference of success [points] at a power of 80 %, "
+            "as for the number of maps needed; a dash if there are too few maps.",
         ),
         *_difference_columns(
-            times,
+            f"Δ T_total [{unit}], 95 %",
             "time",
             f"_{suffix}",
             scale,
-            "difference of the mean time, a failure counted as the time budget "
-            f"T{fraction_note}; a dash for an interval of fewer than {LEAST_MAPS} "
-            "maps.",
+            "difference of the mean time, where a failure counts as the time budget "
+            f"T{fraction_note}; below {LEAST_MAPS} maps, a dash instead of an interval.",
         ),
         Column(
             "p (ranks)",
             cell_of("time_p_holm", p_value),
-            "Wilcoxon's signed-rank test of T_total, Holm's correction. It compares "
-            "ranks, while the interval is of the mean, so that the two can disagree.",
+            "Wilcoxon's signed-rank test of T_total, Holm's correction. The test is of "
+            "ranks and the interval of the mean, so the two can disagree.",
         ),
         *_difference_columns(
-            arrivals,
+            "Δ T if both arrive [s], 95 %, on maps",
             "arrival_time",
             "_s",
             1,
@@ -101,9 +90,8 @@ def comparison_table(table: pd.DataFrame, difference: float, by: str) -> Table:
         ),
         Column("on maps", cell_of("arrival_time_n_maps", str)),
     ]
-    return _pair_table(
-        table, by, ("n_maps",), columns, _comparison_notes(table, difference)
-    )
+    notes = _comparison_notes(table, difference)
+    return _pair_table(table, by, ("n_maps",), columns, notes)
 
 
 def metric_table(table: pd.DataFrame, quantity: Quantity, by: str) -> Table:
@@ -171,21 +159,22 @@ def _pair_table(
     notes: tuple[str, ...],
 ) -> Table:
     """Format columns, preceded by labels that differ, the pair, and counts."""
-    labels = [
-        name for name in (*LABELS, "run") if name in table and differ(table[name])
-    ]
-    named = [
-        *(Column(name, cell_of(name, partial(reading_name, name))) for name in labels),
-        Column(by, cell_of("one", partial(reading_name, by))),
-        Column("against", cell_of("other", partial(reading_name, by))),
-    ]
-    shown = [
-        Column(name.removeprefix("n_"), cell_of(name))
-        for name in counts
-        if table[name].nunique() > 1
-    ]
+    names = [name for name in (*LABELS, "run") if name in table]
+    labels = []
+    for name in names:
+        if differ(table[name]):
+            label = partial(reading_name, name)
+            labels.append(Column(name, cell_of(name, label)))
+    label = partial(reading_name, by)
+    labels.append(Column(by, cell_of("one", label)))
+    labels.append(Column("against", cell_of("other", label)))
+    shown_counts = []
+    for name in counts:
+        if table[name].nunique() > 1:
+            shown_counts.append(Column(name.removeprefix("n_"), cell_of(name)))
     rows = table.to_dict("records")
-    return table_of(rows, [*named, *shown, *columns], labels=len(named), notes=notes)
+    all_columns = [*labels, *shown_counts, *columns]
+    return table_of(rows, all_columns, labels=len(labels), notes=notes)
 
 
 def _significance(p: str) -> Column:
@@ -200,7 +189,8 @@ def _significance(p: str) -> Column:
 def _pairs_and_unit(table: pd.DataFrame) -> tuple[str, str]:
     """Return the number of pairs in words, and the statistical unit."""
     pairs = "1 pair" if len(table) == 1 else f"{len(table)} pairs"
-    return pairs, "group" if (table["n_groups"] < table["n_maps"]).any() else "map"
+    has_groups = (table["n_groups"] < table["n_maps"]).any()
+    return pairs, "group" if has_groups else "map"
 
 
 def _difference_columns(
@@ -210,13 +200,12 @@ def _difference_columns(
 
     def ends(row: Row) -> str:
         low = scale * row[f"{name}_low{unit}"]
-        return signed_interval(low, scale * row[f"{name}_high{unit}"])
+        high = scale * row[f"{name}_high{unit}"]
+        return signed_interval(low, high)
 
+    heading, _, _ = title.partition(",")
     shown = cell_of(f"{name}_difference{unit}", lambda value: signed(scale * value))
-    return [
-        Column(title.partition(",")[0], shown, meaning, title),
-        Column("95 %", ends),
-    ]
+    return [Column(heading, shown, meaning, title), Column("95 %", ends)]
 
 
 def _comparison_notes(table: pd.DataFrame, difference: float) -> tuple[str, ...]:
@@ -227,7 +216,7 @@ def _comparison_notes(table: pd.DataFrame, difference: float) -> tuple[str, ...]
     if np.isinf(table["success_detectable"]).any():
         needed = (
             f"These {unit}s are too few for any difference to be significant, "
-            "and to estimate how many it needs."
+            "and to estimate how many maps a test needs."
         )
     return (
         f"Tests by {unit}: signs of the difference (success) and ranks (T_total), p "

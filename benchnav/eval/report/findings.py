@@ -34,18 +34,17 @@ def findings(
     Returns:
         Sentences by the title of a block.
     """
-    all_blocks = blocks(with_names(summary))
-    other_blocks = [_pairing_by_label(block, summary) for _, block in all_blocks]
-    return {
-        title: list(_sentences(block, failures, predicted, unlike))
-        for (title, block), unlike in zip(all_blocks, other_blocks, strict=True)
-    }
+    by_title = {}
+    for title, block in blocks(with_names(summary)):
+        pairing = _pairing_by_label(block, summary)
+        by_title[title] = list(_sentences(block, failures, predicted, pairing))
+    return by_title
 
 
 def _pairing_by_label(rows: pd.DataFrame, summary: pd.DataFrame) -> dict[str, bool]:
-    """Return labels that put settings on the same maps into other blocks.
+    """Return the labels by which blocks on the same maps differ from this one.
 
-    The value is whether `compare` pairs the settings by that label.
+    The value is whether `compare` pairs settings by that label.
     """
     first = rows.iloc[0]
     setting_columns = [name for name in LABELS if name not in BLOCK]
@@ -61,12 +60,10 @@ def _pairing_by_label(rows: pd.DataFrame, summary: pd.DataFrame) -> dict[str, bo
             & (same_maps[name] != first[name])
         ]
         if not others.empty:
-            # Worlds may draw unlike λ, and are then not paired.
-            paired = name != "world" and bool(
-                settings
-                & set(others[setting_columns].itertuples(index=False, name=None))
-            )
-            is_paired_by[name] = paired
+            rows_of_others = others[setting_columns].itertuples(index=False, name=None)
+            has_common_setting = not settings.isdisjoint(rows_of_others)
+            # Worlds may draw different λ and are never paired.
+            is_paired_by[name] = name != "world" and has_common_setting
     return is_paired_by
 
 
@@ -74,7 +71,7 @@ def _sentences(
     rows: pd.DataFrame,
     failures: pd.DataFrame,
     predicted: Mapping[str, np.ndarray],
-    apart: Mapping[str, bool],
+    pairing: Mapping[str, bool],
 ) -> Iterable[str]:
     rivals = rows[competing(rows)]
     best = rivals[rivals["condition"] == rivals["best"].iloc[0]].to_dict("records")[0]
@@ -82,18 +79,19 @@ def _sentences(
         "best_difference", kind="stable"
     )
     shared = int((rivals_of_best["success_rate"] == best["success_rate"]).sum())
-    named = (
-        f"{best['name']} and {shared} more have" if shared else f"{best['name']} has"
-    )
+    subject = f"{best['name']} has"
+    if shared:
+        subject = f"{best['name']} and {shared} more have"
+    low = 100 * best["success_low"]
+    high = 100 * best["success_high"]
     yield (
-        f"{named} the highest success rate: {rate_in_words(best)} % of the episodes "
-        "reached the goal (95 % interval "
-        f"{100 * best['success_low']:.0f} to {100 * best['success_high']:.0f} %)."
+        f"{subject} the highest success rate: {rate_in_words(best)} % of the episodes "
+        f"reached the goal (95 % interval {low:.0f} to {high:.0f} %)."
     )
     common = int(best["best_episodes"])
     if not rivals_of_best.empty and (rivals["n_episodes"] > common).any():
         yield f"The comparison uses the {common} episodes that all settings have."
-    yield from _rank(best, rivals_of_best, apart)
+    yield from _rank(best, rivals_of_best, pairing)
     yield from _why(best, failures, predicted)
     count = int(rivals["n_episodes"].sum())
     failed = rivals[list(FAILURE_COUNTS)].to_numpy().sum()
@@ -115,13 +113,17 @@ def _sentences(
 
 
 def _rank(
-    best: Mapping[Any, Any], others: pd.DataFrame, apart: Mapping[str, bool]
+    best: Mapping[Any, Any], others: pd.DataFrame, pairing: Mapping[str, bool]
 ) -> Iterable[str]:
     if others.empty:
-        with_this = f" with this {' and '.join(apart)}" if apart else ""
+        with_this = f" with this {' and '.join(pairing)}" if pairing else ""
         yield f"There is no other setting{with_this} to compare it with."
-        for name in (name for name, paired in apart.items() if paired):
-            yield f"benchnav-eval compare --by {name} compares the {name}s of the run."
+        for name, is_paired in pairing.items():
+            if is_paired:
+                yield (
+                    f"benchnav-eval compare --by {name} compares the {name}s of the "
+                    "run."
+                )
         return
     alike = others[others["best_alike"]]
     worse = others[~others["best_alike"]]
@@ -129,28 +131,33 @@ def _rank(
     test = f"max-T bootstrap test by {unit} over {len(others) + 1} settings"
     if best["best_maps"] < FEWEST_MAPS:
         yield (
-            f"No setting is marked: with fewer than {FEWEST_MAPS} {unit}s none can "
-            "be called worse."
+            f"No setting is marked: with fewer than {FEWEST_MAPS} {unit}s, no setting "
+            "can be called worse."
         )
         return
     if worse.empty:
         shown = others["best_shown"].max()
         p = others["best_p"].min()
         maps = f"{int(best['best_maps'])} {unit}s"
-        power = (
-            f"; {maps} detect differences of {100 * shown:.0f} points or more "
-            "with 80 % power"
-        )
+        power = ""
+        if shown <= 1:
+            power = (
+                f"; {maps} detect differences of {100 * shown:.0f} points or more "
+                "with 80 % power"
+            )
+        relation = "=" if p >= 1 else "≥"
+        rounded_p = max(np.floor(100 * p) / 100, ALPHA)
         yield (
             f"There is no significant difference between the settings ({test}, p "
-            f"{'=' if p >= 1 else '≥'} "
-            f"{max(np.floor(100 * p) / 100, ALPHA):g}{power if shown <= 1 else ''})."
+            f"{relation} {rounded_p:g}{power})."
         )
         return
     if alike.empty:
-        subject = "The other setting is"
-        if len(worse) != 1:
-            subject = f"All {len(worse)} other settings are"
+        subject = f"All {len(worse)} other settings are"
+        if len(worse) == 1:
+            subject = "The other setting is"
+        elif len(worse) == 2:
+            subject = "Both other settings are"
         yield f"{subject} significantly worse."
     else:
         listed = list(alike["name"])
@@ -167,14 +174,14 @@ def _rank(
     following = worse.iloc[0]
     low = 100 * following["best_low"]
     high = 100 * following["best_high"]
+    difference = 100 * following["best_difference"]
     verb = "is the best of those that are significantly worse"
     if len(worse) == 1:
         verb = "is significantly worse"
     yield (
         f"{following['name']} {verb}: {rate_in_words(following)} %, "
-        f"{100 * following['best_difference']:.1f} points "
-        f"less (95 % interval of this pair only {low:.1f} to {high:.1f}), "
-        f"{p_in_words(following['best_p'])} ({test})."
+        f"{difference:.1f} points less (95 % interval {low:.1f} to {high:.1f}, of this "
+        f"pair only), {p_in_words(following['best_p'])} ({test})."
     )
 
 
@@ -197,9 +204,8 @@ def _why(
     predicted_median = pd.Series(predicted.get(best["condition"]), dtype=float).median()
     if not np.isnan(observed) and not np.isnan(predicted_median):
         yield (
-            f"Where they ended, the predicted λ̂ was {predicted_median:.2f}; the robot observed "
-            f"λ = {observed:.2f} in the last 2 s "
-            "(medians)."
+            f"Where they ended, the predicted λ̂ was {predicted_median:.2f}; the robot "
+            f"observed λ = {observed:.2f} in the last 2 s (medians)."
         )
     elif not np.isnan(observed):
         yield f"The robot observed λ = {observed:.2f} in their last 2 s (median)."

@@ -1,7 +1,7 @@
 """Settings and provenance of a run in words, for its report."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,7 @@ def header_lines(
     manifest: Mapping[str, Any],
     worlds: Mapping[str, Mapping[str, Any]],
 ) -> tuple[str, ...]:
-    """Describe worlds, data, seeds, rejected draws and bounds of a run, a line each.
+    """Describe worlds, data, seeds, rejected draws and bounds of a run, one per line.
 
     Args:
         summary: from `summary.summarise`.
@@ -47,26 +47,35 @@ def _header(summary: pd.DataFrame, manifest: Mapping[str, Any]) -> list[str]:
         for condition in conditions
     }
     lines = [f"World {label}: {text}." for label, text in worlds.items()]
-    seeds = dict.fromkeys(
-        seed for condition in conditions for seed in condition["seeds"]
-    )
-    data = joined(summary["data"].unique()) or NOT_USED
-    models = joined(summary["model"].unique()) or NOT_USED
-    lines.append(f"Data: {data}. Models: {models}. Seeds: {joined(map(str, seeds))}.")
+    data = _distinct(summary["data"])
+    models = _distinct(summary["model"])
+    seeds = joined(map(str, _seeds(conditions)))
+    lines.append(f"Data: {data}. Models: {models}. Seeds: {seeds}.")
     if summary["revisions_mean"].notna().any():
-        knowledge = (
-            f"{kind} {joined(summary[kind].unique()) or NOT_USED}" for kind in KNOWLEDGE
-        )
+        knowledge = [f"{kind} {_distinct(summary[kind])}" for kind in KNOWLEDGE]
         lines.append(f"Sensing and belief: {'; '.join(knowledge)}.")
-    if len(summary[["n_episodes", "n_maps", "n_groups"]].drop_duplicates()) == 1:
-        maps = maps_in_words(summary["n_maps"][0], summary["n_groups"][0])
-        lines.append(f"Each condition: {summary['n_episodes'][0]} episodes on {maps}.")
-    options = dict.fromkeys(
-        f"{condition['labels']['planner']} {change}"
-        for condition in conditions
-        for change in condition["changed"]
-    )
-    return [*lines, f"Planner options: {', '.join(options)}."] if options else lines
+    counts = summary[["n_episodes", "n_maps", "n_groups"]].drop_duplicates()
+    if len(counts) == 1:
+        n_episodes, n_maps, n_groups = counts.iloc[0]
+        maps = maps_in_words(n_maps, n_groups)
+        lines.append(f"Each condition: {n_episodes} episodes on {maps}.")
+    options: dict[str, None] = {}
+    for condition in conditions:
+        planner = condition["labels"]["planner"]
+        options |= dict.fromkeys(f"{planner} {text}" for text in condition["changed"])
+    if options:
+        lines.append(f"Planner options: {', '.join(options)}.")
+    return lines
+
+
+def _distinct(labels: pd.Series) -> str:
+    return joined(labels.unique()) or NOT_USED
+
+
+def _seeds(conditions: Iterable[Mapping[str, Any]]) -> list[int]:
+    """Return the distinct seeds of conditions, in order."""
+    seeds = [seed for condition in conditions for seed in condition["seeds"]]
+    return list(dict.fromkeys(seeds))
 
 
 def _rejected_draws(episodes: pd.DataFrame, conditions: Mapping[str, Any]) -> list[str]:
@@ -79,7 +88,7 @@ def _rejected_draws(episodes: pd.DataFrame, conditions: Mapping[str, Any]) -> li
     episodes = episodes[episodes["condition"].isin(frozen)]
     if not episodes["rejected_draws"].any():
         return []
-    # All conditions have the same draws, except where a model failed: none.
+    # All conditions have the same draws, but those of a failed model have no draw.
     rejected = episodes.groupby(MAP)["rejected_draws"].max()
     fraction = rejected.sum() / (rejected + 1).sum()
     return [
@@ -96,19 +105,20 @@ def _bracket(
     """Return the bounds of the best possible T_total, from planners that are given λ."""
     lines = []
     for name, rows in episodes.groupby("condition", sort=False):
-        rows = rows.assign(time_budget_s=time_budgets(rows, worlds[str(name)]))
-        best = best_possible(rows)
+        budgets = time_budgets(rows, worlds[str(name)])
+        best = best_possible(rows.assign(time_budget_s=budgets))
         if np.isnan(best["time_bound"]):
             continue
-        reached = rows["success"].mean()
+        success = 100 * rows["success"].mean()
+        success_bound = 100 * best["success_bound"]
         time_s = rows["total_time_s"].mean()
         labels = conditions[str(name)]["labels"]
+        block = f"{labels['scenario']}, {labels['world']}"
+        planner = planner_name(labels["planner"])
         lines.append(
-            f"The best possible result ({labels['scenario']}, "
-            f"{labels['world']}) lies between a lower bound "
-            f"and that of {planner_name(labels['planner'])}: T_total "
-            f"{best['time_bound']:.1f} to {time_s:.1f} s, "
-            f"success {100 * reached:.1f} to {100 * best['success_bound']:.1f} %."
+            f"The best possible result ({block}) lies between that of {planner} and a "
+            f"bound: T_total {best['time_bound']:.1f} to {time_s:.1f} s, "
+            f"success {success:.1f} to {success_bound:.1f} %."
         )
     return lines
 
@@ -116,22 +126,22 @@ def _bracket(
 def _world(value: Mapping[str, Any]) -> str:
     world = value["world"]
     free = value["rules"]["free_space"]
-    words = [f"λ {world['noise']}"]
+    noise = f"λ {world['noise']}"
     if "correlation_m" in world:
-        words[0] += f", correlated over {world['correlation_m']:g} m"
-        words[0] += " (Matérn-3/2)" if world.get("kernel") == "matern32" else ""
+        noise += f", correlated over {world['correlation_m']:g} m"
+        if world.get("kernel") == "matern32":
+            noise += " (Matérn-3/2)"
+    words = [noise]
     if "immobile" in world:
-        immobile = world["immobile"]
-        words.append(
-            f"λ below {immobile['below']:g} for {immobile['for_s']:g} s immobilises the robot"
-        )
+        limit = world["immobile"]["below"]
+        dwell_s = world["immobile"]["for_s"]
+        words.append(f"λ below {limit:g} for {dwell_s:g} s immobilises the robot")
     if "time_budget_ratio" in world:
-        words.append(
-            f"time budget T = {world['time_budget_ratio']:g} × the reference time at "
-            "the top speed"
-        )
+        ratio = world["time_budget_ratio"]
+        budget = f"{ratio:g} × the reference time at the top speed"
     else:
-        words.append(f"time budget T = {world['time_budget_s']:g} s")
+        budget = f"{world['time_budget_s']:g} s"
+    words.append(f"time budget T = {budget}")
     by = "mean λ" if free["by"] == "mean" else "λ̂"
     return "; ".join([*words, f"free terrain has {by} above {free['above']:g}"])
 
@@ -156,19 +166,13 @@ def provenance_lines(manifest: Mapping[str, Any]) -> list[tuple[str, str]]:
         lines += [(name, str(value)) for name, value in environment.items()]
     lines.append(("machine", f"{machine['processor']}, {machine['cores']} cores"))
     for data, dataset in manifest["datasets"].items():
-        maps = ", ".join(
-            f"{split} {len(digests)}" for split, digests in dataset["maps"].items()
-        )
-        lines.append((f"dataset {data}", f"{dataset['id']}; maps: {maps}"))
+        counts = [f"{split} {len(maps)}" for split, maps in dataset["maps"].items()]
+        text = f"{dataset['id']}; maps: {', '.join(counts)}"
+        lines.append((f"dataset {data}", text))
     lines += dict.fromkeys(part for code in codes for part in code["parts"].items())
     metrics = [entry for code in codes for entry in code.get(METRICS, {}).items()]
-    lines += dict.fromkeys(
-        (f"metric {column}", own["digest"]) for column, own in metrics
-    )
-    seeds = dict.fromkeys(
-        seed
-        for condition in manifest["conditions"].values()
-        for seed in condition["seeds"]
-    )
+    digests = [(f"metric {column}", entry["digest"]) for column, entry in metrics]
+    lines += dict.fromkeys(digests)
+    seeds = _seeds(manifest["conditions"].values())
     lines.append(("seeds", ", ".join(map(str, seeds))))
     return [(name, value) for name, value in lines if value]

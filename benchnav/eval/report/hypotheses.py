@@ -16,7 +16,7 @@ from benchnav.eval.words import NOT_YET, count_range, p_in_words, reading_names
 from benchnav.metrics.shipped import QUANTITIES, TOTAL_TIME
 from benchnav.stats.bootstrap import LEAST_MAPS
 from benchnav.stats.holm import ALPHA
-from benchnav.stats.tables import Column, p_value, signed, table_of
+from benchnav.stats.tables import Column, cell_of, p_value, signed, table_of
 
 _TESTS = {
     "difference": "sign-flip test by {unit} (difference)",
@@ -45,11 +45,11 @@ def hypothesis_findings(
         Sentences by their title.
     """
     all_quantities = quantities(further_quantities(manifest))
-    sentences = [
-        f"{number}. {_capital(_claim(row, all_quantities))}: {_verdict(row)} "
-        f"({_numbers(row, unit)})."
-        for number, row in enumerate(tests.to_dict("records"), start=1)
-    ]
+    sentences = []
+    for number, row in enumerate(tests.to_dict("records"), start=1):
+        claim = _capital(_claim(row, all_quantities))
+        verdict = f"{_verdict(row)} ({_numbers(row, unit)})"
+        sentences.append(f"{number}. {claim}: {verdict}.")
     title = (
         "Hypotheses, fixed before the first unit was run (digest "
         f"{manifest['hypotheses']['digest']})"
@@ -62,80 +62,68 @@ def hypothesis_table(
     unit: str,
     quantities_by_name: Mapping[str, Quantity] = QUANTITIES,
 ) -> Table:
-    """Format the tests, a row a hypothesis; a supported one is bold.
+    """Format the tests, one row per hypothesis; results of supported ones are bold.
 
     Args:
         tests: from `hypotheses.test_hypotheses`.
         unit: statistical unit, from `words.unit_of_statistics`.
         quantities_by_name: quantities that conditions are compared by.
     """
-    used = "; ".join(
-        words for kind, words in _TESTS.items() if (tests["kind"] == kind).any()
-    )
+    kinds = set(tests["kind"])
+    used = "; ".join(words for kind, words in _TESTS.items() if kind in kinds)
     family = "1 hypothesis" if len(tests) == 1 else f"{len(tests)} hypotheses"
-    notes = [
+    notes = (
         f"Tests: {used.format(unit=unit)}; p is corrected over {family} (Holm). "
         f"Supported: p < {ALPHA}.",
-        "Intervals are of one difference and not corrected, so that an interval and p "
-        "can disagree.",
-    ]
-    rows = [
-        {**row, "number": number}
-        for number, row in enumerate(tests.to_dict("records"), start=1)
-    ]
+        "Intervals are of one difference and not corrected, so an interval and p can "
+        "disagree.",
+    )
+    rows = tests.assign(number=range(1, len(tests) + 1)).to_dict("records")
     columns = [
-        Column("", lambda row: str(row["number"])),
+        Column("", cell_of("number")),
         Column("hypothesis", lambda row: _claim(row, quantities_by_name)),
-        Column(f"{unit}s", lambda row: str(row["n_maps"])),
-        Column(
-            "values",
-            lambda row: f"{_value(row['mean_one'])} : {_value(row['mean_other'])}",
-            "of the first condition and of the second.",
-        ),
+        Column(f"{unit}s", cell_of("n_maps")),
+        Column("values", _values, "of the first condition and of the second."),
         Column("difference", _with_unit),
         Column(
             "interval",
             _interval,
-            "95 % for a difference; 90 % for a margin, where the end beyond the "
-            "margin decides the test before the correction. Below "
-            f"{LEAST_MAPS} {unit}s only success has an interval.",
+            "95 % for a difference; 90 % for a margin: the end of the interval that "
+            "faces the margin decides the test, before the correction. Below "
+            f"{LEAST_MAPS} {unit}s, only success has an interval.",
         ),
-        Column(
-            "p",
-            lambda row: NOT_USED if np.isnan(row["p_holm"]) else p_value(row["p_holm"]),
-        ),
-        Column(
-            "result",
-            lambda row: Bold(_verdict(row)) if row["supported"] else _verdict(row),
-        ),
+        Column("p", cell_of("p_holm", _p)),
+        Column("result", _result),
     ]
-    table = table_of(
-        rows,
-        columns,
-        labels=2,
-        notes=tuple(notes),
-        bold_note="supported." if tests["supported"].any() else "",
-    )
+    bold_note = "supported." if tests["supported"].any() else ""
+    table = table_of(rows, columns, labels=2, notes=notes, bold_note=bold_note)
     explained = []
-    if ((tests["metric"] == TOTAL_TIME.name) & (tests["kind"] == "difference")).any():
+    is_of_time = tests["metric"] == TOTAL_TIME.name
+    is_difference = tests["kind"] == "difference"
+    if (is_of_time & is_difference).any():
         text = (
             "the interval allows for rare failures that no episode showed, and p "
-            "does not. So p can be small where the interval contains 0."
+            "does not. So p can be small although the interval contains 0."
         )
         explained.append(("T_total", text))
     for quantity in quantities_by_name.values():
         if quantity.of_arrivals and (tests["metric"] == quantity.name).any():
-            explained.append(
-                (quantity.words, "over the episodes in which both reached the goal.")
-            )
+            text = "over the episodes in which both reached the goal."
+            explained.append((quantity.words, text))
     return replace(table, explained=(*table.explained, *explained))
 
 
 def _claim(row: Mapping[Any, Any], quantities_by_name: Mapping[str, Quantity]) -> str:
     """Return the hypothesis, with conditions named as in tables and figures."""
-    test = Hypothesis(**{name.name: row[name.name] for name in fields(Hypothesis)})
+    names = [field.name for field in fields(Hypothesis)]
+    test = Hypothesis(**{name: row[name] for name in names})
     first, second = map(reading_names, row["names"])
     return test.claim(first, second, quantities_by_name[test.metric])
+
+
+def _result(row: Mapping[Any, Any]) -> str:
+    verdict = _verdict(row)
+    return Bold(verdict) if row["supported"] else verdict
 
 
 def _verdict(row: Mapping[Any, Any]) -> str:
@@ -154,39 +142,40 @@ def _verdict(row: Mapping[Any, Any]) -> str:
 
 def _numbers(row: Mapping[Any, Any], unit: str) -> str:
     words = [f"difference {_with_unit(row)}"]
-    if (ends := _interval(row)) != NOT_USED:
-        words.append(f"interval {ends}")
-    p = [] if np.isnan(row["p_holm"]) else [p_in_words(row["p_holm"])]
-    return ", ".join([*words, *p, f"{row['n_maps']} {unit}s"])
+    interval = _interval(row)
+    if interval != NOT_USED:
+        words.append(f"interval {interval}")
+    p = row["p_holm"]
+    if not np.isnan(p):
+        words.append(p_in_words(p))
+    words.append(f"{row['n_maps']} {unit}s")
+    return ", ".join(words)
 
 
 def _extended(manifest: Mapping[str, Any]) -> list[str]:
     """Return a note if a run was extended after its hypotheses were fixed."""
     planned = manifest["hypotheses"]["episodes"]
-    now = {
-        condition: sum(
-            count for _, _, count in manifest["conditions"][condition]["draws"]
-        )
-        for condition in planned
-    }
+    now = {}
+    for condition in planned:
+        draws = manifest["conditions"][condition]["draws"]
+        now[condition] = sum(count for _, _, count in draws)
     if now == planned:
         return []
     return [
         "The run was extended after the hypotheses were fixed (episodes a condition: "
-        f"{count_range(planned.values())} "
-        f"then, {count_range(now.values())} now). The p-values hold only if that was "
-        "planned."
+        f"{count_range(planned.values())} then, {count_range(now.values())} now). "
+        "The p-values are valid only if that was planned."
     ]
 
 
 def _interval(row: Mapping[Any, Any]) -> str:
-    # The interval whose end decides a test at 5 %, before a correction.
-    suffix, words = ("_90", "90 %") if row["kind"] in _OF_MARGINS else ("", "95 %")
+    # The end of this interval decides a test at 5 %, before a correction.
+    suffix, level = ("_90", "90 %") if row["kind"] in _OF_MARGINS else ("", "95 %")
     low = row[f"low{suffix}"]
     high = row[f"high{suffix}"]
     if np.isnan(low):
         return NOT_USED
-    return f"{_signed(low)} to {_signed(high)} ({words})"
+    return f"{_signed(low)} to {_signed(high)} ({level})"
 
 
 def _with_unit(row: Mapping[Any, Any]) -> str:
@@ -196,6 +185,14 @@ def _with_unit(row: Mapping[Any, Any]) -> str:
 
 def _signed(value: float) -> str:
     return signed(value, 1 if abs(value) >= 0.95 else 2)
+
+
+def _values(row: Mapping[Any, Any]) -> str:
+    return f"{_value(row['mean_one'])} : {_value(row['mean_other'])}"
+
+
+def _p(p: float) -> str:
+    return NOT_USED if np.isnan(p) else p_value(p)
 
 
 def _value(value: float) -> str:

@@ -1,4 +1,4 @@
-"""Tables of a run: a row a condition; for a paper, a column a scenario.
+"""Tables of a run: one row per condition; for a paper, one column per scenario.
 
 Source: Endo, Honda and Ishigami (2024), Table I.
 """
@@ -34,7 +34,7 @@ from benchnav.stats.bootstrap import LEAST_MAPS
 from benchnav.stats.holm import ALPHA
 from benchnav.stats.tables import Column, Row, cell_of, table_of
 
-# Values of `follows` of planners that follow only the user's objective.
+# Values of `follows` for planners that minimise only the user's objective.
 _USERS_OWN = ("", "J")
 _ALWAYS = ("scenario", "planner", "risk")
 _SUCCESS = shipped.SUCCESS.quantity
@@ -73,19 +73,27 @@ def _success(row: Row) -> str:
 
 def _total_time(row: Row) -> str:
     mean = f"{row['total_time_mean_s']:.1f}"
-    if np.isnan(row["total_time_low_s"]):
+    low = row["total_time_low_s"]
+    if np.isnan(low):
         return mean
-    return f"{mean} ({row['total_time_low_s']:.1f}–{row['total_time_high_s']:.1f})"
+    return f"{mean} ({low:.1f}–{row['total_time_high_s']:.1f})"
+
+
+def _success_time(row: Row) -> str:
+    return mean_and_std(row["success_time_mean_s"], row["success_time_std_s"])
 
 
 def _traversability(row: Row) -> str:
-    text = mean_and_std(
-        100 * row["traversability_mean"], 100 * row["traversability_std"]
-    )
-    # An episode that ended at once observed no λ, so fewer episodes have λ̄ than the
-    # row.
-    some = 0 < row["traversability_n"] < row["n_episodes"]
-    return f"{text} (n = {row['traversability_n']})" if some else text
+    mean = 100 * row["traversability_mean"]
+    text = mean_and_std(mean, 100 * row["traversability_std"])
+    # An episode that ended at once observed no λ and has no λ̄.
+    count = row["traversability_n"]
+    is_partial = 0 < count < row["n_episodes"]
+    return f"{text} (n = {count})" if is_partial else text
+
+
+def _latency(row: Row) -> str:
+    return _times(*(row[f"latency_{name}"] for name in LATENCIES))
 
 
 def _planning_time(row: Row) -> str:
@@ -105,12 +113,12 @@ _RESULTS = (
     Column(
         _TOTAL_TIME.heading,
         _total_time,
-        f"mean {_TOTAL_TIME.meaning}, with its 95 % interval in brackets; no interval "
-        f"below {LEAST_MAPS} maps.",
+        f"mean {_TOTAL_TIME.meaning}. In brackets: its 95 % interval, with "
+        f"{LEAST_MAPS} maps or more.",
     ),
     Column(
         "T if success [s]",
-        lambda row: mean_and_std(row["success_time_mean_s"], row["success_time_std_s"]),
+        _success_time,
         "time of the episodes that reached the goal, mean ± standard deviation.",
     ),
     Column(
@@ -123,16 +131,15 @@ _RESULTS = (
 _TIMES = {
     "latency_median_ms": Column(
         ALONE,
-        lambda row: _times(*(row[f"latency_{name}"] for name in LATENCIES)),
+        _latency,
         "planning time of a step of one robot without a batch, on one thread: median "
         "(95th percentile, maximum) over at most 100 steps.",
     ),
     "planning_ms_median": Column(
         IN_BATCH,
         _planning_time,
-        "planning time of a step of a batch, divided by its episodes, on one thread: "
-        "median (95th percentile) over "
-        "steps; no latency.",
+        "planning time of a step of a batch, divided by its number of episodes, on one "
+        "thread: median (95th percentile) over steps; not a latency.",
     ),
 }
 _FAILURES = Column("failures", failures_in_words, "how the other episodes ended.")
@@ -156,34 +163,21 @@ def result_table(
     """
     marks, notes = _notes(summary, conditions)
     labels = _label_columns(summary, _ALWAYS)
-    counts = [
-        Column(name, cell_of(f"n_{name}"), _MEANINGS[name])
-        for name in ("groups", "maps", "episodes")
-        if summary[f"n_{name}"].nunique() > 1
-        and (name != "groups" or unit_of_statistics(summary) == "group")
-    ]
-    times = [
-        column
-        for name, column in _TIMES.items()
-        if name in summary and summary[name].notna().any()
-    ]
-    columns = [
-        *labels,
-        *counts,
-        *_RESULTS,
-        *map(_further_column, further),
-        *times,
-        _FAILURES,
-    ]
+    times = []
+    for name, column in _TIMES.items():
+        if name in summary and summary[name].notna().any():
+            times.append(column)
+    results = [*_RESULTS, *map(_further_column, further), *times, _FAILURES]
+    columns = [*labels, *_count_columns(summary), *results]
     rows = summary.assign(mark=marks).to_dict("records")
     if any(column.cell(row).endswith("¶") for column in times for row in rows):
         notes.append("¶ The planner ran as compiled code.")
-    if (summary["best_rivals"] > 0).any() and not summary["best_marked"].any():
-        few = summary["best_maps"].max() < FEWEST_MAPS
+    has_rivals = (summary["best_rivals"] > 0).any()
+    if has_rivals and not summary["best_marked"].any():
         why = "no setting is significantly"
-        if few:
+        if summary["best_maps"].max() < FEWEST_MAPS:
             unit = unit_of_statistics(summary)
-            why = f"with fewer than {FEWEST_MAPS} {unit}s none can be called"
+            why = f"with fewer than {FEWEST_MAPS} {unit}s, no setting can be called"
         notes.append(f"No rate is bold: {why} worse than the best.")
     return table_of(
         rows,
@@ -192,6 +186,19 @@ def result_table(
         notes=tuple(notes),
         bold_note=bold_note(summary),
     )
+
+
+def _count_columns(summary: pd.DataFrame) -> list[Column]:
+    """Return the columns of numbers of maps and episodes that differ."""
+    names = ["maps", "episodes"]
+    if unit_of_statistics(summary) == "group":
+        names.insert(0, "groups")
+    columns = []
+    for name in names:
+        count = f"n_{name}"
+        if summary[count].nunique() > 1:
+            columns.append(Column(name, cell_of(count), _MEANINGS[name]))
+    return columns
 
 
 def _label_columns(summary: pd.DataFrame, always: Collection[str]) -> list[Column]:
@@ -211,22 +218,23 @@ def _label(name: str, row: Row) -> str:
 def _further_column(quantity: Quantity) -> Column:
     meaning = (
         f"{quantity.meaning}: mean over episodes, with its 95 % interval in brackets; "
-        f"no interval below {LEAST_MAPS} maps; n is the number of episodes that have "
-        "it, if not all have."
+        f"no interval below {LEAST_MAPS} maps; n is the number of episodes with a "
+        "value, if some have no value."
     )
     return Column(quantity.heading, partial(_mean_in_words, quantity), meaning)
 
 
 def _mean_in_words(quantity: Quantity, row: Row) -> str:
     """Return the mean of a further quantity with its interval, in its unit."""
-    mean, low, high = (
-        quantity.scale * row[quantity.summary_column(name)]
-        for name in ("mean", "low", "high")
-    )
+    columns = map(quantity.summary_column, ("mean", "low", "high"))
+    mean, low, high = (quantity.scale * row[column] for column in columns)
     if np.isnan(mean):
         return NOT_USED
-    count = row[f"{quantity.column.removesuffix(quantity.suffix)}_n"]
-    words = f"{mean:.4g}" if np.isnan(low) else f"{mean:.4g} ({low:.4g}–{high:.4g})"
+    words = f"{mean:.4g}"
+    if not np.isnan(low):
+        words += f" ({low:.4g}–{high:.4g})"
+    stem = quantity.column.removesuffix(quantity.suffix)
+    count = row[f"{stem}_n"]
     return f"{words} (n = {count})" if count < row["n_episodes"] else words
 
 
@@ -238,49 +246,61 @@ def learning_table(summary: pd.DataFrame) -> Table | None:
     """
     if summary.empty or summary["revisions_mean"].isna().all():
         return None
-    rows = summary[summary["revisions_mean"].notna()].to_dict("records")
-    full = {
-        _without_sensor(row): row
-        for row in summary.to_dict("records")
-        if row["sensor"] == "full"
-    }
+    has_learnt = summary["revisions_mean"].notna()
+    rows = summary[has_learnt].to_dict("records")
     labels = _label_columns(summary, (*_ALWAYS, "ground", "belief"))
+    counts = (shipped.SEEN_CELLS, shipped.SENSED_CELLS, shipped.REVISIONS)
     columns = [
         *labels,
-        *(
-            _mean_column(metric, "{:.0f}".format)
-            for metric in (shipped.SEEN_CELLS, shipped.SENSED_CELLS, shipped.REVISIONS)
-        ),
+        *(_mean_column(metric, "{:.0f}".format) for metric in counts),
         *(_mean_column(metric, _number) for metric in shipped.AHEAD),
         _mean_column(shipped.LEARNING_TIME, _times),
         Column(
             "planning [ms]",
             cell_of("planning_ms_median", _times),
-            "time of a step for planning, likewise: median over steps.",
+            "planning time of a step of a batch, divided by its number of episodes: "
+            "median over steps.",
         ),
     ]
-    if any(row["sensor"] != "full" and _without_sensor(row) in full for row in rows):
-        columns += [
-            Column(
-                "Succ. to full [points]",
-                lambda row: _difference_to_full(row, full, "success_rate", 100),
-                "success minus that of the same condition with the sensor `full`; "
-                "`compare --by sensor --against full` has the interval and the test.",
-            ),
-            Column(
-                "T_total to full [s]",
-                lambda row: _difference_to_full(row, full, "total_time_mean_s", 1),
-                "mean T_total minus that of the same condition with the sensor `full`.",
-            ),
-        ]
+    columns += _columns_to_full(rows, summary)
     return table_of(rows, columns, labels=len(labels), title="Learning during episodes")
 
 
 def _mean_column(metric: Metric, write: Callable[[Any], str]) -> Column:
-    cell = cell_of(metric.quantity.summary_column("mean"), write)
-    return Column(
-        metric.quantity.heading, cell, f"{metric.meaning}, mean over episodes."
-    )
+    quantity = metric.quantity
+    cell = cell_of(quantity.summary_column("mean"), write)
+    return Column(quantity.heading, cell, f"{metric.meaning}, mean over episodes.")
+
+
+def _columns_to_full(rows: Sequence[Row], summary: pd.DataFrame) -> list[Column]:
+    """Return the columns of differences to a robot that observes the whole map."""
+    is_full = summary["sensor"] == "full"
+    full = {_without_sensor(row): row for row in summary[is_full].to_dict("records")}
+
+    def reference(row: Row) -> Row | None:
+        return None if row["sensor"] == "full" else full.get(_without_sensor(row))
+
+    def difference(row: Row, name: str, scale: float) -> str:
+        with_full = reference(row)
+        if with_full is None:
+            return NOT_USED
+        return f"{scale * (row[name] - with_full[name]):+.1f}"
+
+    if all(reference(row) is None for row in rows):
+        return []
+    return [
+        Column(
+            "Succ. to full [points]",
+            partial(difference, name="success_rate", scale=100),
+            "success minus that of the same condition with the sensor `full`; "
+            "`compare --by sensor --against full` has the interval and the test.",
+        ),
+        Column(
+            "T_total to full [s]",
+            partial(difference, name="total_time_mean_s", scale=1),
+            "mean T_total minus that of the same condition with the sensor `full`.",
+        ),
+    ]
 
 
 def _without_sensor(row: Row) -> tuple[str, ...]:
@@ -288,18 +308,8 @@ def _without_sensor(row: Row) -> tuple[str, ...]:
     return tuple(str(row[name]) for name in LABELS if name != "sensor")
 
 
-def _difference_to_full(
-    row: Row, full: Mapping[tuple[str, ...], Row], name: str, scale: float
-) -> str:
-    """Return a value minus that of a robot that observes the whole map."""
-    reference = full.get(_without_sensor(row))
-    if reference is None or row["sensor"] == "full":
-        return NOT_USED
-    return f"{scale * (row[name] - reference[name]):+.1f}"
-
-
 def paper_table(summary: pd.DataFrame, label: str, mark: str = "") -> str:
-    """Return a complete LaTeX table: a row a setting, and columns for each block.
+    """Return a complete LaTeX table: one row per setting, and columns for each block.
 
     The columns are success, T_total and λ̄. More than three blocks are split over
     several tabulars.
@@ -310,25 +320,23 @@ def paper_table(summary: pd.DataFrame, label: str, mark: str = "") -> str:
         mark: words that the caption begins with.
     """
     all_blocks = blocks(summary)
-    count = maps_in_words(
-        *(count_range(summary[name]) for name in ("n_maps", "n_groups"))
-    )
-    note = f" Bold: {bold_note(summary)}" if bold_note(summary) else ""
+    maps = count_range(summary["n_maps"])
+    groups = count_range(summary["n_groups"])
+    bold = bold_note(summary)
+    note = f" Bold: {bold}" if bold else ""
     caption = (
-        f"{mark}Planning results on {count} per scenario: success rate with its 95 % "
-        "interval; total time T_total, a "
-        "failure counted as the time budget T; and mean observed traversability λ̄. "
-        "± is the standard deviation over "
-        f"episodes.{note}"
+        f"{mark}Planning results on {maps_in_words(maps, groups)} per scenario: "
+        "success rate with its 95 % interval; total time T_total, where a failure "
+        "counts as the time budget T; and mean observed traversability λ̄. "
+        f"± is the standard deviation over episodes.{note}"
     )
     several = naming_labels(summary)
-    tables = [
-        _across(all_blocks[i : i + _MAX_ACROSS], several)
-        for i in range(0, len(all_blocks), _MAX_ACROSS)
-    ]
-    return to_latex(
-        tables, caption, label, wide=len(all_blocks) > 1, size="footnotesize"
-    )
+    tables = []
+    for first in range(0, len(all_blocks), _MAX_ACROSS):
+        side_by_side = all_blocks[first : first + _MAX_ACROSS]
+        tables.append(_across(side_by_side, several))
+    is_wide = len(all_blocks) > 1
+    return to_latex(tables, caption, label, wide=is_wide, size="footnotesize")
 
 
 def _across(
@@ -343,31 +351,32 @@ def _across(
         side_by_side.append(pd.DataFrame(cells, settings, dtype=object))
     table = pd.concat(side_by_side, axis=1).fillna(NOT_USED)
     names = table.index.to_frame(index=False)
-    names = names.iloc[names["planner"].factorize()[0].argsort(kind="stable")]
+    planner, _ = names["planner"].factorize()
+    names = names.iloc[planner.argsort(kind="stable")]
     cells = table.loc[pd.MultiIndex.from_frame(names)]
-    as_above = names.eq(names.shift()).cummin(axis=1)
+    is_as_above = names.eq(names.shift()).cummin(axis=1)
+    starts_planner = ~is_as_above["planner"]
     for name in labels:
         names[name] = [reading_name(name, label) for label in names[name]]
+    shown_names = names.mask(is_as_above, "")
+    label_headings = [name.capitalize() for name in labels]
     return Table(
-        headings=(
-            *(name.capitalize() for name in labels),
-            *(_SUCCESS.heading, _TOTAL_TIME.heading, _TRAVERSABILITY.heading)
-            * len(shown_blocks),
-        ),
+        headings=(*label_headings, *_PAPER * len(shown_blocks)),
         labels=len(labels),
-        rows=tuple(map(tuple, np.hstack([names.mask(as_above, ""), cells]))),
+        rows=tuple(map(tuple, np.hstack([shown_names, cells]))),
         groups=tuple(title for title, _ in shown_blocks),
-        rules=frozenset(np.flatnonzero(~as_above["planner"])[1:].tolist()),
+        rules=frozenset(np.flatnonzero(starts_planner)[1:].tolist()),
     )
 
 
 def _in_paper(row: Row) -> list[str]:
     success = f"{rate_in_words(row)} ({success_interval_in_words(row)})"
-    return [
-        Bold(success) if row["best_marked"] else success,
-        mean_and_std(row["total_time_mean_s"], row["total_time_std_s"]),
-        mean_and_std(100 * row["traversability_mean"], 100 * row["traversability_std"]),
-    ]
+    if row["best_marked"]:
+        success = Bold(success)
+    total_time = mean_and_std(row["total_time_mean_s"], row["total_time_std_s"])
+    mean = 100 * row["traversability_mean"]
+    traversability = mean_and_std(mean, 100 * row["traversability_std"])
+    return [success, total_time, traversability]
 
 
 def bold_note(summary: pd.DataFrame) -> str:
@@ -378,13 +387,14 @@ def bold_note(summary: pd.DataFrame) -> str:
     """
     if not summary["best_marked"].any():
         return ""
-    several = "" if len(blocks(summary)) == 1 else " of a block"
+    all_blocks = blocks(summary)
+    of_block = "" if len(all_blocks) == 1 else " of a block"
     words = (
-        f"highest success rate{several} and all without a significant difference from "
-        "it (max-T bootstrap test by "
+        f"the highest success rate{of_block}, and all rates without a significant "
+        "difference from it (max-T bootstrap test by "
         f"{unit_of_statistics(summary)}, p ≥ {ALPHA})"
     )
-    left_out = pd.concat([rows[~competing(rows)] for _, rows in blocks(summary)])
+    left_out = pd.concat([rows[~competing(rows)] for _, rows in all_blocks])
     models: dict[str, None] = {}
     for part in PRIVILEGED:
         of_part = left_out.loc[left_out["privileged"] == part, "model"]
@@ -402,11 +412,11 @@ def _times(*values: float) -> str:
     """Format milliseconds with two significant digits, all but the first in brackets."""
     if np.isnan(values[0]):
         return NOT_USED
-    first, *rest = (
-        np.format_float_positional(value, 2, fractional=False, trim="-")
-        for value in values
+    digits = partial(
+        np.format_float_positional, precision=2, fractional=False, trim="-"
     )
-    return f"{first} ({', '.join(rest)})" if rest else first
+    first, *others = map(digits, values)
+    return f"{first} ({', '.join(others)})" if others else first
 
 
 def _notes(
@@ -417,13 +427,12 @@ def _notes(
     marks = []
     for condition in summary["condition"]:
         entry = conditions[condition]
-        follows = entry["follows"]
-        texts = []
-        if follows not in _USERS_OWN:
-            texts.append(f"Cost minimised in place of J: {follows}.")
-        numbers_of_condition = [
-            numbers.setdefault(text, str(len(numbers) + 1).translate(_SUPERSCRIPTS))
-            for text in (*texts, *entry["remarks"])
-        ]
-        marks.append(",".join(numbers_of_condition))
+        texts = [*entry["remarks"]]
+        cost = entry["follows"]
+        if cost not in _USERS_OWN:
+            texts.insert(0, f"Cost minimised instead of J: {cost}.")
+        for text in texts:
+            next_number = str(len(numbers) + 1).translate(_SUPERSCRIPTS)
+            numbers.setdefault(text, next_number)
+        marks.append(",".join(numbers[text] for text in texts))
     return marks, [f"{number} {text}" for text, number in numbers.items()]

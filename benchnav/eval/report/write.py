@@ -4,6 +4,7 @@ import base64
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
@@ -52,9 +53,9 @@ class Report(RunData):
         name: name of the run.
         header: lines on the settings of the run.
         findings: sentences by their title.
-        table: table of results, a row a condition.
-        warnings: lines on faults, and on what could not be shown.
-        mark: mark of a run that is not finished; empty if it is.
+        table: table of results, one row per condition.
+        warnings: lines on faults, and on contents that could not be shown.
+        mark: mark of a run that is not finished; empty for a finished run.
         faults: warnings on custom figures that could not be drawn.
     """
 
@@ -76,11 +77,8 @@ class Report(RunData):
     def hypotheses(self) -> Table:
         """The formatted `tests`."""
         all_quantities = quantities(further_quantities(self.about))
-        return self.marked(
-            hypothesis_table(
-                self.tests, unit_of_statistics(self.summary), all_quantities
-            )
-        )
+        unit = unit_of_statistics(self.summary)
+        return self.marked(hypothesis_table(self.tests, unit, all_quantities))
 
     def marked(self, table: Table) -> Table:
         """Return a table with a note if the run is not finished."""
@@ -88,16 +86,15 @@ class Report(RunData):
             return table
         return replace(table, notes=(_capital(self.mark), *table.notes))
 
-    def says(self, text: str) -> str:
+    def marked_text(self, text: str) -> str:
         """Return a text, preceded by the mark of a run that is not finished."""
         return f"{_capital(self.mark)}. {text}" if self.mark else text
 
     def csv(self, table: pd.DataFrame, digits: int = 6) -> str:
         """Return a table as CSV, with a column `partial` if the run is not finished."""
-        marked = table
         if self.mark:
-            marked = table.assign(partial=self.mark.removeprefix("partial: "))
-        return marked.to_csv(index=False, float_format=f"%.{digits}g")
+            table = table.assign(partial=self.mark.removeprefix("partial: "))
+        return table.to_csv(index=False, float_format=f"%.{digits}g")
 
 
 def read_report(
@@ -107,12 +104,13 @@ def read_report(
 
     Args:
         folder: a finished run.
-        record_driven: records driven episodes again, as `run.recordings.record_driven`
-            does of the folder; without it no failure is shown on a map.
-        partial: also of a run that is not finished, of what is there.
+        record_driven: records driven episodes again, such as
+            `run.recordings.record_driven`; if None, no failure is shown on a map.
+        partial: whether to accept a run that is not finished, and use its finished
+            units.
 
     Raises:
-        ConfigError: the folder is no run folder, or its run is not finished.
+        ConfigError: If the folder is not a run folder, or its run is not finished.
     """
     results = read_results(folder, partial)
     manifest = results.run.about
@@ -125,44 +123,31 @@ def read_report(
     summary = summarise(episodes, worlds, further)
     tests = pd.DataFrame()
     if "hypotheses" in manifest:
+        is_finished = not results.is_partial
+        stated = manifest["hypotheses"]
         tests = test_hypotheses(
-            manifest["hypotheses"],
-            episodes,
-            worlds,
-            not results.is_partial,
-            quantities(further),
+            stated, episodes, worlds, is_finished, quantities(further)
         )
     best = against_best(episodes, summary, privileged_models(manifest["conditions"]))
     summary = summary.merge(best, on="condition", how="left", validate="1:1")
-    # Planning time of a step of one robot, if the run measured it.
-    latencies = [
-        manifest["conditions"][condition].get("latency", {})
-        for condition in summary["condition"]
-    ]
-    summary = summary.join(
-        pd.DataFrame(latencies, columns=LATENCIES, dtype=float).add_prefix("latency_")
-    )
+    summary = summary.join(_latencies(summary, manifest["conditions"]))
     failures = failures_table(folder, episodes)
     sheets = collect_sheets(summary, failures, record_driven)
     findings_by_title = findings(summary, failures, sheets.predicted)
     if not tests.empty:
         # If hypotheses were fixed before the run, all other findings are exploratory.
-        explored = {
-            f"Exploratory: {title}": sentences
-            for title, sentences in findings_by_title.items()
-        }
-        findings_by_title = (
-            hypothesis_findings(tests, manifest, unit_of_statistics(summary)) | explored
-        )
+        explored = _prefixed("Exploratory: ", findings_by_title)
+        unit = unit_of_statistics(summary)
+        findings_by_title = hypothesis_findings(tests, manifest, unit) | explored
     if results.mark:
-        findings_by_title = {
-            f"{_capital(results.mark)}. {title}": sentences
-            for title, sentences in findings_by_title.items()
-        }
+        mark = f"{_capital(results.mark)}. "
+        findings_by_title = _prefixed(mark, findings_by_title)
     warnings = [*results.notes(), *caveats(manifest)]
     manifest = {**manifest, "conditions": results.conditions}
-    if count := summary[[f"{name}_count" for name in ERROR_OUTCOMES]].to_numpy().sum():
-        episodes_in_words = "1 episode" if count == 1 else f"{count} episodes"
+    error_counts = summary[[f"{name}_count" for name in ERROR_OUTCOMES]]
+    n_errors = error_counts.to_numpy().sum()
+    if n_errors:
+        episodes_in_words = "1 episode" if n_errors == 1 else f"{n_errors} episodes"
         warnings.append(
             "warning: a planner, model, sensor or belief failed in "
             f"{episodes_in_words}; see {folder / ERRORS}"
@@ -187,6 +172,21 @@ def read_report(
         mark=results.mark,
     )
     return replace(report, table=report.marked(report.table))
+
+
+def _latencies(
+    summary: pd.DataFrame, conditions: Mapping[str, Mapping[str, Any]]
+) -> pd.DataFrame:
+    """Return the planning time of a step of one robot; NaN if it was not measured."""
+    rows = [conditions[name].get("latency", {}) for name in summary["condition"]]
+    table = pd.DataFrame(rows, columns=LATENCIES, dtype=float)
+    return table.add_prefix("latency_")
+
+
+def _prefixed(
+    prefix: str, sentences_by_title: Mapping[str, list[str]]
+) -> dict[str, list[str]]:
+    return {prefix + title: lines for title, lines in sentences_by_title.items()}
 
 
 def write_report(
@@ -224,29 +224,27 @@ def write_report(
         if not table.empty
     }
     texts["failures.csv"] = report.csv(report.failures, digits=4)
-    comments = "".join(
-        f"% {line}\n"
-        for line in (*report.header, *report.table.notes, *report.warnings)
-    )
-    texts["summary.tex"] = comments + paper_table(
-        report.summary, report.name, report.says("")
-    )
+    comment_lines = (*report.header, *report.table.notes, *report.warnings)
+    comments = "".join(f"% {line}\n" for line in comment_lines)
+    paper = paper_table(report.summary, report.name, report.marked_text(""))
+    texts["summary.tex"] = comments + paper
     if not report.tests.empty:
-        caption = report.says("Tests of the hypotheses that were fixed before the run.")
-        texts["hypotheses.tex"] = to_latex(
-            [report.hypotheses], caption, f"{report.name}-hypotheses"
+        caption = report.marked_text(
+            "Tests of the hypotheses that were fixed before the run."
         )
+        label = f"{report.name}-hypotheses"
+        texts["hypotheses.tex"] = to_latex([report.hypotheses], caption, label)
     for name, text in texts.items():
         write_text(out / name, text)
     captions, faults = _draw_figures(report, figures, out / "figures")
     report = replace(report, warnings=(*report.warnings, *faults), faults=faults)
-    pages = "summary.md", PAGE
+    pages = ("summary.md", PAGE)
     for name in pages:
         write_text(out / name, render(name, report, captions))
-    drawn = [
-        path.with_suffix(suffix) for path in captions for suffix in (".png", ".pdf")
-    ]
-    note_checksums(out, [*drawn, *(out / name for name in (*texts, *pages))])
+    written = [out / name for name in (*texts, *pages)]
+    for path in captions:
+        written += [path, path.with_suffix(".pdf")]
+    note_checksums(out, written)
     return report
 
 
@@ -280,7 +278,8 @@ def _draw_figures(
     captions: dict[Path, str] = {}
     _save_figures(report, figures_of(report), folder, captions)
     faults = []
-    for spec in (*report.about.get("suite", {}).get("figures", ()), *figures):
+    of_suite = report.about.get("suite", {}).get("figures", ())
+    for spec in (*of_suite, *figures):
         name = getattr(spec, "name", spec)
         if isinstance(spec, Mapping):
             name = spec["part"]
@@ -302,15 +301,16 @@ def _save_figures(
             raise ConfigError(
                 f"Expected a figure with a unique name, got {figure.name!r}. Rename it."
             )
-        caption = report.says(figure.caption(report))
-        save_twice(figure(report), path, trim=figure.trim, mark=_capital(report.mark))
+        caption = report.marked_text(figure.caption(report))
+        mark = _capital(report.mark)
+        save_twice(figure(report), path, trim=figure.trim, mark=mark)
         captions[path] = caption
 
 
 def render(file: str, report: Report, figures: Mapping[Path, str]) -> str:
     """Return the text of a file from its template.
 
-    In HTML all text is escaped, and the page needs no other file and no network.
+    In HTML, all text is escaped, and the page needs no other file and no network.
 
     Args:
         file: `report.html` or `summary.md`.
@@ -340,7 +340,8 @@ def render(file: str, report: Report, figures: Mapping[Path, str]) -> str:
 
 
 def _inline(path: Path) -> str:
-    return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()
+    encoded = base64.b64encode(path.read_bytes()).decode()
+    return f"data:image/png;base64,{encoded}"
 
 
 def _pixels(path: Path) -> int:

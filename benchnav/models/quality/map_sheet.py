@@ -18,7 +18,7 @@ from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.base import TraversabilityModel, predict
 from benchnav.models.predictor import Oracle
 from benchnav.models.quality.scores import mutual_information, predictive_entropy
-from benchnav.viz.maps import LAMBDA, TRAVERSABILITY_COLOURS, lacking_handle
+from benchnav.viz.maps import LAMBDA, TRAVERSABILITY_COLOURS, missing_handle
 from benchnav.viz.sheet import SheetColumn, class_patches, class_scale, sheet_of_maps
 
 # Title, label of the colour bar, and colours of each layer; classes and images have no
@@ -160,7 +160,7 @@ def map_sheet_figure(
     labels = [classes[class_id].name.replace("_", " ") for class_id in class_ids]
     patches = class_patches(labels, class_colours(classes)[class_ids])
     if patches and any(bool(np.isnan(layer).any()) for layer in sheet.layers.values()):
-        patches.append(lacking_handle())
+        patches.append(missing_handle())
     rows = [f"map {index}" for index in sheet.indices]
     return sheet_of_maps(
         columns, rows, sheet.extent_m, f"{title}, split {sheet.split}", patches

@@ -14,7 +14,8 @@ from benchnav.core.errors import ConfigError
 from benchnav.eval.figures.data import Driven, RunData, read_driven
 from benchnav.eval.figures.driven import DrivenPaths
 from benchnav.eval.recording import GROUND, Ground, Recording
-from benchnav.viz.maps import IMMOBILISING, MARKS
+from benchnav.viz.drives import MARKS
+from benchnav.viz.maps import IMMOBILISING
 from benchnav.viz.style import planner_colours
 from tests.eval.forged import forge_steps
 from tests.eval.report import made

@@ -1,3 +1,4 @@
+import itertools
 from dataclasses import replace
 from typing import Any
 
@@ -67,9 +68,13 @@ def test_panels_say_where_when_and_why() -> None:
         panel for panel in figure.axes if panel.get_visible() and panel.get_title()
     ]
     told = line.recordings[0].predicted[4, 2]
-    assert [panel.get_title() for panel in panels] == [
-        f"hg, map 0: immobilised, 20 s\nλ̂ = {told:.2f}, observed λ = 0.04",
-        "hg, map 1: out of bounds, 21 s\noutside the map",
+    titles = [
+        " ".join(panel.get_title().replace("\N{NO-BREAK SPACE}", " ").split())
+        for panel in panels
+    ]
+    assert titles == [
+        f"hg, map 0: immobilised, 20 s λ̂ = {told:.2f}, observed λ = 0.04",
+        "hg, map 1: out of bounds, 21 s outside the map",
     ]
     assert panels[0].get_ylabel() == "MPPI, mean\n(2 of 9 failures)"
     for panel, place in zip(panels, range(2), strict=True):
@@ -101,3 +106,17 @@ def test_ground_that_immobilises_a_robot_is_drawn_and_named_where_there_is_such(
     assert "immobilises a robot" not in [
         text.get_text() for text in plain.legends[0].get_texts()
     ]
+
+
+def test_titles_of_neighbours_do_not_overlap() -> None:
+    rows = failures(["planner_failure"] * 4, scenario="hg-050", map=range(996, 1000))
+    for count in (2, 4):
+        figure = draw_failures([shown(rows[:count])])
+        figure.draw_without_rendering()
+        titles = [
+            panel.title.get_window_extent()
+            for panel in figure.axes
+            if panel.get_visible() and panel.get_title()
+        ]
+        assert len(titles) == count
+        assert all(left.x1 < right.x0 for left, right in itertools.pairwise(titles))

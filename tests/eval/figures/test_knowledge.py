@@ -20,7 +20,8 @@ from benchnav.eval.folder.sealed import read_sealed
 from benchnav.eval.recording import Recording
 from benchnav.eval.report import write
 from benchnav.stats.bootstrap import LEAST_MAPS
-from benchnav.viz.maps import MARKS, hatching, robot_marker
+from benchnav.viz.drives import MARKS, robot_marker
+from benchnav.viz.maps import hatching
 from benchnav.viz.style import TWO_COLUMNS_IN
 from tests.eval.forged import forge_steps
 from tests.eval.report import made
@@ -71,7 +72,7 @@ def test_four_moments_from_start_to_end_show_what_was_known_by_then() -> None:
             (reach,) = [
                 line
                 for line in panel.lines
-                if line.get_label() == "reach of the sensors"
+                if line.get_label() == "footprint of the sensors"
             ]
             np.testing.assert_array_equal(np.transpose(reach.get_data()), known.outline)
             (driven,) = [line for line in panel.lines if line.get_label() == "driven"]
@@ -112,7 +113,11 @@ def test_the_robot_stands_where_it_was_and_its_end_is_marked() -> None:
 
 def test_the_legend_names_what_there_is_alone() -> None:
     recording = made.learning_recording(100)
-    ground = ["edge of where λ was sensed", "not seen", "reach of the sensors"]
+    ground = [
+        "edge of cells with measured λ",
+        "not observed",
+        "footprint of the sensors",
+    ]
     names = names_in_legend(draw_knowledge(recording))
     assert set(names) == {"driven", "start", "goal", "robot", "immobilised", *ground}
     bare: list[Any] = [

@@ -11,7 +11,8 @@ from benchnav.eval.figures.data import choose_recordings
 from benchnav.eval.figures.moment import known_colours
 from benchnav.eval.figures.trajectories import draw_trajectories
 from benchnav.eval.recording import Recording
-from benchnav.viz.maps import CLOSED, MARKS, field_colours, hatching, robot_marker
+from benchnav.viz.drives import MARKS, robot_marker
+from benchnav.viz.maps import CLOSED, field_colours, hatching
 from benchnav.viz.style import TWO_COLUMNS_IN, bytes_of, save_twice
 from tests.eval.report import made
 
@@ -105,7 +106,7 @@ def test_what_is_drawn_is_what_was_planned_and_driven_by_then() -> None:
     above, below = shown(draw_trajectories([taken]))
     now = taken.now
     assert (
-        above.get_title()
+        above.get_title().replace("\N{NO-BREAK SPACE}", " ")
         == f"MPPI, CVaR\nt = {now / 10:g} s; out of bounds after {taken.end_s:g} s"
     )
     for panel in (above, below):
@@ -239,7 +240,7 @@ def test_titles_tell_models_and_worlds_apart_where_they_differ() -> None:
 def test_without_a_recorded_plan_the_whole_path_is_shown_and_how_it_ended() -> None:
     taken = replace(held(), plans=())
     above, below, _ = shown(figure := draw_trajectories([taken]))
-    assert above.get_title() == "MPPI, CVaR\nimmobilised after 17 s"
+    assert above.get_title() == "MPPI, CVaR\nimmobilised after 17\N{NO-BREAK SPACE}s"
     (driven,) = [layer for layer in above.collections if layer.get_array() is not None]
     np.testing.assert_array_equal(driven.get_array(), taken.traversability)
     assert max(len(line.get_xdata()) for line in below.lines) == 171
@@ -321,4 +322,4 @@ def test_λ_hat_of_a_robot_that_learns_is_that_known_at_the_moment() -> None:
     np.testing.assert_array_equal(
         below.get_images()[0].get_array(), known_colours(taken, taken.now)["risk"]
     )
-    assert below.get_title() == "λ̂ known by then"
+    assert below.get_title() == "λ̂ of the belief at that time"

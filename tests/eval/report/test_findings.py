@@ -39,10 +39,9 @@ def test_a_best_that_all_others_are_worse_than() -> None:
     assert sentences[0] == (
         "MPPI, CVaR₀.₉ has the highest success rate: 90 % of the episodes reached the goal (95 % interval 83 to 94 %)."
     )
-    assert sentences[1] == "All 2 other settings are significantly worse."
+    assert sentences[1] == "Both other settings are significantly worse."
     assert sentences[2].startswith(
-        "MPPI, mean is the best of those that are significantly worse: 40 %, 50.0 points less (95 % interval of this "
-        "pair only "
+        "MPPI, mean is the best of those that are significantly worse: 40 %, 50.0 points less (95 % interval "
     )
     assert sentences[2].endswith(
         ", p = 0.0005 (max-T bootstrap test by map over 3 settings)."
@@ -68,7 +67,7 @@ def test_one_that_is_not_worse_and_the_next_that_is() -> None:
         == "1 other setting is not significantly worse (p ≥ 0.05): MPPI, VaR."
     )
     assert sentences[2].startswith(
-        "MPPI, mean is significantly worse: 40 %, 50.0 points less (95 % interval of this pair only "
+        "MPPI, mean is significantly worse: 40 %, 50.0 points less (95 % interval "
     )
 
 
@@ -102,7 +101,7 @@ def test_the_interval_is_that_of_the_difference_and_the_power_that_of_the_hardes
     row = summary[summary["risk"] == "mean"].iloc[0]
     low, high = 100 * row["best_low"], 100 * row["best_high"]
     told = findings(summary, NONE, {})["std"][2]
-    assert f"(95 % interval of this pair only {low:.1f} to {high:.1f})" in told
+    assert f"(95 % interval {low:.1f} to {high:.1f}, of this pair only)" in told
     alike = summary_of(
         condition(90, risk="a"), condition(89, risk="b"), [*condition(87, risk="c")]
     )

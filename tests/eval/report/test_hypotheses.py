@@ -90,7 +90,7 @@ def test_a_difference_of_time_says_that_its_interval_and_its_p_are_of_two_kinds(
     ):
         explained = hypothesis_table(pd.DataFrame([test]), "map").explained
         assert (
-            any("where the interval contains 0" in text for _, text in explained)
+            any("although the interval contains 0" in text for _, text in explained)
             == said
         )
 

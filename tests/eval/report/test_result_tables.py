@@ -79,10 +79,10 @@ def test_golden_table() -> None:
         "| std | CL-RRT¹,² | mean | 50 | 9–91 | 70.0 | 40.0 | 70.0 ± 28.3 | 1 (3) | 1 stuck |\n"
         "| std | straight | – | 0 | 0–66 | 100.0 | – | 80.0 (n = 1) | – | 1 out of bounds, "
         "1 planner failure |\n"
-        "\n¹ Cost minimised in place of J: its own time.\n"
+        "\n¹ Cost minimised instead of J: its own time.\n"
         "\n² limits 0.5 m/s²\n"
         "\n¶ The planner ran as compiled code.\n"
-        "\nNo rate is bold: with fewer than 6 maps none can be called worse than the best."
+        "\nNo rate is bold: with fewer than 6 maps, no setting can be called worse than the best."
     )
 
 
@@ -131,8 +131,8 @@ def test_bold_is_what_is_not_worse_than_the_best_where_another_is() -> None:
     rate = table.headings.index("Succ. [%]")
     assert made.bold_cells(table) == {(1, rate), (2, rate)}
     assert table.bold_note == (
-        "highest success rate and all without a significant difference from it (max-T bootstrap test by map, p ≥ "
-        "0.05). Privileged models (oracle) do not compete."
+        "the highest success rate, and all rates without a significant difference from it "
+        "(max-T bootstrap test by map, p ≥ 0.05). Privileged models (oracle) do not compete."
     )
     alike = table_of(
         rows[rows["risk"].isin(["var", "cvar"]) & (rows["model"] != "oracle")]
@@ -217,7 +217,7 @@ def test_notes_are_numbered_once_and_marked_at_every_condition_they_hold_for() -
         "b¹,²",
         "b¹,²",
     ]
-    assert table.notes[:2] == ("¹ Cost minimised in place of J: path length.", "² slow")
+    assert table.notes[:2] == ("¹ Cost minimised instead of J: path length.", "² slow")
 
 
 @pytest.mark.parametrize("follows", ["", "J"])
@@ -415,7 +415,7 @@ def test_maps_too_few_to_show_any_difference_say_so() -> None:
     assert many["detectable"] == f"{100 * table['success_detectable'][1]:.0f}"
     (_, note) = comparison_table(table, 0.2, "risk").notes
     assert note.endswith(
-        "These maps are too few for any difference to be significant, and to estimate how many it needs."
+        "These maps are too few for any difference to be significant, and to estimate how many maps a test needs."
     )
 
 

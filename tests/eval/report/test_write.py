@@ -87,7 +87,7 @@ def test_report_has_its_files_and_gives_the_summary(tmp_path: Path) -> None:
         "- World paper: λ resampled; time budget T = 100 s; free terrain has λ̂ above 0.3.",
         "- Data: paper-v1. Models: paper-v1. Seeds: 0, 7.",
         "- Each condition: 4 episodes on 2 maps.",
-        "¹ Cost minimised in place of J: its own time.",
+        "¹ Cost minimised instead of J: its own time.",
         "    benchnav-eval run --seeds '[0,7]'",
     ):
         assert line in text.splitlines()
@@ -111,7 +111,7 @@ def test_report_has_its_files_and_gives_the_summary(tmp_path: Path) -> None:
     for part in (
         " the highest success rate: ",
         "benchnav-eval run --seeds &#39;[0,7]&#39;",
-        "none can be called worse",
+        "no setting can be called worse",
     ):
         assert part in page
     assert not list(folder.rglob("*partial*"))
@@ -183,7 +183,7 @@ def test_what_is_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     printed = capsys.readouterr().out
     assert printed.startswith("World paper: λ resampled; time budget T = 100 s")
     assert "T if success [s]" in printed
-    assert "¹ Cost minimised in place of J: its own time." in printed
+    assert "¹ Cost minimised instead of J: its own time." in printed
     assert re.search(r"\nstd:\n.+ the highest success rate: ", printed)
     assert "\x1b" not in printed
 

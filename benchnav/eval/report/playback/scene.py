@@ -18,14 +18,8 @@ from benchnav.core.grid import outline
 from benchnav.eval.figures.moment import known_colours, true_colours
 from benchnav.eval.recorded_plans import thinned
 from benchnav.eval.recording import Recording, drawing_interval
-from benchnav.viz.maps import (
-    MARKS,
-    REACH,
-    SOFT,
-    hatching,
-    layer_colours,
-    shades,
-)
+from benchnav.viz.drives import MARKS
+from benchnav.viz.maps import FOOTPRINT, SOFT, hatching, layer_colours, shades
 from benchnav.viz.plans import STYLES
 from benchnav.viz.style import bytes_of
 
@@ -34,15 +28,16 @@ TIMELINE = "time"
 _RADIUS_M = 0.02
 _RADIUS_CELLS = 0.06
 _HEADING_M = 1.2
-# Plans for each part of the driven path; the whole part is logged at each plan.
+# Drawing intervals of each part of the driven path; each entry logs the part from its
+# start.
 _PIECE = 10
-# An X in one stroke, and its half width.
+# A cross (X) in one stroke, and its half width.
 _CROSS = np.array([(-1, -1), (1, 1), (0, 0), (-1, 1), (1, -1)], dtype=np.float32)
 _CROSS_M = 1.0
 _MARK = (255, 255, 255)
-_TRANSLUCENT = 160  # of a plan, in [0, 255]
-_LIFT_M = 0.12
-_CLOSED = (240, 240, 240)
+_TRANSLUCENT = 160  # opacity of a plan, in [0, 255]
+_LIFT_M = 0.12  # of lines over the terrain
+_CLOSED = (240, 240, 240)  # edge of non-free cells
 
 # Archetypes over the terrain and on the maps.
 _POINTS = (rr.Points3D, rr.Points2D)
@@ -65,10 +60,10 @@ class Driver:
 
     def entity(self, root: str, *leaf: str) -> str:
         """Return the path of an entity of the robot under a root."""
-        named = (
-            ["conditions", rr.escape_entity_path_part(self.name)] if self.name else []
-        )
-        return "/".join([root, *named, *leaf])
+        branch = []
+        if self.name:
+            branch = ["conditions", rr.escape_entity_path_part(self.name)]
+        return "/".join([root, *branch, *leaf])
 
     def entities(self, leaf: str) -> tuple[str, str]:
         """Return the paths of an entity over the terrain and on the maps."""
@@ -93,9 +88,8 @@ class Stage:
 
     def image(self, entity: str, image: np.ndarray, static: bool = True) -> None:
         """Log a map, uint8 of shape [H, W, 3], as an image, whose first row is on top."""
-        self.stream.log(
-            entity, rr.Image(np.ascontiguousarray(image[::-1])), static=static
-        )
+        flipped = np.ascontiguousarray(image[::-1])
+        self.stream.log(entity, rr.Image(flipped), static=static)
 
     def edges(
         self,
@@ -129,86 +123,71 @@ class Stage:
             **looks: options of both archetypes; `static` logs for all times.
         """
         static = looks.pop("static", False)
-        positions = (
-            [self.lifted(shape, lift_m) for shape in shapes],
-            [self.flat(shape) for shape in shapes],
-        )
-        for entity, kind, drawn, radius in zip(
-            entities, kinds, positions, radii, strict=True
-        ):
-            self.stream.log(entity, kind(drawn, radii=radius, **looks), static=static)
+        lifted = [self.lifted(shape, lift_m) for shape in shapes]
+        flat = [self.flat(shape) for shape in shapes]
+        for index, positions in enumerate((lifted, flat)):
+            drawn = kinds[index](positions, radii=radii[index], **looks)
+            self.stream.log(entities[index], drawn, static=static)
 
     def lifted(self, positions: np.ndarray, lift_m: float = _LIFT_M) -> np.ndarray:
         """Return positions (x, y) of shape [..., 2] with their height over the terrain."""
         height = self.recording.elevation_m[self.cells(positions)] + lift_m
-        return np.concatenate((positions, height[..., None]), axis=-1).astype(
-            np.float32
-        )
+        points = np.concatenate((positions, height[..., None]), axis=-1)
+        return points.astype(np.float32)
 
     def flat(self, positions: np.ndarray) -> np.ndarray:
         """Return positions (x, y) of shape [..., 2] in image coordinates."""
-        return positions / self.recording.resolution_m * (1, -1) + (
-            0,
-            self.recording.grid.height,
-        )
+        cells = positions / self.recording.resolution_m
+        return cells * (1, -1) + (0, self.recording.grid.height)
 
     def cells(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return rows and columns of the cells nearest to positions of shape [..., 2]."""
         shape = np.array(self.recording.grid.shape)
-        indices = np.floor(positions / self.recording.resolution_m).astype(int)[
-            ..., ::-1
-        ]
-        row, column = np.moveaxis(indices.clip(0, shape - 1), -1, 0)
+        indices = np.floor(positions / self.recording.resolution_m).astype(int)
+        on_grid = indices[..., ::-1].clip(0, shape - 1)
+        row, column = np.moveaxis(on_grid, -1, 0)
         return row, column
 
 
 def log_terrain(stage: Stage) -> None:
     """Log the terrain as a mesh, and the common maps: colour, layers, soft spots, λ."""
     recording = stage.recording
-    stream = stage.stream
-    grid = recording.grid
-    rows, columns = np.mgrid[: grid.height, : grid.width]
-    x_m, y_m = ((cells + 0.5) * grid.resolution_m for cells in (columns, rows))
-    corner = (rows * grid.width + columns)[:-1, :-1].ravel()
-    right = corner + 1
-    above = corner + grid.width
-    triangles = np.stack(
-        (corner, right, above, right, above + 1, above), axis=1
-    ).reshape(-1, 3)
-    stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    mesh = rr.Mesh3D(
-        vertex_positions=np.stack((x_m, y_m, recording.elevation_m), axis=-1).reshape(
-            -1, 3
-        ),
-        triangle_indices=triangles,
-        vertex_colors=recording.rgb.reshape(3, -1).T,
-    )
-    stream.log("world/terrain", mesh, static=True)
-    images = {
-        "map/colour": np.moveaxis(recording.rgb, 0, -1),
-        "map/true_mean": shades(recording.true_mean),
-        **{
-            layer_entity(name): layer_colours(name, layer)
-            for name, layer in recording.layers.items()
-        },
-        **({} if recording.field is None else {"map/field": true_colours(recording)}),
-    }
-    for entity, image in images.items():
-        stage.image(entity, image)
+    stage.stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    stage.stream.log("world/terrain", _mesh(recording), static=True)
+    stage.image("map/colour", np.moveaxis(recording.rgb, 0, -1))
+    stage.image("map/true_mean", shades(recording.true_mean))
+    for name, layer in recording.layers.items():
+        stage.image(layer_entity(name), layer_colours(name, layer))
+    if recording.field is not None:
+        stage.image("map/field", true_colours(recording))
     if recording.soft.any():
-        for name, lines in (("outline", outline), ("hatching", hatching)):
-            stage.edges(
-                f"map/soft/{name}",
-                lines(recording.soft, grid.resolution_m),
-                bytes_of(SOFT),
-                0.06,
-            )
+        for name, lines_of in (("outline", outline), ("hatching", hatching)):
+            lines = lines_of(recording.soft, recording.resolution_m)
+            stage.edges(f"map/soft/{name}", lines, bytes_of(SOFT), 0.06)
+    radii = (0.35, 0.7)
     for name, position in (("start", recording.track[0]), ("goal", recording.goal_m)):
         entities = (f"world/{name}", f"map/places/{name}")
         colours = [bytes_of(MARKS[name]["color"])]
-        stage.on_both(
-            entities, _POINTS, [position], (0.35, 0.7), static=True, colors=colours
-        )
+        stage.on_both(entities, _POINTS, [position], radii, static=True, colors=colours)
+
+
+def _mesh(recording: Recording) -> Any:
+    """Return the mesh of the terrain: a vertex per cell, two triangles per square."""
+    grid = recording.grid
+    rows, columns = np.mgrid[: grid.height, : grid.width]
+    x_m = (columns + 0.5) * grid.resolution_m
+    y_m = (rows + 0.5) * grid.resolution_m
+    vertices = np.stack((x_m, y_m, recording.elevation_m), axis=-1)
+    numbers = rows * grid.width + columns
+    corner = numbers[:-1, :-1].ravel()
+    right = corner + 1
+    above = corner + grid.width
+    squares = np.stack((corner, right, above, right, above + 1, above), axis=1)
+    return rr.Mesh3D(
+        vertex_positions=vertices.reshape(-1, 3),
+        triangle_indices=squares.reshape(-1, 3),
+        vertex_colors=recording.rgb.reshape(3, -1).T,
+    )
 
 
 def layer_entity(name: str) -> str:
@@ -219,22 +198,20 @@ def layer_entity(name: str) -> str:
 def log_driver(stream: Any, driver: Driver) -> None:
     """Log all entities of a robot."""
     stage = Stage(stream=stream, recording=driver.recording)
-    for log in (
-        _log_known,
-        _log_robot,
-        _log_series,
-        _log_driven,
-        _log_plans,
-        _log_outcome,
-    ):
-        log(stage, driver)
+    _log_known(stage, driver)
+    _log_robot(stage, driver)
+    _log_series(stage, driver)
+    _log_driven(stage, driver)
+    _log_plans(stage, driver)
+    _log_outcome(stage, driver)
 
 
 def _log_known(stage: Stage, driver: Driver) -> None:
     """Log a planner's λ̂, the edge of non-free cells, and the robot's knowledge."""
     recording = driver.recording
     learns = bool(recording.known)
-    for step in [known_map.step for known_map in recording.known] or [0]:
+    steps = [known_map.step for known_map in recording.known]
+    for step in steps or [0]:
         if learns:
             stage.at(step)
         for name, colours in known_colours(recording, step).items():
@@ -242,81 +219,73 @@ def _log_known(stage: Stage, driver: Driver) -> None:
         _, free = recording.given_at(step)
         edge = outline(~free, recording.resolution_m)
         stage.edges(driver.entity("map/closed"), edge, _CLOSED, 0.08, not learns)
+    entities = driver.entities("reach")
+    line_colours = [driver.colour if driver.name else bytes_of(FOOTPRINT)]
     for known_map in recording.known:
         stage.at(known_map.step)
-        reach = [driver.colour if driver.name else bytes_of(REACH)]
-        stage.on_both(
-            driver.entities("reach"),
-            _STRIPS,
-            known_map.outlines,
-            (0.05, 0.15),
-            colors=reach,
-        )
+        lines = known_map.outlines
+        stage.on_both(entities, _STRIPS, lines, (0.05, 0.15), colors=line_colours)
 
 
 def _log_robot(stage: Stage, driver: Driver) -> None:
     """Log the robot's position and heading at each step."""
     recording = driver.recording
     heading_rad = recording.states[:, 2]
-    colours = [driver.colour]
-    times = rr.TimeColumn(
-        TIMELINE, duration=np.arange(len(heading_rad)) * recording.dt_s
-    )
+    times = _times(recording, len(heading_rad))
+    components = (np.cos(heading_rad), np.sin(heading_rad), 0 * heading_rad)
+    ahead = _HEADING_M * np.stack(components, axis=1)
+    ahead_flat = ahead[:, :2] * (1, -1) / recording.resolution_m
     lifted = stage.lifted(recording.track)
     flat = stage.flat(recording.track)
-    ahead = _HEADING_M * np.stack(
-        (np.cos(heading_rad), np.sin(heading_rad), 0 * heading_rad), axis=1
-    )
-    ahead_flat = ahead[:, :2] * (1, -1) / recording.resolution_m
     for root, dots, arrows, positions, vectors, radius in (
         ("world", rr.Points3D, rr.Arrows3D, lifted, ahead, 0.3),
         ("map/overlay", rr.Points2D, rr.Arrows2D, flat, ahead_flat, 0.7),
     ):
         robot = driver.entity(root, "robot")
+        moving = dots.columns(positions=positions)
+        dot = dots.from_fields(radii=[radius], colors=[driver.colour])
+        stage.stream.send_columns(robot, [times], moving)
+        stage.stream.log(robot, dot, static=True)
         heading = driver.entity(root, "heading")
-        stage.stream.send_columns(robot, [times], dots.columns(positions=positions))
-        stage.stream.send_columns(
-            heading, [times], arrows.columns(origins=positions, vectors=vectors)
-        )
-        stage.stream.log(
-            robot, dots.from_fields(radii=[radius], colors=colours), static=True
-        )
-        stage.stream.log(
-            heading, arrows.from_fields(radii=[radius / 3], colors=colours), static=True
-        )
+        turning = arrows.columns(origins=positions, vectors=vectors)
+        arrow = arrows.from_fields(radii=[radius / 3], colors=[driver.colour])
+        stage.stream.send_columns(heading, [times], turning)
+        stage.stream.log(heading, arrow, static=True)
+
+
+def _times(recording: Recording, count: int) -> Any:
+    """Return the times of the first steps of an episode."""
+    return rr.TimeColumn(TIMELINE, duration=np.arange(count) * recording.dt_s)
 
 
 def _log_series(stage: Stage, driver: Driver) -> None:
     """Log observed and predicted λ, the free threshold, distance to goal, and commands."""
     recording = driver.recording
     positions = recording.track[:-1]
-    times = rr.TimeColumn(TIMELINE, duration=np.arange(len(positions)) * recording.dt_s)
+    n_steps = len(positions)
+    times = _times(recording, n_steps)
+    distance_m = np.linalg.norm(positions - recording.goal_m, axis=1)
     lines = {
         driver.entity("series/traversability", "observed"): recording.traversability,
-        driver.entity("series/goal", "distance"): np.linalg.norm(
-            positions - recording.goal_m, axis=1
-        ),
+        driver.entity("series/goal", "distance"): distance_m,
     }
     if not driver.name:
-        cells = zip(*stage.cells(positions), strict=True)
-        predicted = [
-            recording.given_at(step)[0][cell] for step, cell in enumerate(cells)
-        ]
-        lines["series/traversability/predicted"] = np.array(predicted)
-        lines["series/traversability/threshold"] = np.full(
-            len(positions), recording.free_above
-        )
-        for name, commanded in zip(
-            recording.action_names, recording.actions.T, strict=True
-        ):
+        predicted = np.empty(n_steps)
+        for step, cell in enumerate(zip(*stage.cells(positions), strict=True)):
+            risk_map, _ = recording.given_at(step)
+            predicted[step] = risk_map[cell]
+        threshold = "series/traversability/threshold"
+        lines["series/traversability/predicted"] = predicted
+        lines[threshold] = np.full(n_steps, recording.free_above)
+        commands = zip(recording.action_names, recording.actions.T, strict=True)
+        for name, commanded in commands:
             lines[f"series/command/{rr.escape_entity_path_part(name)}"] = commanded
-        named = f"free: {'mean' if recording.free_by == 'mean' else 'λ̂'} above"
-        style = rr.SeriesLines(colors=[(200, 60, 60)], names=[named])
-        stage.stream.log("series/traversability/threshold", style, static=True)
+        by = "mean" if recording.free_by == "mean" else "λ̂"
+        style = rr.SeriesLines(colors=[(200, 60, 60)], names=[f"free: {by} above"])
+        stage.stream.log(threshold, style, static=True)
     for entity, values in lines.items():
-        stage.stream.send_columns(
-            entity, [times], rr.Scalars.columns(scalars=values.astype(np.float64))
-        )
+        scalars = rr.Scalars.columns(scalars=values.astype(np.float64))
+        stage.stream.send_columns(entity, [times], scalars)
         if driver.name:
             style = rr.SeriesLines(colors=[driver.colour], names=[driver.name])
             stage.stream.log(entity, style, static=True)
@@ -329,16 +298,18 @@ def _log_driven(stage: Stage, driver: Driver) -> None:
     count = len(recording.traversability)
     interval = drawing_interval(recording.dt_s)
     colours = shades(recording.traversability)
-    for piece, first in enumerate(range(0, count, _PIECE * interval)):
-        last = min(first + _PIECE * interval, count)
+    length = _PIECE * interval
+    for piece, first in enumerate(range(0, count, length)):
+        entities = driver.entities(f"driven/{piece:03}")
+        last = min(first + length, count)
         for step in [*range(first + interval, last, interval), last]:
             stage.at(step)
             lines = [positions[first : step + 1]]
+            line_colours: Any = [driver.colour]
             if not driver.name:
                 lines = [positions[k : k + 2] for k in range(first, step)]
-            shown = [driver.colour] if driver.name else colours[first:step]
-            entities = driver.entities(f"driven/{piece:03}")
-            stage.on_both(entities, _STRIPS, lines, (0.08, 0.25), colors=shown)
+                line_colours = colours[first:step]
+            stage.on_both(entities, _STRIPS, lines, (0.08, 0.25), colors=line_colours)
 
 
 def _log_plans(stage: Stage, driver: Driver) -> None:
@@ -354,28 +325,25 @@ def _log_plans(stage: Stage, driver: Driver) -> None:
             if (driver.name and name != "path") or logged.get(name) == content:
                 continue
             logged[name] = content
-            colours = [
-                (*driver.colour[:3], _TRANSLUCENT)
-                if driver.name
-                else bytes_of(style.colour)
-            ]
+            colour = bytes_of(style.colour)
+            if driver.name:
+                colour = (*driver.colour[:3], _TRANSLUCENT)
             radii = (_RADIUS_M * style.width, _RADIUS_CELLS * style.width)
             entities = driver.entities(f"plan/{name}")
-            stage.on_both(entities, _STRIPS, lines, radii, colors=colours)
+            stage.on_both(entities, _STRIPS, lines, radii, colors=[colour])
 
 
 def _log_outcome(stage: Stage, driver: Driver) -> None:
     """Log the outcome at the last position, and a mark if the robot was immobilised."""
     recording = driver.recording
-    words = [
-        f"{driver.name}: {recording.outcome}" if driver.name else recording.outcome
-    ]
+    words = recording.outcome
+    if driver.name:
+        words = f"{driver.name}: {words}"
     stage.at(len(recording.traversability))
-    looks = {"labels": words, "show_labels": True, "colors": [driver.colour]}
+    looks = {"labels": [words], "show_labels": True, "colors": [driver.colour]}
+    entities = driver.entities("outcome")
     end = [recording.track[-1]]
-    stage.on_both(
-        driver.entities("outcome"), _POINTS, end, (0.05, 0.1), _LIFT_M + 0.6, **looks
-    )
+    stage.on_both(entities, _POINTS, end, (0.05, 0.1), _LIFT_M + 0.6, **looks)
     if recording.immobilised_at is not None:
         cross = (recording.immobilised_at + _CROSS_M * _CROSS).astype(np.float32)
         entities = driver.entities("immobilised")

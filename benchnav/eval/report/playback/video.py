@@ -7,6 +7,7 @@ to these the λ field, once for all episodes on the same field.
 import textwrap
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -19,7 +20,7 @@ from benchnav.core.store import replacing
 from benchnav.eval.figures import moment
 from benchnav.eval.recording import Recording
 from benchnav.eval.words import episode_names
-from benchnav.viz import maps
+from benchnav.viz import drives, maps
 from benchnav.viz.style import (
     TEXT,
     condition_colours,
@@ -73,7 +74,7 @@ def write_video(
     if len(recordings) > MAX_CONDITIONS:
         raise ConfigError(
             f"Expected at most {MAX_CONDITIONS} conditions side by side, got "
-            f"{len(recordings)}."
+            f"{len(recordings)}. Select fewer."
         )
     frames = Frames(recordings)
     times = frame_times(max(recording.end_s for recording in recordings))
@@ -82,15 +83,13 @@ def write_video(
         replacing(path) as partial,
         av.open(str(partial), "w", format="mp4", options=faststart) as container,
     ):
-        stream = container.add_stream(
-            "libx264", rate=FRAMES_A_SECOND, options={"crf": "20"}
-        )
+        quality = {"crf": "20"}
+        stream = container.add_stream("libx264", FRAMES_A_SECOND, options=quality)
         stream.width, stream.height = SIZE
         stream.pix_fmt = "yuv420p"
         for done, time_s in enumerate(times, start=1):
-            frame = av.VideoFrame.from_ndarray(
-                frames.draw(float(time_s)), format="rgb24"
-            )
+            image = frames.draw(float(time_s))
+            frame = av.VideoFrame.from_ndarray(image, format="rgb24")
             container.mux(stream.encode(frame))
             yield done, len(times)
         container.mux(stream.encode())
@@ -116,9 +115,9 @@ class Frames:
         self._moving: list[Artist] = []
         count = len(recordings) + len(self._shared)
         extent_m = recordings[0].grid.extent_m
-        self._figure = Figure(
-            figsize=(SIZE[0] / _DPI, SIZE[1] / _DPI), dpi=_DPI, layout="constrained"
-        )
+        width_in = SIZE[0] / _DPI
+        size_in = (width_in, SIZE[1] / _DPI)
+        self._figure = Figure(figsize=size_in, dpi=_DPI, layout="constrained")
         self._canvas = FigureCanvasAgg(self._figure)
         columns = _columns(count, extent_m[1] / extent_m[0])
         panels = [panel for (panel,) in stack_panels(self._figure, count, columns)]
@@ -126,35 +125,32 @@ class Frames:
         self.truths = panels[len(recordings) :]
         names = episode_names([recording.about for recording in recordings])
         planners = [recording.about["planner"] for recording in recordings]
-        self._colours = (
-            condition_colours(planners) if len(recordings) > 1 else ["black"]
-        )
-        letters = int(SIZE[0] / _DPI / (columns + 0.4) / _LETTER_IN)
-        for recording, panel, name, colour in zip(
-            recordings, self.given, names, self._colours, strict=True
+        self._colours = ["black"]
+        if len(recordings) > 1:
+            self._colours = condition_colours(planners)
+        letters = int(width_in / (columns + 0.4) / _LETTER_IN)
+        for index, (recording, panel) in enumerate(
+            zip(recordings, self.given, strict=True)
         ):
-            _title(
-                panel, f"{name}\n{moment.known_in_words(recording)}", letters, colour
-            )
+            title = f"{names[index]}\n{moment.known_in_words(recording)}"
+            _title(panel, title, letters, self._colours[index])
             if not recording.known:
                 moment.show_known(panel, recording, 0)
         for panel, indices in zip(self.truths, self._shared, strict=True):
-            is_field = recordings[indices[0]].field is not None
-            heading = "mean of λ, resampled at each step"
-            if is_field:
-                heading = "λ field of the episode"
-            of = (
-                "; ".join(names[index] for index in indices)
-                if len(self._shared) > 1
-                else ""
-            )
-            _title(panel, f"{heading}\n{of}", letters)
-            moment.show_truth(panel, recordings[indices[0]])
+            recording = recordings[indices[0]]
+            heading = "λ field of the episode"
+            if recording.field is None:
+                heading = "mean of λ, resampled at each step"
+            conditions = ""
+            if len(self._shared) > 1:
+                conditions = "; ".join(names[index] for index in indices)
+            _title(panel, f"{heading}\n{conditions}", letters)
+            moment.show_truth(panel, recording)
         for panel in panels:
             panel.axis("off")
         maps.draw_scale(panels[-1], extent_m)
-        about = "{data}, {scenario}, map {map}".format(**recordings[0].about)
-        words = f"{about}; {SPEED:g} × as fast as driven"
+        map_name = "{data}, {scenario}, map {map}".format(**recordings[0].about)
+        words = f"{map_name}; {SPEED:g} × as fast as driven"
         self._figure.suptitle(words, x=0.01, ha="left", parse_math=False)
         placement: dict[str, float | str] = {
             "x": 0.99,
@@ -165,9 +161,8 @@ class Frames:
         }
         self.time = self._figure.text(**placement, family="monospace", animated=True)  # type: ignore[arg-type]
         maps.draw_bar(self._figure, "traversability λ, λ̂", aspect=30)
-        for time_s in np.linspace(
-            0, max(recording.end_s for recording in recordings), _MOMENTS
-        ):
+        end_s = max(recording.end_s for recording in recordings)
+        for time_s in np.linspace(0, end_s, _MOMENTS):
             self._put(float(time_s))
         legend_outside(self._figure, columns=5)
         engine = self._figure.get_layout_engine()
@@ -188,9 +183,11 @@ class Frames:
         self._canvas.restore_region(self._background)
         self._clear()
         self._put(time_s)
-        for artist in [self.time, *sorted(self._moving, key=Artist.get_zorder)]:
+        by_depth = sorted(self._moving, key=Artist.get_zorder)
+        for artist in (self.time, *by_depth):
             self._figure.draw_artist(artist)
-        return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
+        pixels = np.asarray(self._canvas.buffer_rgba())
+        return pixels[..., :3].copy()
 
     def _clear(self) -> None:
         for artist in self._moving:
@@ -199,9 +196,7 @@ class Frames:
 
     def _put(self, time_s: float) -> None:
         """Draw the contents of all panels at a time."""
-        before = {
-            artist for panel in self._figure.axes for artist in panel.get_children()
-        }
+        before = set(self._artists())
         self.time.set_text(f"t = {time_s:5.1f} s")
         for index, (panel, recording) in enumerate(
             zip(self.given, self._recordings, strict=True)
@@ -211,51 +206,42 @@ class Frames:
                 moment.show_known(panel, recording, step)
             moment.draw_plan(panel, recording, step)
             self._put_robot(panel, index, step)
-            text = ""
-            if step:
-                text = (
-                    "observed λ = "
-                    f"{recording.traversability[min(step, len(recording.traversability) - 1)]:.2f}"
-                )
-            text = (
-                f"{recording.outcome}, {recording.end_s:.1f} s"
-                if moment.has_ended(recording, step)
-                else text
-            )
-            panel.text(
-                1,
-                -0.02,
-                text,
-                transform=panel.transAxes,
-                ha="right",
-                va="top",
-                size=TEXT,
-            )
+            corner: dict[str, Any] = {"transform": panel.transAxes, "ha": "right"}
+            words = _state_in_words(recording, step)
+            panel.text(1, -0.02, words, va="top", size=TEXT, **corner)
         for panel, indices in zip(self.truths, self._shared, strict=True):
             for index in indices:
-                self._put_robot(panel, index, _step(self._recordings[index], time_s))
-        after = (
+                step = _step(self._recordings[index], time_s)
+                self._put_robot(panel, index, step)
+        new = [artist for artist in self._artists() if artist not in before]
+        self._moving += new
+
+    def _artists(self) -> list[Artist]:
+        return [
             artist for panel in self._figure.axes for artist in panel.get_children()
-        )
-        self._moving += [artist for artist in after if artist not in before]
+        ]
 
     def _put_robot(self, panel: Axes, index: int, step: int) -> None:
         several = len(self._recordings) > 1
         label = "driven, in the colour of its title" if several else "driven"
         drive = moment.drive_at(self._recordings[index], step)
-        maps.draw_drive(
-            panel,
-            drive,
-            1.8,
-            colour=self._colours[index],
-            ls=line_style(index),
-            label=label,
-        )
+        look = {"colour": self._colours[index], "ls": line_style(index)}
+        drives.draw_drive(panel, drive, 1.8, label=label, **look)
 
 
 def _step(recording: Recording, time_s: float) -> int:
     """Return the step of an episode at a time; the last once it has ended."""
-    return min(int(time_s / recording.dt_s + 1e-6), len(recording.traversability))
+    step = int(time_s / recording.dt_s + 1e-6)
+    return min(step, len(recording.traversability))
+
+
+def _state_in_words(recording: Recording, step: int) -> str:
+    """Return the outcome of an ended episode, or else the observed λ."""
+    if moment.has_ended(recording, step):
+        return f"{recording.outcome}, {recording.end_s:.1f} s"
+    if not step:
+        return ""
+    return f"observed λ = {recording.traversability[step]:.2f}"
 
 
 def _columns(count: int, ratio: float) -> int:
@@ -271,9 +257,9 @@ def _columns(count: int, ratio: float) -> int:
 
 def _title(panel: Axes, words: str, letters: int, colour: str = "black") -> None:
     """Set the title of a panel, wrapped to a number of letters."""
-    lines = [
-        line for part in words.splitlines() for line in textwrap.wrap(part, letters)
-    ]
+    lines: list[str] = []
+    for line in words.splitlines():
+        lines += textwrap.wrap(line, letters)
     panel.set_title("\n".join(lines), color=colour, parse_math=False)
 
 
@@ -281,5 +267,6 @@ def _groups_of_truth(recordings: Sequence[Recording]) -> list[list[int]]:
     """Return indices of recordings, grouped by equal true λ."""
     groups: dict[bytes, list[int]] = {}
     for index, recording in enumerate(recordings):
-        groups.setdefault(moment.true_colours(recording).tobytes(), []).append(index)
+        content = moment.true_colours(recording).tobytes()
+        groups.setdefault(content, []).append(index)
     return list(groups.values())

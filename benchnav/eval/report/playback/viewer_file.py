@@ -40,7 +40,7 @@ _ALONE = "#00aa00"
 _LEARNT = {
     "mean": "Belief: mean of λ",
     "spread": f"Belief: spread of λ, 0 to {MAX_SPREAD:g}",
-    "seen": "Seen light, λ sensed blue",
+    "seen": "Observed cells light, measured λ blue",
 }
 _ALL = "/map/overlay/**"
 _PLACES = "/map/places/**"
@@ -52,12 +52,12 @@ def write_viewer_files(folder: Path) -> None:
     Args:
         folder: the run folder.
     """
-    files = [
-        path.with_suffix(".rrd") for path in sorted((folder / "playback").glob("*.npz"))
-    ]
-    for file in files:
+    files = []
+    for stored in sorted((folder / "playback").glob("*.npz")):
+        file = stored.with_suffix(".rrd")
+        files.append(file)
         if not file.exists() or not is_as_noted(folder, file):
-            write_rerun([Recording.load(file.with_suffix(".npz"))], file)
+            write_rerun([Recording.load(stored)], file)
     note_checksums(folder, files)
 
 
@@ -78,11 +78,8 @@ def write_rerun(recordings: Sequence[Recording], path: Path) -> None:
         stream.save(partial, default_blueprint=arrange(drivers))
         try:
             stream.send_recording_name(_title(drivers))
-            stream.log(
-                "about",
-                rr.TextDocument(describe(drivers), media_type="text/markdown"),
-                static=True,
-            )
+            text = rr.TextDocument(describe(drivers), media_type="text/markdown")
+            stream.log("about", text, static=True)
             log_terrain(Stage(stream=stream, recording=recordings[0]))
             for driver in drivers:
                 log_driver(stream, driver)
@@ -95,24 +92,22 @@ def drivers_of(recordings: Sequence[Recording]) -> list[Driver]:
     """Return drivers with unique names and colours; a single one has no name."""
     if len(recordings) == 1:
         return [Driver(recording=recordings[0], name="", colour=bytes_of(_ALONE))]
-    identities = [recording.about for recording in recordings]
-    colours = condition_colours([identity["planner"] for identity in identities])
-    return [
-        Driver(recording=recording, name=name, colour=bytes_of(colour))
-        for recording, name, colour in zip(
-            recordings, contender_names(identities), colours, strict=True
-        )
-    ]
+    labels = [recording.about for recording in recordings]
+    names = contender_names(labels)
+    colours = condition_colours([of_one["planner"] for of_one in labels])
+    drivers = []
+    for recording, name, colour in zip(recordings, names, colours, strict=True):
+        driver = Driver(recording=recording, name=name, colour=bytes_of(colour))
+        drivers.append(driver)
+    return drivers
 
 
 def _title(drivers: Sequence[Driver]) -> str:
     if len(drivers) == 1:
         return drivers[0].recording.title
-    identity = drivers[0].recording.about
-    return (
-        f"{identity['scenario']} {identity['map']}: "
-        f"{', '.join(driver.name for driver in drivers)}"
-    )
+    labels = drivers[0].recording.about
+    names = ", ".join(driver.name for driver in drivers)
+    return f"{labels['scenario']} {labels['map']}: {names}"
 
 
 def arrange(drivers: Sequence[Driver]) -> Any:
@@ -128,23 +123,19 @@ def arrange(drivers: Sequence[Driver]) -> Any:
     title = "All conditions"
     if len(drivers) == 1:
         title = drivers[0].recording.title
-        series.insert(1, rrb.TimeSeriesView(name="Commanded", origin="/series/command"))
-    flat = [
+        commands = rrb.TimeSeriesView(name="Commanded", origin="/series/command")
+        series.insert(1, commands)
+    terrain = rrb.Spatial3DView(name=title, origin="/world")
+    description = rrb.TextDocumentView(name="About", origin="/about")
+    below = rrb.Horizontal(*series, description)
+    scene = rrb.Vertical(terrain, below, row_shares=[3, 1])
+    maps = [
         rrb.Spatial2DView(name=name, origin="/map", contents=contents)
         for name, contents in map_views(drivers).items()
     ]
+    grid = rrb.Grid(*maps, grid_columns=2)
     return rrb.Blueprint(
-        rrb.Horizontal(
-            rrb.Vertical(
-                rrb.Spatial3DView(name=title, origin="/world"),
-                rrb.Horizontal(
-                    *series, rrb.TextDocumentView(name="About", origin="/about")
-                ),
-                row_shares=[3, 1],
-            ),
-            rrb.Grid(*flat, grid_columns=2),
-            column_shares=[1, 1],
-        ),
+        rrb.Horizontal(scene, grid, column_shares=[1, 1]),
         rrb.TimePanel(timeline=TIMELINE, state="collapsed"),
         rrb.SelectionPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),
@@ -154,37 +145,25 @@ def arrange(drivers: Sequence[Driver]) -> Any:
 def map_views(drivers: Sequence[Driver]) -> dict[str, list[str]]:
     """Return the entities that each view of a map shows, by its title."""
     recording = drivers[0].recording
-    closed = ["/map/closed"] if len(drivers) == 1 else []
-    colour = "Colour, soft ground hatched" if recording.soft.any() else "Colour"
-    views = {
-        colour: ["/map/colour", "/map/soft/**", _ALL, _PLACES],
-        **{
-            layer_title(name, layer): [f"/{layer_entity(name)}", _ALL, _PLACES]
-            for name, layer in recording.layers.items()
-        },
-        "True mean of λ": ["/map/true_mean", *closed, _ALL, _PLACES],
-    }
+    is_single = len(drivers) == 1
+    overlays = [_ALL, _PLACES]
+    on_truth = ["/map/closed", *overlays] if is_single else overlays
+    colour = "Colour, soft terrain hatched" if recording.soft.any() else "Colour"
+    views = {colour: ["/map/colour", "/map/soft/**", *overlays]}
+    for name, layer in recording.layers.items():
+        views[layer_title(name, layer)] = [f"/{layer_entity(name)}", *overlays]
+    views["True mean of λ"] = ["/map/true_mean", *on_truth]
     if recording.field is not None:
-        views["λ field of the episode; dark red immobilises a robot"] = [
-            "/map/field",
-            *closed,
-            _ALL,
-            _PLACES,
-        ]
+        title = "λ field of the episode; dark red immobilises a robot"
+        views[title] = ["/map/field", *on_truth]
     for driver in drivers:
-        name = (
-            f"λ̂ given to {driver.name or 'the planner'}, free: "
-            f"{free_rule(driver.recording)}"
-        )
-        views[name] = [
-            driver.entity("/map/risk"),
-            driver.entity("/map/overlay", "**"),
-            _PLACES,
-        ]
-    if len(drivers) == 1 and recording.known:
-        views |= {
-            title: [f"/map/{name}", _ALL, _PLACES] for name, title in _LEARNT.items()
-        }
+        planner = driver.name or "the planner"
+        title = f"λ̂ given to {planner}, free: {free_rule(driver.recording)}"
+        overlay = driver.entity("/map/overlay", "**")
+        views[title] = [driver.entity("/map/risk"), overlay, _PLACES]
+    if is_single and recording.known:
+        for name, title in _LEARNT.items():
+            views[title] = [f"/map/{name}", *overlays]
     return views
 
 
@@ -198,38 +177,31 @@ def layer_title(name: str, layer: np.ndarray) -> str:
 
 def describe(drivers: Sequence[Driver]) -> str:
     """Describe the episodes in Markdown: labels, outcomes, and the rule of free space."""
-    identity = drivers[0].recording.about
     recordings = [driver.recording for driver in drivers]
-    labels = {
-        name: [
-            reading_name(name, recording.about.get(name, NOT_USED))
-            for recording in recordings
-        ]
-        for name in NAMING
-    }
     rows: dict[str, Sequence[str]] = {}
-    for name, cells in labels.items():
+    for name in NAMING:
+        labels = [recording.about.get(name, NOT_USED) for recording in recordings]
+        cells = [reading_name(name, label) for label in labels]
         if set(cells) != {NOT_USED}:
             rows[name] = cells
     rows["outcome"] = [Bold(recording.outcome) for recording in recordings]
-    rows["time"] = [
-        f"{recording.end_s:.1f} s of {recording.time_budget_s:g} s"
-        for recording in recordings
-    ]
-    rows["observed λ"] = [
-        _mean_in_words(recording.traversability) for recording in recordings
-    ]
+    rows["time"] = [_time_in_words(recording) for recording in recordings]
+    observed = [recording.traversability for recording in recordings]
+    rows["observed λ"] = list(map(_mean_in_words, observed))
     rows["free"] = [free_rule(recording) for recording in recordings]
+    names = [driver.name for driver in drivers]
     table = Table(
-        headings=("", *(driver.name for driver in drivers)),
+        headings=("", *names),
         rows=tuple((name, *cells) for name, cells in rows.items()),
     )
-    lines = [
-        f"# {identity['data']}, {identity['scenario']} {identity['map']}",
-        f"Seed {identity['seed']}, realisation {identity['realisation']}",
-        to_markdown(table),
-    ]
-    return "\n\n".join(lines)
+    template = (
+        "# {data}, {scenario} {map}\n\nSeed {seed}, realisation {realisation}\n\n"
+    )
+    return template.format(**recordings[0].about) + to_markdown(table)
+
+
+def _time_in_words(recording: Recording) -> str:
+    return f"{recording.end_s:.1f} s of {recording.time_budget_s:g} s"
 
 
 def _mean_in_words(traversability: np.ndarray) -> str:

@@ -53,7 +53,8 @@ def serve(path: Path) -> None:
     try:
         _wait_for(page, viewer)
         _wait_for(data, viewer)
-        address = f"http://{HOST}:{page}?url={quote(f'rerun+http://{HOST}:{data}/proxy', safe='')}"
+        source = quote(f"rerun+http://{HOST}:{data}/proxy", safe="")
+        address = f"http://{HOST}:{page}?url={source}"
         print(f"viewer:  {address}\nCtrl-C ends it", flush=True)
         viewer.wait()
     except KeyboardInterrupt:

@@ -265,9 +265,9 @@ def test_the_map_changes_when_more_is_known_and_only_then() -> None:
     np.testing.assert_array_equal(
         panel.collections[0].get_segments(), hatching(~known.seen, 0.5)
     )
-    reach = labelled(panel)["reach of the sensors"]
+    reach = labelled(panel)["footprint of the sensors"]
     np.testing.assert_array_equal(np.transpose(reach.get_data()), known.outline)
-    assert "λ̂ known by then" in words_of(panel)
+    assert "λ̂ of the belief at that time" in words_of(panel)
     # Back in time as well.
     assert np.array_equal(frames.draw(0.4), shown[1])
 
@@ -290,7 +290,10 @@ def test_ground_that_was_not_seen_lies_under_a_veil() -> None:
 
 
 def test_the_legend_names_what_learning_shows() -> None:
-    learning, words = made.learning_recording(20), {"not seen", "reach of the sensors"}
+    learning, words = (
+        made.learning_recording(20),
+        {"not observed", "footprint of the sensors"},
+    )
     assert words < named(learning)
     seen = replace(
         learning.known[0], seen=np.ones((40, 60), bool), outline=np.empty((0, 2))
