@@ -1,6 +1,5 @@
-"""The studies of the documentation: a folder each, with its suites, hypotheses, scripts
-and rows.
+"""Studies of the documentation; each has a folder of suites, hypotheses, scripts, rows.
 
-`python -m studies NAME` repeats one. `NAME/study.yaml` says what it consists of;
-`study.py` describes that file.
+`python -m studies NAME` repeats one. `NAME/study.yaml` lists its parts; `study.py`
+describes the format of that file.
 """

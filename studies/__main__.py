@@ -2,15 +2,15 @@
 page.
 
     python -m studies knowledge                    # maps, runs, report
-    python -m studies knowledge maps               # make the maps, or check the digests of those there
-    python -m studies knowledge develop            # the hypotheses on maps to develop on; then their power
+    python -m studies knowledge maps               # create missing maps; check the digests of all
+    python -m studies knowledge develop            # run the hypotheses on development maps; print their power
     python -m studies knowledge power
     python -m studies knowledge run primary known  # resumes if it was interrupted
-    python -m studies knowledge report             # tables and figures of the page
-    python -m studies knowledge keep               # summaries and rows of finished runs into the study's folder
+    python -m studies knowledge report             # write tables and figures of the page
+    python -m studies knowledge keep               # copy rows of finished runs into the study's folder
 
-Maps and runs lie in the folders `--maps_in` and `--out`. With `--maps` only the first
-maps are driven.
+Maps are stored in the folder `--maps_in`, runs in the folder `--out`. With `--maps N`
+only the first N maps are run.
 """
 
 import argparse
@@ -34,7 +34,7 @@ def main(words: list[str] | None = None) -> int:
     )
     names = sorted(path.parent.name for path in HOME.glob("*/study.yaml"))
     parser.add_argument(
-        "study", help=f"{', '.join(names)}; or a folder with a study.yaml"
+        "study", help=f"{', '.join(names)}; or a folder that has a study.yaml"
     )
     parser.add_argument("what", nargs="?", choices=_WHATS, default="all")
     parser.add_argument("parts", nargs="*", help="parts of the study; if empty, all")
@@ -45,19 +45,19 @@ def main(words: list[str] | None = None) -> int:
         "--maps_in", type=Path, default=Path("datasets"), help="folder of the maps"
     )
     parser.add_argument(
-        "--maps", type=int, default=0, help="number of maps; if 0, as the suites say"
+        "--maps", type=int, default=0, help="number of maps; if 0, that of the suites"
     )
     parser.add_argument("--jobs", type=int, default=2, help="number of processes")
-    given = parser.parse_args(words)
+    arguments = parser.parse_args(words)
     try:
-        study = Study.load(given.study)
+        study = Study.load(arguments.study)
         work = Work(
-            out=given.out.resolve(),
-            maps_in=given.maps_in.resolve(),
-            maps=given.maps,
-            jobs=given.jobs,
+            out=arguments.out.resolve(),
+            maps_in=arguments.maps_in.resolve(),
+            maps=arguments.maps,
+            jobs=arguments.jobs,
         )
-        _do(given.what, study, study.choose(given.parts), work)
+        _do(arguments.what, study, study.choose(arguments.parts), work)
     except BenchnavError as error:
         print(f"{parser.prog}: error: {error}", file=sys.stderr)
         return error.status

@@ -1,6 +1,4 @@
-"""Curves with intervals over rows of summaries, as the figures of the studies show
-them.
-"""
+"""Curves with intervals over rows of summaries, for the figures of the studies."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -11,7 +9,7 @@ from matplotlib.figure import Figure
 
 from benchnav.viz import Curves, legend_outside, line_looks
 
-# Columns of a summary with their ends, factor and label.
+# Columns of a summary (value, lower and upper end), factor to the label's unit, label.
 SUCCESS = ("success_rate", "success_low", "success_high"), 100.0, "success [%]"
 TOTAL_TIME = (
     ("total_time_mean_s", "total_time_low_s", "total_time_high_s"),
@@ -21,9 +19,7 @@ TOTAL_TIME = (
 
 
 def in_units(row: Any, measure: Any) -> list[Any]:
-    """Return a measure of a row, or of rows, and the ends of its interval, in the units
-    of its label.
-    """
+    """Return a measure and the ends of its interval, in the unit of its label."""
     columns, factor, _ = measure
     return [factor * row[column] for column in columns]
 
@@ -35,18 +31,18 @@ def draw_curves(
     across: int = 2,
     high_in: float = 2.0,
 ) -> tuple[Figure, dict[tuple[str, str], Axes]]:
-    """Draw measures of conditions with 95 % intervals, a marker each, and a legend.
+    """Draw measures of conditions as markers with 95 % intervals, and a legend.
 
     Args:
-        rows: rows of a summary with `panel`, `line` and `x`; a curve joins the rows of
-            a line as they stand.
-        measures: by name, such as `SUCCESS`.
-        x_label: of the axes.
-        across: panels side by side.
+        rows: rows of a summary with the columns `panel`, `line` and `x`; a curve joins
+            the rows of one line in their order.
+        measures: measures such as `SUCCESS`, by name.
+        x_label: label of the x axes.
+        across: number of panels next to each other.
         high_in: height of a panel in inches.
 
     Returns:
-        The figure, and its panels by `panel` and measure.
+        The figure, and its axes by (`panel`, measure).
     """
     table, labels = rows.copy(), {}
     for name, measure in measures.items():

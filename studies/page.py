@@ -1,8 +1,8 @@
-"""Writing the tables and the figures of a study's page.
+"""Tables and figures of a study's page.
 
-A table stands between `<!-- KIND RUN -->` and `<!-- end -->`, which may be indented, as
-in a fold. `RUN` names a run of the study. A table or figure whose run is missing stays
-as it is.
+A table is between the lines `<!-- KIND RUN -->` and `<!-- end -->`, which may be
+indented (for example in a fold). `RUN` is the name of a run of the study. A table or
+figure whose run is missing is not changed.
 """
 
 import re
@@ -29,7 +29,7 @@ FIGURES = ROOT / "docs" / "figures"
 
 
 def report(study: Study, work: Work) -> None:
-    """Write the tables and figures of the page, and print the power where it is known."""
+    """Write the tables and figures of the page; print the power if it can be computed."""
     if (fixed := study.folder / "primary.yaml").exists():
         print(f"primary.yaml {digest_of(fixed)}")
     page = ROOT / study.page
@@ -40,7 +40,7 @@ def report(study: Study, work: Work) -> None:
 
 
 def with_tables(text: str, study: Study, work: Work) -> str:
-    """Return the text of a page with the tables of this study's runs."""
+    """Return the text of a page with updated tables of this study's runs."""
     parts = {study.run_of(part): part for part in study.parts}
 
     def written(block: re.Match[str]) -> str:
@@ -49,9 +49,9 @@ def with_tables(text: str, study: Study, work: Work) -> str:
             return block.group()
         table = _table(study, parts[run], kind, rows.folder_of(study, run, work))
         if table is None:
-            print(f"left as it is: {kind} {run}")
+            print(f"not changed: {kind} {run}")
             return block.group()
-        # In a fold a table needs empty lines around it.
+        # In a fold, a table needs empty lines around it.
         body = f"\n{table.rstrip()}\n" if margin else table.rstrip()
         return indent(f"<!-- {kind} {run} -->\n{body}\n<!-- end -->", margin)
 
@@ -59,10 +59,10 @@ def with_tables(text: str, study: Study, work: Work) -> str:
 
 
 def _table(study: Study, part: str, kind: str, folder: Path) -> str | None:
-    """Return a table of a part as Markdown; None where what it is made of is missing.
+    """Return a table of a part as Markdown; None if its input is missing.
 
     Raises:
-        ConfigError: If there is no such kind.
+        ConfigError: If `kind` is not a kind of table.
     """
     if study.parts[part].script:
         stored = folder / f"{kind}.md"
@@ -89,7 +89,7 @@ def draw_figures(study: Study, work: Work) -> None:
             else [folder / rows.SUMMARY for folder in folders]
         )
         if not all(file.exists() for file in needed):
-            print(f"left as it is: {name}")
+            print(f"not changed: {name}")
         elif drawing.copy:
             shutil.copyfile(needed[0], path)
         else:

@@ -1,4 +1,4 @@
-"""Power of the hypotheses of a study, by what was found on maps to develop on."""
+"""Power of the hypotheses of a study, from estimates on its development maps."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -19,10 +19,11 @@ ALPHA, POWER = 0.05, 0.8
 def power(study: Study, work: Work) -> str:
     """Return a table of the power of each hypothesis, as Markdown.
 
-    It is of the first and the last place of Holm's correction, if the difference is the
-    one that was found; of equivalence and non-inferiority also if there is none. Of a
-    difference the table has the smallest one that is shown with a power of 0.8 in the
-    first place too.
+    The power is given at the first and the last step of Holm's correction, assuming
+    that the true difference is the estimate on the development maps. For equivalence
+    and non-inferiority it is also given assuming no difference. For tests of a
+    difference the table has the smallest difference that the first step detects with a
+    power of 0.8.
     """
     maps = yaml.safe_load(study.suite_of("primary").read_text())["maps"]
     tests = read_report(developed(study, work)).tests.to_dict("records")
@@ -34,7 +35,7 @@ def power(study: Study, work: Work) -> str:
 
 
 def _row(test: Mapping[Any, Any], n_tests: int, maps: int) -> dict[str, str]:
-    """Return the cells of a hypothesis, one of `n_tests`, on so many maps."""
+    """Return the cells of one of `n_tests` hypotheses, tested on `maps` maps."""
     error = (
         (test["high"] - test["low"])
         / 2
@@ -69,10 +70,10 @@ def power_of(
     """Return the probability that a hypothesis is supported.
 
     Args:
-        test: with `kind`, `direction` and `margin`.
-        error: standard error of the estimate, which is normal.
-        alpha: level of the test.
-        difference: the true one.
+        test: row of a hypothesis with `kind`, `direction` and `margin`.
+        error: standard error of the estimate, whose distribution is taken as normal.
+        alpha: significance level.
+        difference: true difference.
     """
     kind, margin = test["kind"], test["margin"]
     if kind == "equivalence":
@@ -81,7 +82,7 @@ def power_of(
             for away in (difference, -difference)
         )
         return max(0.0, float(sum(norm.cdf(end) for end in ends)) - 1)
-    # Of a difference in either direction the side that it lies on counts.
+    # A test in both directions can only support the side of the true difference.
     gain = (
         difference * (-1 if test["direction"] == "lower" else 1)
         if test["direction"]

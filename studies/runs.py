@@ -1,4 +1,4 @@
-"""Making the maps of a study, and running its parts."""
+"""Maps of a study and runs of its parts."""
 
 import contextlib
 import hashlib
@@ -24,14 +24,15 @@ DEVELOPED_MAPS = 200
 
 
 def command(program: str, *words: object) -> None:
-    """Run one of our commands from the root of the repository, where paths of parts
-    begin.
+    """Run a command of the package from the root, to which paths of parts are relative.
+
+    If the command fails, exit with its status.
     """
     started = time.perf_counter()
     if code := subprocess.run(
         [Path(sys.executable).with_name(program), *map(str, words)], cwd=ROOT
     ).returncode:
-        sys.exit(code)  # it has said why
+        sys.exit(code)  # the command has printed its error
     print(
         f"-- {program} {' '.join(map(str, words[:3]))}: "
         f"{time.perf_counter() - started:.0f} s",
@@ -40,10 +41,10 @@ def command(program: str, *words: object) -> None:
 
 
 def make_maps(study: Study, work: Work) -> None:
-    """Make the maps that are missing, and check the digests of all.
+    """Create the missing maps, and check the digests of all.
 
     Raises:
-        ConfigError: If maps have another digest than the study was fixed with.
+        ConfigError: If a digest differs from that of the study.
     """
     work.maps_in.mkdir(parents=True, exist_ok=True)
     for name, maps in study.maps.items():
@@ -69,7 +70,7 @@ def make_maps(study: Study, work: Work) -> None:
 
 
 def run(study: Study, parts: list[str], work: Work) -> None:
-    """Run parts, one after another."""
+    """Run parts in this order."""
     for part in parts:
         if study.parts[part].script:
             _run_script(study, part, work)
@@ -78,7 +79,7 @@ def run(study: Study, parts: list[str], work: Work) -> None:
 
 
 def drive(suite: dict[str, Any], folder: Path, jobs: int) -> None:
-    """Run a suite into a folder, or the units that are missing there."""
+    """Run the units of a suite that are missing in a folder."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     config = folder.with_name(f"{folder.name}.yaml")
     config.write_text(yaml.safe_dump(suite, sort_keys=False, allow_unicode=True))
@@ -86,15 +87,13 @@ def drive(suite: dict[str, Any], folder: Path, jobs: int) -> None:
 
 
 def _run_script(study: Study, part: str, work: Work) -> None:
-    """Call the function of a part, and store each result as NAME.md, NAME.csv or
-    NAME.png.
-    """
-    folder, about = work.out / study.run_of(part), study.parts[part]
+    """Call a part's script; store results as NAME.png, NAME.md or NAME.md and NAME.csv."""
+    folder, settings = work.out / study.run_of(part), study.parts[part]
     folder.mkdir(parents=True, exist_ok=True)
-    options = {**about.options, **({"maps": work.maps} if work.maps else {})}
-    # Shipped maps and models are found from the root.
+    options = {**settings.options, **({"maps": work.maps} if work.maps else {})}
+    # Paths of shipped maps and models are relative to the root.
     with contextlib.chdir(ROOT), one_thread():
-        results = study.function(about.script)(work, folder, **options)
+        results = study.function(settings.script)(work, folder, **options)
     for name, result in results.items():
         path = folder / name
         if isinstance(result, Figure):
@@ -111,7 +110,7 @@ def _run_script(study: Study, part: str, work: Work) -> None:
 
 
 def table_of(rows: pd.DataFrame) -> Table:
-    """Return rows as a table, numbers with four digits."""
+    """Return rows as a table, with floats of four significant digits."""
     cells = rows.map(
         lambda value: f"{value:.4g}" if isinstance(value, float) else str(value)
     )
@@ -122,23 +121,27 @@ def table_of(rows: pd.DataFrame) -> Table:
 
 
 def develop(study: Study, work: Work) -> None:
-    """Run the conditions of the hypotheses on the maps that they were developed on.
+    """Run the conditions of the hypotheses on the study's development maps.
 
     Raises:
-        ConfigError: If the study names no such maps.
+        ConfigError: If the study has no development maps.
     """
-    expect(study.develop, f"a study with maps to develop on, got {study.name}.")
-    suite = study.suite("primary", work)
-    on = {"data": str(work.maps_in / f"{study.develop}.h5"), "seed": study.seed}
-    drive(
-        suite | on | {"maps": min(DEVELOPED_MAPS, suite["maps"])},
-        developed(study, work),
-        work.jobs,
+    expect(
+        study.develop,
+        f"a study with development maps (`develop`), got {study.name}. Name them in "
+        "its study.yaml.",
     )
+    suite = study.suite("primary", work)
+    changes = {
+        "data": str(work.maps_in / f"{study.develop}.h5"),
+        "seed": study.seed,
+        "maps": min(DEVELOPED_MAPS, suite["maps"]),
+    }
+    drive(suite | changes, developed(study, work), work.jobs)
 
 
 def developed(study: Study, work: Work) -> Path:
-    """Return the folder of the run on maps to develop on."""
+    """Return the folder of the run on the development maps."""
     return work.out / f"{study.name}-developed"
 
 

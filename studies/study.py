@@ -1,9 +1,9 @@
-"""What a study consists of, as its file `study.yaml` says.
+"""Studies and their parts, read from `study.yaml`.
 
 A study has parts. A part is a suite, which is run into a folder, or a script of the
-study, which computes tables and figures. Suites whose digest stands on a page keep
-their bytes: paths in them are those of the day when they were fixed. `moved` says where
-such a file is today, and the suite that is run names that.
+study, which computes tables and figures. A suite whose digest is printed on a page must
+not change, so its paths are those of the time when it was fixed. `moved` maps them to
+current paths, which replace them when the suite is run.
 """
 
 import importlib
@@ -21,18 +21,18 @@ from benchnav.eval.cli import SUITES
 ROOT = Path(__file__).parents[1]
 HOME = ROOT / "studies"
 
-# Rows of a table: cells by heading.
+# Rows of a table; each maps headings to cells.
 Rows = list[dict[str, Any]]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Work:
-    """Where a study is run, and how much of it.
+    """Folders and extent of the work on a study.
 
     Args:
         out: folder of the runs.
         maps_in: folder of the maps.
-        maps: number of maps of each condition, the first ones; if 0, as the suites say.
+        maps: number of maps per condition, from the first; if 0, that of the suites.
         jobs: number of processes.
     """
 
@@ -47,14 +47,14 @@ class Part:
     """A part of a study.
 
     Args:
-        suite: name of its suite in the study's folder, or of a shipped one; if empty,
-            the part's name.
-        script: `MODULE:FUNCTION` of the study's folder, in place of a suite; called
-            with the `Work`, the run's folder and the options, it returns figures,
-            tables (rows or Markdown) by name.
-        options: of the script.
+        suite: name of a suite in the study's folder or of a shipped one; if empty, the
+            part's name.
+        script: `MODULE:FUNCTION` in the study's folder, instead of a suite; called with
+            the `Work`, the run's folder and the options, it returns figures and tables
+            (rows or Markdown) by name.
+        options: options of the script.
         run: name of the run; if empty, `STUDY-PART`.
-        maps: number of maps of each condition, the first ones; if 0, as the suite says.
+        maps: number of maps per condition, from the first; if 0, that of the suite.
     """
 
     suite: str = ""
@@ -66,12 +66,12 @@ class Part:
 
 @dataclass(frozen=True, kw_only=True)
 class Maps:
-    """Maps of a study.
+    """Dataset of a study.
 
     Args:
-        create: words of `benchnav-datagen create`.
-        splits: the splits to make; the digest is of the first.
-        digest: of the content; if empty, any.
+        create: arguments of `benchnav-datagen create`.
+        splits: splits to create; the digest is that of the first.
+        digest: digest of the content; if empty, not checked.
     """
 
     create: tuple[str, ...]
@@ -81,13 +81,13 @@ class Maps:
 
 @dataclass(frozen=True, kw_only=True)
 class Drawing:
-    """How a figure of the page comes about.
+    """Source of a figure of the page: a file to copy, or a function that draws it.
 
     Args:
-        copy: path of a figure in the folder of the runs; empty where it is drawn.
-        draw: `MODULE:FUNCTION` of the study's folder; called with the rows of all
-            summaries, it returns the figure.
-        parts: parts whose summaries it is given.
+        copy: path of a figure in the folder of the runs; if empty, it is drawn.
+        draw: `MODULE:FUNCTION` in the study's folder; called with the rows of the
+            parts' summaries, it returns the figure.
+        parts: parts whose summaries are passed to `draw`.
     """
 
     copy: str = ""
@@ -97,19 +97,19 @@ class Drawing:
 
 @dataclass(frozen=True, kw_only=True)
 class Study:
-    """A study.
+    """Study with its parts, maps, tables and figures.
 
     Args:
-        folder: where its files lie; its name is the study's.
+        folder: folder of its files; the folder's name is that of the study.
         page: path of the page with its tables, from the root of the repository.
         parts: parts by name, in the order in which they are run.
-        maps: maps by name of their file.
-        moved: path of today by a path in a suite that was fixed before.
-        develop: maps on which its hypotheses were developed; empty where it has none.
-        seed: of the episodes there.
-        tables: `MODULE:FUNCTION` of the study's folder by kind of table; it makes one
-            of a run's folder.
-        figures: figures of the page by name of their file in docs/figures.
+        maps: datasets by file name without suffix.
+        moved: current paths of files, by their paths in fixed suites.
+        develop: dataset on which hypotheses were developed; empty without hypotheses.
+        seed: seed of the episodes on the development maps.
+        tables: `MODULE:FUNCTION` in the study's folder, by kind of table; called with a
+            run's folder, the function returns the table.
+        figures: figures of the page, by file name in docs/figures.
     """
 
     folder: Path
@@ -124,10 +124,10 @@ class Study:
 
     @classmethod
     def load(cls, name: str) -> "Study":
-        """Read a study by its name, or by its folder.
+        """Read a study, given its name or its folder.
 
         Raises:
-            ConfigError: If there is no such study, or its file is not usable.
+            ConfigError: If there is no such study, or its file is invalid.
         """
         folder = next(
             (
@@ -137,15 +137,15 @@ class Study:
             ),
             None,
         )
-        known = sorted(path.parent.name for path in HOME.glob("*/study.yaml"))
+        names = sorted(path.parent.name for path in HOME.glob("*/study.yaml"))
         expect(
             folder,
-            f"`study` among {', '.join(known)}, or a folder with a study.yaml, got "
+            f"`study` among {', '.join(names)}, or a folder that has a study.yaml, got "
             f"{name}.",
         )
         assert folder is not None
         data = yaml.safe_load((folder / "study.yaml").read_text())
-        # A part that says nothing is the suite of its name.
+        # A part without settings is the suite of the same name.
         data["parts"] = {part: options or {} for part, options in data["parts"].items()}
         study: Study = read(
             cls,
@@ -160,7 +160,7 @@ class Study:
         return self.folder.name
 
     def choose(self, parts: Sequence[str]) -> list[str]:
-        """Return these parts, or all if none is named, in the order of the study.
+        """Return these parts in the order of the study, or all if `parts` is empty.
 
         Raises:
             ConfigError: If the study has no such part.
@@ -174,13 +174,11 @@ class Study:
     def suite_of(self, part: str) -> Path:
         """Return the file of a part's suite."""
         name = self.parts[part].suite or part
-        own = self.folder / f"{name}.yaml"
-        return own if own.is_file() else SUITES / f"{name}.yaml"
+        path = self.folder / f"{name}.yaml"
+        return path if path.is_file() else SUITES / f"{name}.yaml"
 
     def suite(self, part: str, work: Work) -> dict[str, Any]:
-        """Return a part's suite as it is run: with maps by their files, and files where
-        they are today.
-        """
+        """Return a part's suite as it is run, with the paths of maps and moved files."""
         content: dict[str, Any] = yaml.safe_load(self.suite_of(part).read_text())
         suite: dict[str, Any] = self._placed(content, work)
         maps = work.maps or self.parts[part].maps
@@ -201,9 +199,8 @@ class Study:
         return value
 
     def function(self, name: str) -> Callable[..., Any]:
-        """Return a function of the study, from `MODULE:FUNCTION`."""
-        module, _, function = name.partition(":")
-        found: Callable[..., Any] = getattr(
-            importlib.import_module(f"studies.{self.name}.{module}"), function
-        )
-        return found
+        """Import a function of the study, given as `MODULE:FUNCTION`."""
+        module_name, _, function_name = name.partition(":")
+        module = importlib.import_module(f"studies.{self.name}.{module_name}")
+        function: Callable[..., Any] = getattr(module, function_name)
+        return function

@@ -1,12 +1,13 @@
 """Tables of the studies' pages, by kind.
 
 - `results`: the table of the run's report;
-- `hypotheses`: what the suite was to show, and the tests of it;
-- `settings`: success and mean T_total, a row for each model, planner and world, a
-  column for each risk setting;
-- `sweep`: success of each setting under each value, and what the best gains on the
-  worst; p of the sign-flip test, after Holm's correction over all pairs of settings of
-  the row. Best and worst are chosen by what was seen, so the gain is biased upward.
+- `hypotheses`: the hypotheses of the suite and their tests;
+- `settings`: success and mean T_total, with a row for each model, planner and world and
+  a column for each risk setting;
+- `sweep`: success of each risk setting under each swept value, and the gain of the best
+  over the worst; p is of the sign-flip test, with Holm's correction over all pairs of
+  settings in the row. Best and worst are chosen by the same data, so the gain is biased
+  upward.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -40,12 +41,12 @@ NEXT_TO_RISK = (
 def table(
     headings: Sequence[str], rows: Sequence[Sequence[str]], labels: int = 1
 ) -> Table:
-    """Return a table, its first columns labels."""
+    """Return a table whose first `labels` columns are labels."""
     return Table(headings=tuple(headings), rows=tuple(map(tuple, rows)), labels=labels)
 
 
 def success(row: Mapping[Any, Any]) -> str:
-    """Return success of a condition in per cent, with its interval."""
+    """Format the success of a condition in per cent, with its interval."""
     rate, low, high = (100 * row[f"success_{end}"] for end in ("rate", "low", "high"))
     return f"{rate:.1f} ({low:.0f}–{high:.0f})"
 
@@ -61,7 +62,7 @@ def hypotheses(run: Path) -> Table:
 
 
 def settings(run: Path) -> Table:
-    """Return success with its interval and mean T_total, risk settings across."""
+    """Return success with its interval and mean T_total, one column per risk setting."""
     summary = pd.read_csv(run / SUMMARY)
     summary = summary[summary["risk"] != NOT_USED]
     risks = list(summary["risk"].unique())
@@ -79,9 +80,7 @@ def settings(run: Path) -> Table:
 
 
 def sweep(run: Path) -> Table:
-    """Return success of each setting under each value that was swept, and what the best
-    gains on the worst.
-    """
+    """Return success per risk setting and swept value, and the gain of best over worst."""
     pairs = find_pairs(read_conditions([open_run(run)]), by="risk")
     varied = [
         name for name in NEXT_TO_RISK if len({pair.shared[name] for pair in pairs}) > 1
@@ -101,9 +100,7 @@ def sweep(run: Path) -> Table:
 
 
 def _best_and_worst(compared: pd.DataFrame) -> tuple[dict[str, float], str, str]:
-    """Return success of each setting in per cent, what the best gains on the worst in
-    points, and p.
-    """
+    """Return success per setting in per cent, the gain of best over worst, and its p."""
     rates: dict[str, float] = {}
     for row in compared.to_dict("records"):
         rates |= {
@@ -125,7 +122,7 @@ def _best_and_worst(compared: pd.DataFrame) -> tuple[dict[str, float], str, str]
     return rates, gain, f"{pair['success_p_holm']:.2g}"
 
 
-# Each kind with the file that it is made of.
+# Function of each kind, and the file of a run that it reads.
 KINDS: dict[str, tuple[Callable[[Path], Table], str]] = {
     "results": (results, RUN),
     "hypotheses": (hypotheses, RUN),

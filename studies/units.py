@@ -1,6 +1,4 @@
-"""One unit of a suite, built and run in this process: what scripts of studies ask of
-problems and episodes.
-"""
+"""Build and run one unit of a suite in this process, for scripts of studies."""
 
 from pathlib import Path
 from typing import Any
@@ -19,7 +17,7 @@ from benchnav.planning import Prediction, Problem, Task, pose_problem
 from benchnav.planning.free_space import Immobile
 from benchnav.planning.world.outcome import Outcome
 
-# What suites of the studies in the world `stakes` have in common.
+# Settings that all suites of scripts in the world `stakes` share.
 STAKES: dict[str, Any] = {
     "objectives": ("travel_time",),
     "scenarios": ("std",),
@@ -30,12 +28,12 @@ STAKES: dict[str, Any] = {
 
 
 def stakes_suite(data: Path, **options: Any) -> Suite:
-    """Return a suite in the world `stakes`, or in another that is named."""
+    """Return a suite with the settings of `STAKES`, which `options` may replace."""
     return Suite(data=str(data), **STAKES | options)
 
 
 def one_unit(suite: Suite, maps: int) -> Unit:
-    """Return the unit of the first maps of a suite's first condition."""
+    """Return the unit of a suite's first condition on its first `maps` maps."""
     condition = conditions_of(suite, lambda data: ["std"])[0]
     return units(
         {condition.id: (condition, Extent.product(suite.seeds or (0,), 1, maps))}
@@ -43,7 +41,7 @@ def one_unit(suite: Suite, maps: int) -> Unit:
 
 
 def build_unit(unit: Unit) -> Built:
-    """Return the problem and the simulation of a unit."""
+    """Build the problem and the simulation of a unit."""
     return build(unit, Settings().origins().of(unit))
 
 
@@ -55,15 +53,15 @@ def pose_on(
     time_budget_s: float,
     immobile: Immobile | None = None,
 ) -> tuple[Problem, Terrain]:
-    """Return a problem on flat terrain whose λ is known, and the terrain.
+    """Return a problem on flat terrain whose λ planners are given, and the terrain.
 
     Args:
         ground: λ, shape [B, H, W].
-        grid: its cells.
-        ends_m: start and goal, shape [B, 2] each.
-        task: of the robots.
-        time_budget_s: of an episode.
-        immobile: what immobilises robots.
+        grid: grid of the maps.
+        ends_m: start and goal in metres, shape [B, 2] each.
+        task: task of the robots.
+        time_budget_s: time limit of an episode in seconds.
+        immobile: rule of immobilisation; if None, no robot is immobilised.
     """
     level, flat = ground[:, None], torch.zeros_like(ground)
     truth = TraversabilityMixture(
@@ -85,15 +83,13 @@ def pose_on(
 
 
 def seconds_of(episodes: Episodes, dt_s: float) -> np.ndarray:
-    """Return seconds to the goal, infinite if it was not reached, shape [B]."""
+    """Return seconds to the goal, infinite if not reached, shape [B]."""
     has_arrived = (episodes.outcome == Outcome.SUCCESS).numpy()
     return np.where(has_arrived, episodes.steps.double().numpy() * dt_s, np.inf)
 
 
 def drive_unit(unit: Unit) -> tuple[np.ndarray, Built]:
-    """Return seconds to the goal, infinite if it was not reached, shape [B], and what
-    was driven.
-    """
+    """Run a unit; return seconds to the goal [B], infinite if not reached, and the unit."""
     built = build_unit(unit)
     episodes, _ = simulate(unit, built, Settings())
     return seconds_of(episodes, built.problem.dt_s), built

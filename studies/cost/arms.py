@@ -1,5 +1,6 @@
-"""Arms of risk on the cost: the table of their differences, and success over time
-through their levels.
+"""Table and figure of the arms of the study of risk on the cost.
+
+An arm is the quantity whose CVaR is planned on: λ, time or the cost.
 """
 
 from collections.abc import Mapping
@@ -42,24 +43,31 @@ _HEADINGS = (
 
 
 def arms(run: Path) -> Table:
-    """Return success, time and computing of each arm, and what it gains on another.
+    """Return success, time, planning time and gain of each arm.
 
-    The other is CVaR of time on the map with the same planner, or the same arm with the
-    shared time to go; both may be in the run `cost-primary` next to this one. p is
-    after Holm's correction over all rows that have one.
+    The gain is over a baseline: CVaR of time on the map with the same planner, or, for
+    an arm with a time to go of its own, the same arm with the shared one. Baselines
+    that are not in this run are read from the run `cost-primary` in the same folder. p
+    has Holm's correction over all rows with a p.
     """
     arms_of_run = _by_arm(run)
     others = arms_of_run
     if any(_compared_with(*arm) not in arms_of_run for arm in arms_of_run):
         others = arms_of_run | _by_arm(run.with_name("cost-primary"))
     pairs = {}
-    for (planner, risk), one in arms_of_run.items():
-        other = others[_compared_with(planner, risk)]
-        if one is not other:  # the two may differ in planner and risk setting alike
-            check_maps(one, other, f"{planner} and {other.labels['planner']}")
-            both = side_by_side(one.episodes, other.episodes, _MEASURES)
+    for (planner, risk), condition in arms_of_run.items():
+        baseline = others[_compared_with(planner, risk)]
+        if condition is not baseline:
+            # The two may differ both in planner and in risk setting.
+            check_maps(
+                condition, baseline, f"{planner} and {baseline.labels['planner']}"
+            )
+            paired = side_by_side(condition.episodes, baseline.episodes, _MEASURES)
             pairs[planner, risk] = Pair(
-                one=planner, other=other.labels["planner"], shared={}, episodes=both
+                one=planner,
+                other=baseline.labels["planner"],
+                shared={},
+                episodes=paired,
             )
     compared = dict(
         zip(pairs, compare(list(pairs.values())).to_dict("records"), strict=True)
@@ -67,16 +75,18 @@ def arms(run: Path) -> Table:
     rows = []
     for row in pd.read_csv(run / "summary.csv").to_dict("records"):
         arm, differences = (row["planner"], row["risk"]), ["", "", ""]
-        if found := compared.get(arm):
+        if comparison := compared.get(arm):
             points = [
-                100 * found[f"success_{end}"] for end in ("difference", "low", "high")
+                100 * comparison[f"success_{end}"]
+                for end in ("difference", "low", "high")
             ]
             seconds = [
-                found[f"arrival_time_{end}_s"] for end in ("difference", "low", "high")
+                comparison[f"arrival_time_{end}_s"]
+                for end in ("difference", "low", "high")
             ]
             differences = [
                 _interval(points),
-                f"{found['success_p_holm']:.2g}",
+                f"{comparison['success_p_holm']:.2g}",
                 _interval(seconds),
             ]
         times = f"{row['total_time_mean_s']:.1f}", f"{row['planning_ms_median']:.1f}"
@@ -86,7 +96,10 @@ def arms(run: Path) -> Table:
 
 def _by_arm(run: Path) -> dict[tuple[str, str], Compared]:
     conditions = read_conditions([open_run(run)])
-    return {(each.labels["planner"], each.labels["risk"]): each for each in conditions}
+    return {
+        (condition.labels["planner"], condition.labels["risk"]): condition
+        for condition in conditions
+    }
 
 
 def _interval(values: list[float]) -> str:
@@ -102,31 +115,32 @@ def _compared_with(planner: str, risk: str) -> tuple[str, str]:
 
 
 def arm_of(row: Mapping[Any, Any]) -> dict[str, Any]:
-    """Return planner, arm and level of a condition, and whether it has entrapment;
-    other conditions have no arm.
+    """Return planner, arm, level and entrapment (`held`) of a condition.
+
+    The arm is empty for conditions that belong to none.
     """
     part, _, kind = row["planner"].partition(" ")
     name, _, level = row["risk"].partition(":")
-    found = {
+    labels = {
         "planner": planner_name(part),
         "held": "held" in kind,
         "arm": "",
         "level": 0.0,
     }
     if not kind or row["model"] == "clairvoyant":
-        return found
+        return labels
     if "cost" in kind:
-        return found | {"arm": "CVaR of the cost", "level": float(kind.split()[1])}
+        return labels | {"arm": "CVaR of the cost", "level": float(kind.split()[1])}
     arm = "CVaR of λ" if name in ("cvar", "mean") else "CVaR of time"
-    return found | {"arm": arm, "level": float(level or 0)}
+    return labels | {"arm": arm, "level": float(level or 0)}
 
 
 @styled()
 def frontier(summary: pd.DataFrame) -> Figure:
-    """Draw success over the time to the goal, a curve an arm through its levels;
-    markers grow with the level.
+    """Draw success over the time to the goal, one curve per arm through its levels.
 
-    A panel a planner; in the row below with entrapment.
+    Markers grow with the level. There is one panel per planner, and the row below shows
+    the same with entrapment.
     """
     rows = summary.assign(
         **pd.DataFrame(

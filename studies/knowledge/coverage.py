@@ -1,21 +1,21 @@
 """Coverage of the intervals of a belief, with `oracle` and a trained model.
 
-Robots drive by A*+DWA under `expected-time` and learn by `copula`. At four times of
-each episode, drawn beforehand, the belief is asked of all cells within 2ℓ of the robot
-whose λ was not sensed: does λ lie in the central 90 % of what is believed of it? Where
-λ has an atom, a rank in it is drawn (randomised PIT). The table has the fraction of
-cells with its 95 % interval by maps (of a ratio of sums over maps), the fractions under
-and over the interval, and the mean log score next to that of the prediction.
+Robots plan with A*+DWA under `expected-time` and learn with `copula`. At four times of
+each episode, drawn in advance, every unobserved cell within 2ℓ of the robot is checked:
+is λ in the central 90 % interval of the belief? If λ is at an atom, its rank within the
+atom is drawn (randomised PIT). The table has the fraction of cells with its 95 %
+interval by maps (of a ratio of sums over maps), the fractions below and above the
+interval, and the mean log scores of the belief and of the prediction.
 
-In the world `stakes` draws of λ without a feasible path are rejected, which the
-covariance model does not know. `no draw rejected` rejects none, and immobilises no
-robot. The table `rejection` says what rejection changes of λ: over 40 draws of each
-map, the differences of E[λ] and P(λ < 0.1) between accepted draws and all, near the
-straight line from start to goal (3 m) and elsewhere.
+In the world `stakes`, draws of λ without a feasible path are rejected. The covariance
+model does not account for that. The rows `no draw rejected` are of a world that rejects
+no draw and immobilises no robot. The table `rejection` quantifies the effect on λ: over
+40 draws per map, the differences of E[λ] and P(λ < 0.1) between accepted draws and all,
+within 3 m of the straight line from start to goal and elsewhere.
 
-Sums of each unit are stored in the run's folder, so that a run that was interrupted
-resumes. Delete the folder when the code has changed. 25 minutes of a core with 400
-maps' first 200, and 15 with the fine maps.
+Sums of each unit are stored in the run's folder, so that an interrupted run resumes.
+Delete the folder when the code has changed. The first 200 of 400 maps take 25 minutes
+on one core, the fine maps 15.
 """
 
 from collections.abc import Sequence
@@ -46,16 +46,18 @@ GROUNDS = ("contact", "probe:1", "probe:2")
 TIMES, LATEST_S = 4, 40.0
 NEAR_M = 3.0  # 2ℓ
 LAW = {"preset": "stakes", "immobile": None}
-DRAWS = 40  # of each map, of the table on rejection
+DRAWS = 40  # per map, for the table `rejection`
 
 
 class Coverage:
-    """What was found in the episodes of a unit: sums by map, shape [B, 6], the first of
-    them of cells.
+    """Observer that sums cells and scores of a unit's episodes by map, shape [B, 6].
+
+    The sums are of: cells, cells inside, below and above the interval, log scores of
+    the belief, log scores of the prediction.
     """
 
     def __init__(self, unit: Unit, built: Built) -> None:
-        """Draws the times."""
+        """Draw the times at which the belief is checked."""
         assert built.learning is not None
         assert built.simulation.field is not None
         self._built, self._learner, self._field = (
@@ -64,10 +66,10 @@ class Coverage:
             built.simulation.field,
         )
         maps = np.array(unit.maps)
-        every = round(unit.condition.rules.replan_every_s / built.problem.dt_s)
+        replan_steps = round(unit.condition.rules.replan_every_s / built.problem.dt_s)
         drawn = rng.uniform(rng.stream_key(0, "coverage"), maps, (TIMES,))
         self._steps = torch.from_numpy(
-            every * np.ceil(drawn * LATEST_S / built.problem.dt_s / every)
+            replan_steps * np.ceil(drawn * LATEST_S / built.problem.dt_s / replan_steps)
         ).long()
         self._rank = torch.from_numpy(
             rng.uniform(rng.stream_key(0, "rank"), maps, built.problem.grid.shape)
@@ -75,27 +77,27 @@ class Coverage:
         self.sums = torch.zeros(len(maps), 6, dtype=torch.float64)
 
     def __call__(self, step: int, knowing: Knowing) -> None:
-        """Asks what is believed where a time was drawn; of robots that are left."""
-        known, members = knowing.known, knowing.members
-        asked = (self._steps[members] == step).any(1) & known.footprint.flatten(1).any(
+        """Add the scores of robots that are still driving and have a check now."""
+        knowledge, members = knowing.known, knowing.members
+        is_asked = (self._steps[members] == step).any(1) & knowledge.footprint.flatten(
             1
-        )
+        ).any(1)
         cells = (
-            _near(known.footprint, self._built.problem.grid.resolution_m)
-            & ~known.ever_sensed
+            _near(knowledge.footprint, self._built.problem.grid.resolution_m)
+            & ~knowledge.ever_sensed
         )
-        cells &= asked[:, None, None]
+        cells &= is_asked[:, None, None]
         if not bool(cells.any()):
             return
         value, member = (
             self._field[members][cells][None],
             members[cells.nonzero()[:, 0]],
         )
-        believed = self._learner.distribution(known).at(cells)
+        believed = self._learner.distribution(knowledge).at(cells)
         low, high = believed.cdf_limits(value)
         pit = torch.lerp(low.double(), high.double(), self._rank[members][cells][None])
         predicted = self._built.problem.distribution.select(members).at(cells)
-        told = (
+        scores = (
             torch.ones_like(pit),
             (pit - 0.5).abs() <= 0.45,
             pit < 0.05,
@@ -104,14 +106,12 @@ class Coverage:
             predicted.log_prob(value).clamp(min=-10),
         )
         self.sums.index_add_(
-            0, member, torch.stack([part[0].double() for part in told], 1)
+            0, member, torch.stack([part[0].double() for part in scores], 1)
         )
 
 
 def _near(reached: Tensor, resolution_m: float) -> Tensor:
-    """Cells within `NEAR_M` of the middle of those that sensors told of, bool, shape
-    [B, H, W].
-    """
+    """Return a mask of cells within `NEAR_M` of a footprint's centre, [B, H, W]."""
     row, column = (
         torch.arange(size, dtype=torch.float64) for size in reached.shape[1:]
     )
@@ -126,7 +126,7 @@ def _near(reached: Tensor, resolution_m: float) -> Tensor:
 
 
 def suite_of(data: Path, models: Sequence[str] = MODELS) -> Suite:
-    """Return who learns by what, in which world."""
+    """Return the suite of models, sensors and worlds."""
     common: dict[str, Any] = {"grounds": list(GROUNDS), "beliefs": ("copula",)}
     return stakes_suite(
         data,
@@ -142,7 +142,7 @@ def suite_of(data: Path, models: Sequence[str] = MODELS) -> Suite:
 
 
 def sums_of(unit: Unit, settings: Settings, out: Path) -> Tensor:
-    """Sums of the episodes of a unit, read if they are stored, shape [B, 6]."""
+    """Return the sums of a unit's episodes, read if they are stored, shape [B, 6]."""
     path = out / f"{unit.condition.id}-{unit.maps[0]}-{unit.maps[-1]}.npy"
     if not path.exists():
         built = build_unit(unit)
@@ -155,20 +155,22 @@ def sums_of(unit: Unit, settings: Settings, out: Path) -> Tensor:
 
 
 def measured(suite: Suite, maps: int, out: Path) -> Rows:
-    """Coverage of each condition."""
+    """Return one row of coverage per condition."""
     conditions = {
         condition.id: (condition, Extent.product((0,), 1, maps))
         for condition in conditions_of(suite, lambda data: ["std"])
     }
-    settings, found = Settings(), dict[str, list[Tensor]]()
+    settings, sums_by_condition = Settings(), dict[str, list[Tensor]]()
     for unit in track(units(conditions), "units"):
-        found.setdefault(unit.condition.id, []).append(sums_of(unit, settings, out))
+        sums_by_condition.setdefault(unit.condition.id, []).append(
+            sums_of(unit, settings, out)
+        )
     rows = []
-    for key, parts in found.items():
+    for key, parts in sums_by_condition.items():
         labels, sums = conditions[key][0].labels, torch.cat(parts).numpy()
         cells = sums[:, 0].sum()
         inside, under, over, score, of_prediction = sums[:, 1:].sum(0) / cells
-        # A ratio of sums over maps: its error by the residuals of the maps.
+        # Standard error of a ratio of sums over maps, from the residuals of the maps.
         residual = sums[:, 1] - inside * sums[:, 0]
         error = 1.96 * np.sqrt((residual**2).sum()) / cells
         rows.append(
@@ -192,7 +194,7 @@ def measured(suite: Suite, maps: int, out: Path) -> Rows:
 
 
 def rejection(data: Path, maps: int) -> Rows:
-    """Return what rejection of draws changes of λ."""
+    """Return the effect of rejecting draws on the distribution of λ."""
     first_unit = one_unit(suite_of(data), maps)
     world = first_unit.condition.world
     assert world.immobile is not None
@@ -214,7 +216,7 @@ def rejection(data: Path, maps: int) -> Rows:
             n_rejected += int((~is_kept).sum())
         all_draws, kept_draws = (part[1:] / part[0].clamp(min=1) for part in sums)
         near = _near_line(block.places.start_m, block.places.goal_m, grid)
-        # Maps with no draw that is kept say nothing.
+        # Maps whose draws were all rejected have no accepted λ to compare.
         for index in sums[1, 0].flatten(1).amax(1).nonzero()[:, 0].tolist():
             change = (kept_draws - all_draws)[:, index]
             changes.append(
@@ -239,9 +241,7 @@ def rejection(data: Path, maps: int) -> Rows:
 
 
 def _near_line(start_m: Tensor, goal_m: Tensor, grid: Grid) -> Tensor:
-    """Return the cells within `NEAR_M` of the straight line from start to goal, bool,
-    shape [B, H, W].
-    """
+    """Return a mask of cells within `NEAR_M` of the line from start to goal, [B, H, W]."""
     row, column = torch.meshgrid(*map(torch.arange, grid.shape), indexing="ij")
     cell = torch.stack(grid.centre_of(row, column), -1)[None].double()
     start, line = (
@@ -258,9 +258,7 @@ def _near_line(start_m: Tensor, goal_m: Tensor, grid: Grid) -> Tensor:
 def coverage(
     work: Work, folder: Path, data: str, maps: int, models: Sequence[str] = MODELS
 ) -> dict[str, Rows]:
-    """Return coverage of the belief on the first maps of a dataset, and what rejection
-    of draws changes.
-    """
+    """Return the tables `rejection` and `coverage` on the first maps of a dataset."""
     path = work.maps_in / f"{data}.h5"
     return {
         "rejection": rejection(path, maps),

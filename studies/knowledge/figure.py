@@ -1,4 +1,7 @@
-"""Success over what is known: a curve a risk setting, a panel a planner and model."""
+"""Success over the observations of λ: one curve per risk setting.
+
+There is one panel per planner and model.
+"""
 
 from collections.abc import Mapping
 from typing import Any
@@ -9,7 +12,7 @@ from matplotlib.figure import Figure
 from benchnav.viz import planner_name, risk_name, styled
 from studies.curves import SUCCESS, draw_curves
 
-# What is known, by sensor of λ and belief, from nothing to all.
+# Labels of what is known of λ, by traversability sensor and belief, from least to most.
 KNOWN = {
     ("–", "static"): "the prediction",
     ("contact", "copula"): "λ under\nthe robot",
@@ -20,9 +23,7 @@ ALL_KNOWN = "all of λ"
 
 
 def known_of(row: Mapping[Any, Any]) -> str:
-    """Return what is known in a condition; empty where it is none of the study's main
-    series.
-    """
+    """Return the label of what is known in a condition; if not plotted, empty."""
     if row["model"] == "clairvoyant":
         return ALL_KNOWN
     return (
@@ -39,7 +40,7 @@ def known(summary: pd.DataFrame) -> Figure:
     ]
     rows = rows.assign(known=[known_of(row) for row in rows.to_dict("records")])
     rows = rows[rows["known"] != ""]
-    # The clairvoyant has one row, which is of all models and risk settings.
+    # The clairvoyant's one row stands for all models and risk settings.
     is_told = rows["model"] == "clairvoyant"
     settings = rows.loc[~is_told, ["planner", "model", "risk"]].drop_duplicates()
     rows = pd.concat(

@@ -1,8 +1,7 @@
-"""Controls of the study of knowledge: a robot that learns what is not so, and one that
-plans anew for nothing.
+"""Controls of the study of knowledge: false measurements, and replanning without news.
 
-`primary.yaml` names them as `benchmarks/knowledge_parts.py:NAME`, where they were when
-it was fixed; `study.yaml` says where they are.
+`primary.yaml` names them as `benchmarks/knowledge_parts.py:NAME`, which was their path
+when the suite was fixed; `study.yaml` maps that path to this file.
 """
 
 from dataclasses import dataclass, replace
@@ -22,14 +21,13 @@ from benchnav.planning.robots import steps_in
 
 @dataclass(frozen=True)
 class Elsewhere(Probe):
-    """The probe, of another draw of λ than the one that is driven on: what it tells is
-    as plausible, and not so.
+    """Probe that measures another draw of λ than the robot drives on.
 
-    The draw has the true distribution of each cell and the world's correlation; it is
-    not rejected where no path is feasible.
+    Its measurements are plausible but false. The draw has the true distribution of each
+    cell and the world's correlation. It is not rejected if no path is feasible.
 
     Args:
-        correlation_m: ℓ of the draw.
+        correlation_m: correlation length ℓ of the draw, in metres.
     """
 
     correlation_m: float = 1.5
@@ -42,32 +40,32 @@ class Elsewhere(Probe):
         scores = np.stack(
             [_scores(key, terrain.grid.shape, cells) for key in noise_key.keys]
         )
-        other = torch.full_like(field, torch.nan)
+        other_field = torch.full_like(field, torch.nan)
         drawn = torch.from_numpy(scores).to(field)[near]
-        other[near] = terrain.truth.at(near).from_normal(drawn[None])[0].to(field.dtype)
-        return super().sense(terrain, other, robot_state, noise_key)
+        other_field[near] = (
+            terrain.truth.at(near).from_normal(drawn[None])[0].to(field.dtype)
+        )
+        return super().sense(terrain, other_field, robot_state, noise_key)
 
 
 @lru_cache(maxsize=256)
 def _scores(key: int, shape: tuple[int, int], correlation_cells: float) -> np.ndarray:
-    """Normal scores of an episode's other draw; kept, since every step asks for them."""
+    """Return the normal scores of an episode's false draw, cached for its steps."""
     return correlated_normal(
         rng.stream_key(key, "elsewhere"), np.arange(1), shape, correlation_cells
     )[0]
 
 
 class Revising(AStarDWA):
-    """A\\*+DWA that revises its plan as often as a robot that learns, though nothing is
-    learnt.
-    """
+    """A\\*+DWA that replans as often as a robot that learns, without new observations."""
 
     def plan(self, step: Any, plan_state: Any) -> Any:
         problem = plan_state.problem
-        every = steps_in(problem.task.rules.replan_every_s, problem.dt_s)
-        if round(step.time_s / problem.dt_s) % every == 0:
+        replan_steps = steps_in(problem.task.rules.replan_every_s, problem.dt_s)
+        if round(step.time_s / problem.dt_s) % replan_steps == 0:
             problem = replace(problem, start=step.state)
-            # Maps are searched that have changed: all have, if all ground was of the
-            # other kind.
+            # Only changed maps are searched again. Inverting the free mask marks all
+            # of them as changed.
             changed = replace(plan_state, problem=replace(problem, free=~problem.free))
             plan_state = self.revise(changed, problem)
         return super().plan(step, plan_state)

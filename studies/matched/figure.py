@@ -1,7 +1,7 @@
-"""Success and time of planners over how long they compute: a curve a planner.
+"""Success and time of planners over their planning time per step.
 
-Drives one robot on each of three maps by each planner of the run `matched`, and takes
-the mean time of a step but for the first ten, in which code is compiled.
+Each planner of the run `matched` drives one robot on each of three maps. The planning
+time is the mean over steps without the first ten, during which code is compiled.
 """
 
 import json
@@ -50,9 +50,9 @@ def computing(work: Work, folder: Path) -> dict[str, Rows | Figure]:
     return {"computing": table, "matched": matched_figure(rows)}
 
 
-def step_ms(about: dict[str, Any]) -> float:
-    """Return the mean time of a step of one robot."""
-    condition, took = condition_from(about), []
+def step_ms(stored_condition: dict[str, Any]) -> float:
+    """Return the mean planning time of a step of one robot, in milliseconds."""
+    condition, took = condition_from(stored_condition), []
     for index in range(MAPS):
         unit = Unit(condition=condition, seed=1, realisation=0, maps=(index,))
         episodes, _ = simulate(unit, build_unit(unit), Settings())
@@ -62,7 +62,7 @@ def step_ms(about: dict[str, Any]) -> float:
 
 @styled()
 def matched_figure(rows: pd.DataFrame) -> Figure:
-    """Draw success and T_total over the time of a step."""
+    """Draw success and T_total over the planning time of a step."""
     measures = {"success": SUCCESS, "time": TOTAL_TIME}
     rows = rows.assign(panel="", line=rows["family"], x=rows["ms"]).sort_values(
         ["line", "x"]

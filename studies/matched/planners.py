@@ -1,5 +1,4 @@
-"""Two planners that sample action sequences otherwise than MPPI does, to be compared at
-equal computing.
+"""Smooth MPPI and iCEM, for a comparison with MPPI at equal planning time.
 
 Smooth MPPI: Kim, Park, Choi and Ha (2022), "Smooth model predictive path integral
 control without smoothing". iCEM: Pinneri et al. (2020), "Sample-efficient cross-entropy
@@ -32,10 +31,10 @@ class SmoothConfig(MPPIConfig):
     """Settings of Smooth MPPI.
 
     Args:
-        noise_share: standard deviation of what each step adds to an action, as a share
-            of its range.
+        noise_share: standard deviation of an action's change in one step, as a fraction
+            of the action's range.
         smoothness: weight of the squared changes of actions from step to step, each as
-            a share of its range.
+            a fraction of the action's range.
     """
 
     noise_share: float = 0.1
@@ -49,7 +48,7 @@ class _Summed(NoiseBank):
 
 
 class SmoothMPPI(MPPI):
-    """MPPI that samples the changes of actions, and takes large ones for costly."""
+    """MPPI that samples changes of actions and penalises large ones."""
 
     def __init__(self, config: SmoothConfig | None = None) -> None:
         super().__init__(config or SmoothConfig())
@@ -87,14 +86,14 @@ class SmoothMPPI(MPPI):
 
 @dataclass(frozen=True, kw_only=True)
 class ICEMConfig(MPPIConfig):
-    """Settings of iCEM; `samples` are those of the first iteration.
+    """Settings of iCEM; `samples` is the number of the first iteration.
 
     Args:
-        iterations: of a step.
-        elites: sequences to which the distribution is fitted.
-        kept: share of them that the next iteration, and the next step, tries again.
-        decay: by which each iteration has fewer samples than the one before.
-        momentum: weight of the distribution before.
+        iterations: number of iterations per step.
+        elites: number of best sequences, to which the distribution is fitted.
+        kept: fraction of the elites that the next iteration and the next step reuse.
+        decay: factor by which the number of samples falls from iteration to iteration.
+        momentum: weight of the previous distribution.
         colour: exponent β of the noise's spectrum, 1 / f^β.
     """
 
@@ -108,27 +107,26 @@ class ICEMConfig(MPPIConfig):
 
 @dataclass(frozen=True)
 class Coloured:
-    """Noise of variance 1 that all episodes share, of which each iteration takes a
-    part, shape [T, A, 4K].
+    """Noise of variance 1, shared by all episodes, shape [T, A, 4K].
+
+    Each iteration reads a part of it.
     """
 
     values: Tensor
 
     def take(self, key: int, count: int) -> Tensor:
-        """Return so many sequences from an index that a key decides, shape [T, A,
-        count].
-        """
+        """Return `count` sequences from an index set by `key`, shape [T, A, count]."""
         first = key % (self.values.shape[2] - count + 1)
         return self.values[..., first : first + count]
 
 
 @dataclass(frozen=True)
 class ICEMState(MPPIState):
-    """What iCEM carries from step to step, beside what MPPI does.
+    """Plan state of iCEM, which extends that of MPPI.
 
     Args:
-        elites: sequences that are tried again, shape [B, T, A, E].
-        coloured: the noise.
+        elites: sequences to reuse, shape [B, T, A, E].
+        coloured: the noise that iterations read.
     """
 
     elites: Tensor
@@ -136,9 +134,7 @@ class ICEMState(MPPIState):
 
 
 class ICEM(MPPI):
-    """The improved cross-entropy method: coloured noise, and the best sequences are
-    kept.
-    """
+    """Improved cross-entropy method: coloured noise, and reuse of the best sequences."""
 
     def __init__(self, config: ICEMConfig | None = None) -> None:
         super().__init__(config or ICEMConfig())
@@ -153,9 +149,9 @@ class ICEM(MPPI):
     def init(self, problem: Problem, generator: torch.Generator) -> ICEMState:
         base, config = super().init(problem, generator), self.config
         horizon, actions = base.mean.shape[1:]
-        own = rng.generator(rng.stream_key(base.key, "coloured"))
+        noise_generator = rng.generator(rng.stream_key(base.key, "coloured"))
         coloured = coloured_noise(
-            horizon, (actions, 4 * config.samples), config.colour, own
+            horizon, (actions, 4 * config.samples), config.colour, noise_generator
         ).to(base.mean)
         elites = base.mean[..., None].expand(-1, -1, -1, self._kept)
         return ICEMState(**vars(base), elites=elites, coloured=Coloured(coloured))
@@ -166,7 +162,7 @@ class ICEM(MPPI):
         problem, config, mean = plan_state.problem, self.config, plan_state.mean
         low, high = problem.action_bounds
         std = (config.noise_share * (high - low)).expand_as(mean)
-        tried = plan_state.elites
+        retried = plan_state.elites
         for iteration in range(config.iterations):
             count = max(
                 2 * config.elites, int(config.samples / config.decay**iteration)
@@ -177,7 +173,7 @@ class ICEM(MPPI):
                 mean[..., None] + std[..., None] * noise, low[:, None], high[:, None]
             )
             last = [mean[..., None]] if iteration == config.iterations - 1 else []
-            samples = torch.cat((samples, tried, *last), dim=3)
+            samples = torch.cat((samples, retried, *last), dim=3)
             cost = self._cost(problem, step.state, samples, target_m, plan_state.to_go)
             best = cost.topk(config.elites, dim=1, largest=False).indices
             elites = samples.gather(
@@ -185,11 +181,14 @@ class ICEM(MPPI):
             )
             mean = config.momentum * mean + (1 - config.momentum) * elites.mean(3)
             std = config.momentum * std + (1 - config.momentum) * elites.std(3)
-            tried = elites[..., : self._kept]
-        shifted, kept = (
-            torch.cat((each[:, 1:], each[:, -1:]), dim=1) for each in (mean, tried)
+            retried = elites[..., : self._kept]
+        shifted, next_elites = (
+            torch.cat((values[:, 1:], values[:, -1:]), dim=1)
+            for values in (mean, retried)
         )
-        after = replace(plan_state, mean=shifted, elites=kept, step=plan_state.step + 1)
+        after = replace(
+            plan_state, mean=shifted, elites=next_elites, step=plan_state.step + 1
+        )
         return elites[:, 0, :, 0], after, Plan.empty(len(problem), step.state.device)
 
     def _cost(
@@ -200,7 +199,7 @@ class ICEM(MPPI):
         target_m: Tensor,
         to_go: Tensor | None,
     ) -> Tensor:
-        """Return what sequences cost, shape [B, K]."""
+        """Return the costs of sampled sequences, shape [B, K]."""
         ground, target = problem.padded_ground, target_m[:, None].contiguous()
         states = component_wise(state[:, None].expand(-1, samples.shape[3], -1))
         cost = state.new_zeros(states.shape[:2])
@@ -224,8 +223,9 @@ class ICEM(MPPI):
 def _advance(
     states: Tensor, cost: Tensor, actions: Tensor, low: Tensor, high: Tensor, *rest: Any
 ) -> tuple[Tensor, Tensor]:
-    """Roll samples out whose actions, [B, T, A, K], differ by episode: as deviations
-    from a mean of 0.
+    """Roll out actions [B, T, A, K] that differ by episode.
+
+    They are passed to MPPI's rollouts as deviations from a mean of 0.
     """
     sampled = Sampled(
         torch.zeros_like(actions[..., 0]), actions.movedim(1, 0), low, high
@@ -236,13 +236,14 @@ def _advance(
 def coloured_noise(
     steps: int, shape: tuple[int, ...], colour: float, generator: torch.Generator
 ) -> Tensor:
-    """Normal noise of mean 0 and variance 1 whose spectrum over time falls as 1 /
-    f^colour, shape [steps, *shape].
+    """Return normal noise whose spectrum over time is 1 / f^colour, [steps, *shape].
+
+    Its mean is 0 and its variance 1.
 
     Source: Timmer and König (1995), "On generating power law noise".
     """
     frequencies = torch.fft.rfftfreq(steps)
-    # as the lowest that a sequence of this length can tell
+    # Frequency 0 has no finite scale: it takes that of the lowest frequency above 0.
     frequencies[0] = frequencies[1]
     scale = frequencies ** (-colour / 2)
     real, imaginary = torch.randn((2, len(scale), *shape), generator=generator)

@@ -1,9 +1,8 @@
-"""Errors of the class-wise Gaussian processes where each cell is read with its true
-class.
+"""Errors of the class-wise Gaussian processes, given the true class of each cell.
 
-No number has to do with the classifier. Other priors than the default are tried too, on
-all slopes and on flat ground only, to see how much of what is predicted of steeper
-terrain is the prior's.
+The classifier affects none of these numbers. Other priors than the default are compared
+too, fitted to all slopes and to flat terrain only. This shows how much of a prediction
+for steeper terrain comes from the prior.
 """
 
 import contextlib
@@ -35,7 +34,7 @@ BANDS_DEG = ((0, 10), (10, 15), (15, 18), (18, 21), (21, 24), (24, 27), (27, 90)
 def distributions(
     table: SlopeTable, terrain: Terrain
 ) -> tuple[TraversabilityMixture, TraversabilityMixture]:
-    """Predicted and true distribution of λ in each cell, its class known."""
+    """Return the predicted and the true distributions of λ, given the true classes."""
     predicted = table.own(terrain.class_id, terrain.slope_deg.double())
     truth = [
         v.double()
@@ -45,8 +44,9 @@ def distributions(
 
 
 def errors(table: SlopeTable, dataset: TerrainDataset) -> Rows:
-    """Return of each class RMSE of E[λ] over bins of 1° of the validation maps, and
-    relative error of the noise.
+    """Return a row per class: RMSE of E[λ] over bins of 1°, relative error of noise.
+
+    Cells are those of the validation maps; bins need `LEAST_CELLS` cells or more.
     """
     terrain = dataset.terrain("valid")
     predicted, true = distributions(table, terrain)
@@ -79,7 +79,7 @@ def scores(table: SlopeTable, dataset: TerrainDataset, split: str) -> dict[str, 
 
 
 def bands(table: SlopeTable, dataset: TerrainDataset, split: str) -> Rows:
-    """Return how often λ lies in the central 90 % of what is predicted, by slope."""
+    """Return the coverage of predicted central 90 % intervals, by slope."""
     terrain = dataset.terrain(split)
     predicted, _ = distributions(table, terrain)
     draws = rng.generator(rng.stream_key(0, "benchmarks", split))
@@ -101,8 +101,9 @@ def bands(table: SlopeTable, dataset: TerrainDataset, split: str) -> Rows:
 def prior_error(
     table: SlopeTable, classes: tuple[TerrainClass, ...], low: float, high: float
 ) -> str:
-    """Return RMSE and bias of E[λ] over all classes and slopes in a range, every tenth
-    of a degree alike.
+    """Return RMSE and bias of E[λ] over all classes and a uniform grid of slopes.
+
+    The grid runs from `low` to `high` degrees in steps of 0.1°.
     """
     slopes = torch.arange(low, high, 0.1, dtype=torch.float64).expand(len(classes), -1)
     ids = torch.arange(len(classes)).unsqueeze(1).expand_as(slopes)
@@ -115,34 +116,33 @@ def prior_error(
 
 def prior_table(
     changes: Sequence[dict[str, Any]],
-    short: SlopeSums,
-    whole: SlopeSums,
+    flat_sums: SlopeSums,
+    all_sums: SlopeSums,
     classes: tuple[TerrainClass, ...],
 ) -> Rows:
-    """Return how much of what is predicted is the prior's, within the slopes of the
-    data and beyond.
-    """
+    """Return errors under each prior, within the slopes of the data and beyond them."""
     near, far = (EDGE_DEG + beyond for beyond in BEYOND_DEG)
     rows = []
     for change in changes:
-        of_whole, of_short = (
-            fitted(sums, second_component=False, **change) for sums in (whole, short)
+        all_table, flat_table = (
+            fitted(sums, second_component=False, **change)
+            for sums in (all_sums, flat_sums)
         )
         name = ", ".join(f"{key} {value}" for key, value in change.items()) or "default"
         row = {
             "prior": name,
-            "all slopes: 0–12°": prior_error(of_whole, classes, 0.0, EDGE_DEG),
+            "all slopes: 0–12°": prior_error(all_table, classes, 0.0, EDGE_DEG),
         }
         for low, high in ((0.0, EDGE_DEG), (EDGE_DEG, near), (near, far)):
             row[f"slopes < 12°: {low:.0f}–{high:.0f}°"] = prior_error(
-                of_short, classes, low, high
+                flat_table, classes, low, high
             )
         rows.append(row)
     return rows
 
 
 def fitted(sums: SlopeSums, **options: Any) -> SlopeTable:
-    """Return the table of Gaussian processes that were fitted to sums."""
+    """Fit Gaussian processes to sums of cells; return their table over slopes."""
     with contextlib.redirect_stderr(io.StringIO()):
         return fit_gps(
             read(LatentGPConfig, options, of("the options")), sums
@@ -152,9 +152,7 @@ def fitted(sums: SlopeSums, **options: Any) -> SlopeTable:
 def tables(
     work: Work, folder: Path, priors: Sequence[dict[str, Any]]
 ) -> dict[str, Rows]:
-    """Return errors by class, scores of two likelihoods, coverage by slope, and errors
-    of other priors.
-    """
+    """Return tables of errors by class, likelihoods, coverage by slope and priors."""
     dataset = TerrainDataset(work.maps_in / "paper-v1.h5")
     classes = dataset.recipe.classes
     sums = sum_split(dataset, "train")

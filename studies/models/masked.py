@@ -1,11 +1,9 @@
-"""Quality of models on maps of which they see a part: stakes-v1-masked next to
-stakes-v1.
+"""Quality of stakes-v1-masked and stakes-v1 on partly observed maps.
 
-Both are measured on the maps of test/std, whole and masked by a disc of 4, 8 and 16 m
-radius about a point that is drawn for each map, with the sensor noise of `near`. It
-takes four minutes on one thread for 200 maps. Cells that are not seen do not count.
-Scores are means over all cells that count; ± is the standard error of a difference over
-the maps, each of which is weighed by how many of its cells count.
+Both are evaluated on the maps of test/std: fully observed, and masked to a disc of 4, 8
+or 16 m radius around a random point, with the sensor noise of `near`. Scores are means
+over observed cells. ± is the standard error of a difference over maps, weighted by
+their numbers of observed cells. 200 maps take four minutes on one thread.
 """
 
 from collections.abc import Iterator, Sequence
@@ -35,9 +33,7 @@ SCORES = ("NLL", "CRPS", "lower fifth", "class right")
 
 
 def tables(work: Work, folder: Path, models: Sequence[str] = MODELS) -> dict[str, Rows]:
-    """Return the scores of two checkpoints by what is seen of a map, the plain one
-    first.
-    """
+    """Return the scores of two checkpoints and their difference, by observed radius."""
     dataset = TerrainDataset(work.maps_in / "stakes-v1.h5")
     loaded = [load_model(name) for name in models]
     means = find_ground_statistics(models[0], dataset).layer_means
@@ -63,22 +59,27 @@ def tables(work: Work, folder: Path, models: Sequence[str] = MODELS) -> dict[str
 def observed(
     dataset: TerrainDataset, masks: RandomMasks | None
 ) -> Iterator[tuple[Terrain, Observation, Tensor]]:
-    """Maps some at a time: the truth, what is seen of it, and which cells these are."""
-    looks = torch.from_numpy(draw_visibility(SEED, 0, dataset.map_count(SPLIT)))
-    looks[:, 6] = 0.0  # none of the path is driven, so that a disc is seen
+    """Yield chunks of maps: terrain, observation, mask of observed cells [B, H, W]."""
+    visibility = torch.from_numpy(draw_visibility(SEED, 0, dataset.map_count(SPLIT)))
+    visibility[:, 6] = 0.0  # no driven path: a disc is observed
     for indices, _ in dataset.chunks(SPLIT, fields=()):
         terrain = dataset.terrain(SPLIT, indices)
-        whole = terrain.observe()
+        observation = terrain.observe()
         if masks is None:
-            yield terrain, whole, torch.ones_like(terrain.class_id, dtype=torch.bool)
+            yield (
+                terrain,
+                observation,
+                torch.ones_like(terrain.class_id, dtype=torch.bool),
+            )
             continue
         maps = {
-            name: getattr(whole, name) for name in ("rgb", "elevation_m", "slope_deg")
+            name: getattr(observation, name)
+            for name in ("rgb", "elevation_m", "slope_deg")
         }
-        seen = masks.apply(maps, looks[indices.start : indices.stop])
+        seen = masks.apply(maps, visibility[indices.start : indices.stop])
         mask = seen[SEEN]
-        shown = {name: seen[name] for name in maps}
-        yield terrain, replace(whole, **shown, layers={SEEN: mask}), mask == 1
+        layers = {name: seen[name] for name in maps}
+        yield terrain, replace(observation, **layers, layers={SEEN: mask}), mask == 1
 
 
 def measure(
@@ -87,40 +88,45 @@ def measure(
     observation: Observation,
     seen: Tensor,
 ) -> np.ndarray:
-    """Sums of the scores over the seen cells of each map, and how many these are; shape
-    [models, B, scores + 1].
+    """Return sums of scores over observed cells, and the numbers of these cells.
+
+    The shape is [models, B, scores + 1].
     """
-    found = []
+    sums_by_model = []
     for model in models:
-        given, true = predict_observation(model, observation), terrain.traversability
-        right = (
+        predicted, true = (
+            predict_observation(model, observation),
+            terrain.traversability,
+        )
+        is_class_right = (
             model.member_probabilities(observation).mean(0).argmax(1)
             == terrain.class_id
         )
         scores = (
-            -given.log_prob(true),
-            given.crps(true),
-            lower_fifth_and_width(given, true)[0],
-            right,
+            -predicted.log_prob(true),
+            predicted.crps(true),
+            lower_fifth_and_width(predicted, true)[0],
+            is_class_right,
         )
         sums = [
             torch.where(seen, score.double(), 0).sum((1, 2))
             for score in (*scores, torch.ones_like(true))
         ]
-        found.append(torch.stack(sums, 1).numpy())
-    return np.stack(found)
+        sums_by_model.append(torch.stack(sums, 1).numpy())
+    return np.stack(sums_by_model)
 
 
-def lines(found: np.ndarray) -> list[list[str]]:
-    """Mean scores of each model, and the difference of the second to the first with its
-    standard error.
-    """
-    sums, cells = found[..., :-1], found[..., -1:]
+def lines(sums_by_model: np.ndarray) -> list[list[str]]:
+    """Return rows of mean scores, and of the difference second − first ± its error."""
+    sums, cells = sums_by_model[..., :-1], sums_by_model[..., -1:]
     means = sums.sum(1) / cells.sum(1)
     difference = means[1] - means[0]
-    # Of a ratio of sums over independent maps.
-    left = (sums[1] - sums[0]) - difference * cells[0]
-    error = np.sqrt((left**2).sum(0) * len(left) / (len(left) - 1)) / cells[0].sum()
+    # Standard error of a ratio of sums over independent maps.
+    residual = (sums[1] - sums[0]) - difference * cells[0]
+    error = (
+        np.sqrt((residual**2).sum(0) * len(residual) / (len(residual) - 1))
+        / cells[0].sum()
+    )
     text = [[f"{value:.4f}" for value in row] for row in means]
     return [
         *text,

@@ -1,13 +1,12 @@
-"""Tightness of the lower bound of the time to the goal, and a search for planners that
-are earlier than it.
+"""Tightness of the lower bound on the time to the goal, and attempts to beat it.
 
-`gap` takes λ fields of the shipped test maps in the world `stakes`, and the
-near-optimal reference. The gap between the two is split by bounds that leave a cause
-out: the excess of slopes that W is divided by; that a step reaches from quick cells
-into slow ones; that robots may dip into immobilising terrain. The rest are turns, dwell
-time, and what the reference loses. `walls` draws small worlds with a wall of slow cells
-across, some of which immobilise a robot before it is over, and drives planners that are
-given λ.
+`gap` compares the bound with the near-optimal reference, on λ fields of the shipped
+test maps in the world `stakes`. The gap is split by bounds that leave one cause out:
+the excess of slopes that W is divided by; steps that reach from fast cells into slow
+ones; dips into immobilising terrain. The remainder is due to turns, dwell time and the
+error of the reference. `walls` draws small worlds that a wall of slow cells divides.
+Some walls immobilise a robot before it has crossed them. Planners that are given λ then
+try to be faster than the bound.
 """
 
 import time
@@ -50,7 +49,7 @@ PLANNERS: dict[str, dict[str, Any]] = {
     "cl_rrt": {},
     "mppi": {"samples": 512, "cost_to_go": "map"},
 }
-_BLOCK = 10  # worlds of one wall
+_BLOCK = 10  # worlds with the same wall
 _LIMIT_S = 60.0
 
 
@@ -59,7 +58,7 @@ _LIMIT_S = 60.0
 
 @contextmanager
 def without(**changes: Any) -> Iterator[None]:
-    """Exchange parts of the bound, which then holds for a robot that is less able."""
+    """Replace functions of the bound, which then holds for a less capable robot."""
     with ExitStack() as stack:
         for name, value in changes.items():
             stack.enter_context(
@@ -69,12 +68,12 @@ def without(**changes: Any) -> Iterator[None]:
 
 
 def no_reach(fine: ndarray, squares: Grid, step_m: float, error_m: float) -> ndarray:
-    """λ⁺ of a robot that reads λ all along a step."""
+    """Return λ⁺ of a robot that reads λ continuously along a step."""
     return fine
 
 
 def gap(work: Work, folder: Path, maps: int = 50) -> dict[str, Rows]:
-    """Return fractions of the reference's time between it and the bound, by cause."""
+    """Return the gap between bound and reference, as fractions of its time, by cause."""
     suite = stakes_suite(
         DATA, planners=(REFERENCE,), models=("clairvoyant",), risks=("mean",)
     )
@@ -86,31 +85,31 @@ def gap(work: Work, folder: Path, maps: int = 50) -> dict[str, Rows]:
         goal_radius_m=problem.goal_radius_m,
         immobile=problem.immobile,
     )
-    found, seconds = [], 0.0
-    for number in np.flatnonzero(np.isfinite(times_s)):
-        ends = problem.start[number, :2].numpy(), problem.goal_m[number].numpy()
-        given = field[number].numpy(), problem.grid, motion, *ends
-        begun = time.process_time()
-        least = lower_bound_s(*given)
-        seconds += time.process_time() - begun
+    fractions_by_field, seconds = [], 0.0
+    for index in np.flatnonzero(np.isfinite(times_s)):
+        ends = problem.start[index, :2].numpy(), problem.goal_m[index].numpy()
+        arguments = field[index].numpy(), problem.grid, motion, *ends
+        started = time.process_time()
+        bound_s = lower_bound_s(*arguments)
+        seconds += time.process_time() - started
         with without(
             excess=lambda mesh, value: 1.0, _CHECK_EVERY=lower_bound._MOST_STEPS
         ):
-            converged = lower_bound_s(*given)
+            converged_s = lower_bound_s(*arguments)
         with without(_reached=no_reach):
-            reads = lower_bound_s(*given)
+            without_reach_s = lower_bound_s(*arguments)
         with without(_reached=no_reach, _deepest_m=lambda motion, immobile: -1.0):
-            dry = lower_bound_s(*given)
-        whole = times_s[number]
+            without_dips_s = lower_bound_s(*arguments)
+        reference_s = times_s[index]
         steps = (
-            least,
-            converged,
-            max(converged, reads),
-            min(max(reads, dry), whole),
-            whole,
+            bound_s,
+            converged_s,
+            max(converged_s, without_reach_s),
+            min(max(without_reach_s, without_dips_s), reference_s),
+            reference_s,
         )
-        found.append(np.diff(steps) / whole)
-    parts = np.array(found)
+        fractions_by_field.append(np.diff(steps) / reference_s)
+    parts = np.array(fractions_by_field)
     names = (
         "slopes in excess",
         "steps reach into slow cells",
@@ -136,8 +135,10 @@ def gap(work: Work, folder: Path, maps: int = 50) -> dict[str, Rows]:
 def walled(
     generator: np.random.Generator, grid: Grid, count: int
 ) -> tuple[ndarray, Immobile]:
-    """λ of worlds with a wall that takes 0.5 to 1.2 of the time that immobilises a
-    robot, with gaps at times.
+    """Draw λ fields with a wall, and the rule of immobilisation, for `count` worlds.
+
+    Crossing the wall takes 0.5 to 1.2 of the time that immobilises a robot. Some walls
+    have gaps.
     """
     fields = generator.choice([0.6, 0.8, 0.95], (count, *grid.shape))
     thickness, slow = int(generator.integers(1, 5)), float(generator.uniform(0.1, 0.9))
@@ -154,8 +155,9 @@ def walled(
 
 
 def drive_worlds(fields: ndarray, immobile: Immobile, grid: Grid, name: str) -> ndarray:
-    """Return seconds to the goal of a planner that is given λ, infinite if it does not
-    arrive, shape [B].
+    """Return seconds to the goal of a planner that is given λ, shape [B].
+
+    The time is infinite if the robot does not reach the goal.
     """
     ground, robot = torch.from_numpy(fields).float(), Unicycle()
     rules = Rules(free_space=FreeSpace(by="mean", above=0.05), min_traversability=0.02)
@@ -184,14 +186,15 @@ def drive_worlds(fields: ndarray, immobile: Immobile, grid: Grid, name: str) -> 
 
 
 def ends_of(grid: Grid) -> tuple[ndarray, ndarray]:
-    """Start and goal, on both sides of the wall."""
+    """Return start and goal in metres, on opposite sides of the wall."""
     middle = grid.height // 2 * grid.resolution_m + 0.25
     return np.array([1.25, middle]), np.array([grid.extent_m[0] - 1.75, middle])
 
 
 def walls(work: Work, folder: Path, maps: int = 500) -> dict[str, Rows]:
-    """Return whether a planner is earlier than the bound in worlds with walls, or
-    arrives where it is infinite.
+    """Return how often planners are faster than the bound in worlds with walls.
+
+    A planner that reaches the goal although the bound is infinite is counted apart.
     """
     grid, generator = Grid(13, 26, 0.5), np.random.default_rng(0)
     blocks = [walled(generator, grid, _BLOCK) for _ in range(max(1, maps // _BLOCK))]
@@ -203,20 +206,20 @@ def walls(work: Work, folder: Path, maps: int = 500) -> dict[str, Rows]:
         bounds += [
             lower_bound_s(field, grid, motion, *ends_of(grid)) for field in fields
         ]
-    least = np.array(bounds)
-    print(f"{len(least)} worlds; in {np.isinf(least).sum()} the bound is infinite")
+    bound_s = np.array(bounds)
+    print(f"{len(bound_s)} worlds; in {np.isinf(bound_s).sum()} the bound is infinite")
     rows = []
     for name in PLANNERS:
         times = np.concatenate([drive_worlds(*block, grid, name) for block in blocks])
         has_arrived = np.isfinite(times)
-        both = has_arrived & np.isfinite(least)
+        has_both = has_arrived & np.isfinite(bound_s)
         rows.append(
             {
                 "planner, given λ": name,
                 "arrived": has_arrived.sum(),
-                "earlier than the bound": (times[both] < least[both]).sum(),
-                "where it is infinite": (has_arrived & np.isinf(least)).sum(),
-                "bound over its time: median": f"{np.median(least[both] / times[both]):.3f}",
+                "earlier than the bound": (times[has_both] < bound_s[has_both]).sum(),
+                "where it is infinite": (has_arrived & np.isinf(bound_s)).sum(),
+                "bound over its time: median": f"{np.median(bound_s[has_both] / times[has_both]):.3f}",
             }
         )
     return {"walls": rows}

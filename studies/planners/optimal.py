@@ -1,13 +1,14 @@
-"""Error of the optimal planners: their grid, dwell time, and whether another planner is
-quicker.
+"""Error of the optimal planners due to their grid and dwell time; faster planners.
 
-On λ fields of maps of `stakes-v1 --seed 1`, drawn without rejection, which the planners
-are given (`clairvoyant`). The first table compares the time from start to goal with
-that at twice the resolution, and whether both find a path; the second says how much
-more it is where immobilising terrain counts as loss at once (`levels: 0`). The third
-drives the other planners on the same fields, which immobilise no robot: a planner is
-quicker where it takes less than the optimal planner by more than the difference to
-twice the resolution on that map.
+Planners are given the λ fields (`clairvoyant`), drawn without rejection on maps of
+`stakes-v1 --seed 1`. There are three tables:
+
+1. The time from start to goal compared with that at twice the resolution, and whether
+   both find a path.
+2. The added time if entering immobilising terrain counts as failure (`levels: 0`).
+3. The times of other planners on the same fields, which immobilise no robot. The last
+   column counts planners that beat the optimal one by more than the difference to twice
+   the resolution on that map.
 """
 
 import time
@@ -39,15 +40,16 @@ PLANNERS = ("optimal", "astar_dwa", "astar_mppi", "cl_rrt", "mppi")
 
 
 def cost_from_start(
-    problem: Problem, planner: str, **options: Any
+    problem: Problem, name: str, **options: Any
 ) -> tuple[np.ndarray, float]:
-    """Return the time from start to goal, infinite if there is no path, shape [B], and
-    seconds of a map.
+    """Return times from start to goal [B], and the computing time per map in seconds.
+
+    The time to the goal is infinite if there is no path.
     """
-    made = make("planner", read_part("planner", {"part": planner, "options": options}))
-    begun = time.perf_counter()
-    state = Optimal.init(made, problem, rng.generator(0))  # value iteration only
-    took = time.perf_counter() - begun
+    planner = make("planner", read_part("planner", {"part": name, "options": options}))
+    started = time.perf_counter()
+    state = Optimal.init(planner, problem, rng.generator(0))  # value iteration only
+    elapsed_s = time.perf_counter() - started
     cost = (
         ways_from(problem.start, state.dwell_s, state)
         .cost.min(1)
@@ -55,19 +57,20 @@ def cost_from_start(
         .numpy()
     )
     return np.where(
-        cost < made.no_way(state.costs).double().numpy(), cost, np.inf
-    ), took / len(problem)
+        cost < planner.no_way(state.costs).double().numpy(), cost, np.inf
+    ), elapsed_s / len(problem)
 
 
 def more_time(times: np.ndarray, base: np.ndarray) -> np.ndarray:
-    """Return by which fraction times are longer, of maps on which both have a path."""
-    both = np.isfinite(times) & np.isfinite(base)
-    return (times[both] - base[both]) / base[both]
+    """Return relative increases in time, of maps on which both have a path."""
+    has_both = np.isfinite(times) & np.isfinite(base)
+    return (times[has_both] - base[has_both]) / base[has_both]
 
 
 def grid_table(problem: Problem) -> tuple[Rows, list[tuple[np.ndarray, np.ndarray]]]:
-    """Return differences to twice the resolution, and of each row the times at both,
-    each of shape [B].
+    """Return differences to twice the resolution, and the times at both resolutions.
+
+    There is one pair of times per row, each of shape [B].
     """
     immobilising, rows, times = replace(problem, immobile=HOLDS), [], []
     cases: tuple[tuple[str, str, Problem, dict[str, Any]], ...] = (
@@ -95,7 +98,7 @@ def grid_table(problem: Problem) -> tuple[Rows, list[tuple[np.ndarray, np.ndarra
 
 
 def loss_table(reference: np.ndarray, entry: np.ndarray) -> Rows:
-    """Return what counting entry as loss adds to the time of the reference."""
+    """Return the time that counting entry as failure adds to the reference."""
     more = more_time(entry, reference)
     return [
         {
@@ -109,9 +112,7 @@ def loss_table(reference: np.ndarray, entry: np.ndarray) -> Rows:
 
 
 def drive(data: Path, maps: int) -> pd.DataFrame:
-    """Return seconds to the goal, infinite if it was not reached, a row a map and a
-    column a planner.
-    """
+    """Return seconds to the goal, infinite if not reached: rows maps, columns planners."""
     results = evaluate(
         data, planners=PLANNERS, maps=maps, verbose=False, **STAKES | GIVEN
     )
@@ -124,27 +125,30 @@ def drive(data: Path, maps: int) -> pd.DataFrame:
 
 
 def planner_table(seconds: pd.DataFrame, gap_s: np.ndarray) -> Rows:
-    """Return whether planners are quicker than the optimal one, by more than its grid's
-    difference on that map.
+    """Return how often planners are faster than the optimal one, and by more than `gap_s`.
+
+    Args:
+        seconds: times to the goal, one row per map and one column per planner.
+        gap_s: difference of the optimal planner to twice its resolution, shape [B].
     """
-    best, rows = seconds["optimal"], []
+    optimal_s, rows = seconds["optimal"], []
     for planner in PLANNERS:
-        own = seconds[planner]
-        has_arrived = np.isfinite(own)
+        planner_s = seconds[planner]
+        has_arrived = np.isfinite(planner_s)
         rows.append(
             {
                 "planner": planner,
-                "arrived": f"{has_arrived.sum()} of {len(own)}",
-                "time over that of optimal: median": f"{1 + np.median(more_time(own, best)):.3f}",
-                "quicker": f"{np.mean(has_arrived & (own < best)):.0%}",
-                "quicker by more than the grid": f"{np.mean(has_arrived & (own < best - gap_s)):.0%}",
+                "arrived": f"{has_arrived.sum()} of {len(planner_s)}",
+                "time over that of optimal: median": f"{1 + np.median(more_time(planner_s, optimal_s)):.3f}",
+                "quicker": f"{np.mean(has_arrived & (planner_s < optimal_s)):.0%}",
+                "quicker by more than the grid": f"{np.mean(has_arrived & (planner_s < optimal_s - gap_s)):.0%}",
             }
         )
     return rows
 
 
 def tables(work: Work, folder: Path, maps: int = 50) -> dict[str, Rows]:
-    """Return the tables of the grid, of entry as loss and of the other planners."""
+    """Return the tables of the grid, of entry as failure and of the other planners."""
     data = work.maps_in / "stakes-v1-seed1.h5"
     problem = build_unit(
         one_unit(stakes_suite(data, planners=("optimal",), **GIVEN), maps)

@@ -1,16 +1,15 @@
-"""Optimism of MPPI with risk on the cost: chosen actions cost more on fresh fields of λ
-than on its own.
+"""Optimism of MPPI with risk on the cost: cost on new fields of λ minus that on its own.
 
-MPPI chooses actions that cost little on the M fields that it drew, so that they could
-cost more on others (the optimism of a chosen minimum). Robots begin on maps of
-`stakes-v1 --seed 1` under the prediction of `stakes-v1`, with the time to go of
-`expected-time`, and drive on the mean of the prediction. After 0, 2 and 4 seconds the
-chosen actions are rolled out on 1 024 fresh fields. The table has the mean of fresh
-less own cost over maps and moments with its 95 % interval by maps (Student's t), in
-seconds, and how long a solve takes for one robot of a batch. CVaR of few fields is too
-low for
-any actions: so it has the same of those of the step before, which these fields did not
-choose.
+MPPI chooses actions whose cost is low on the M fields that it drew. On other fields
+they can cost more (the optimism of a chosen minimum). Robots start on maps of
+`stakes-v1 --seed 1` and plan with the prediction of `stakes-v1` and the time to go of
+`expected-time`. Their λ is the mean of the prediction. After 0, 2 and 4 seconds, the
+chosen actions are rolled out on 1 024 new fields. The table has the mean difference in
+seconds over maps and times with its 95 % interval by maps (Student's t), and the
+planning time for one robot of a batch.
+
+CVaR over few fields is biased low for any actions. The table therefore has the same
+difference for the actions of the previous step, which these fields did not select.
 """
 
 import time
@@ -38,9 +37,7 @@ CASES = ((0.0, (1, 4, 16, 64, 256)), (0.5, (20, 64, 256)), (0.8, (50, 64, 128, 2
 def costs_on(
     problem: Problem, state: Tensor, actions: Tensor, ground: Tensor, to_go: Tensor
 ) -> Tensor:
-    """What a sequence of actions [B, T, A] costs on each of M fields, [B·M, N], shape
-    [B, M].
-    """
+    """Return the cost of actions [B, T, A] on each of M fields [B·M, N], shape [B, M]."""
     noise = actions.new_zeros(actions.shape[1], actions.shape[2], 1)
     states, cost, _ = roll_out(
         problem, state, actions, noise, problem.goal_m, advance_chunk, ground
@@ -53,8 +50,12 @@ def costs_on(
 def optimism(
     problem: Problem, level: float, count: int, samples: int
 ) -> tuple[np.ndarray, float]:
-    """Fresh less own cost in seconds, of what was chosen and of the step before, [B,
-    moments, 2]; ms of a solve.
+    """Return cost differences in seconds, and the planning time in milliseconds.
+
+    Returns:
+        The cost on new fields minus that on the planner's own, of shape [B, times, 2]
+        (chosen actions, actions of the previous step), and the median planning time of
+        a step per robot.
     """
     planner = MPPI(
         MPPIConfig(
@@ -69,7 +70,7 @@ def optimism(
         problem, rng.generator(rng.stream_key(0, "cost risk"))
     )
     assert plan_state.to_go is not None
-    state, found, took = problem.start, [], []
+    state, gaps_by_moment, elapsed_s = problem.start, [], []
     observed = torch.full_like(state[:, 0], torch.nan)
 
     def fields(count: int, *key: Any) -> Tensor:
@@ -78,17 +79,19 @@ def optimism(
         )
 
     for step in range(MOMENTS[-1] + 1):
-        # The fields that it is about to draw.
+        # The fields that the planner will draw in this step.
         own_fields = fields(count, plan_state.key, plan_state.step)
-        begun = time.perf_counter()
+        started = time.perf_counter()
         now = Step(state=state, traversability=observed, time_s=step * problem.dt_s)
         action, after, _ = planner.plan(now, plan_state)
-        took.append(time.perf_counter() - begun)
+        elapsed_s.append(time.perf_counter() - started)
         if step in MOMENTS:
             chosen = torch.cat((action[:, None], after.mean[:, :-1]), 1)
             gaps = []
             for actions in (chosen, plan_state.mean):
-                own = costs_on(problem, state, actions, own_fields, plan_state.to_go)
+                own_fields_cost = costs_on(
+                    problem, state, actions, own_fields, plan_state.to_go
+                )
                 fresh = [
                     costs_on(
                         problem,
@@ -101,22 +104,22 @@ def optimism(
                 ]
                 fresh_cost, own_cost = (
                     tail_cost(cost[..., None], level)[:, 0]
-                    for cost in (torch.cat(fresh, 1), own)
+                    for cost in (torch.cat(fresh, 1), own_fields_cost)
                 )
                 gaps.append(fresh_cost - own_cost)
-            found.append(torch.stack(gaps, 1))
+            gaps_by_moment.append(torch.stack(gaps, 1))
         mean = problem.distribution.mean().to(state)
         traversability = problem.grid.lookup(
             problem.grid.pad(mean, outside=0.0), state[:, 0], state[:, 1]
         )
         state, plan_state = problem.robot(state, action, traversability), after
-    return torch.stack(found, 1).double().numpy(), 1000 * float(np.median(took)) / len(
-        problem
-    )
+    return torch.stack(gaps_by_moment, 1).double().numpy(), 1000 * float(
+        np.median(elapsed_s)
+    ) / len(problem)
 
 
 def with_interval(values: np.ndarray) -> str:
-    """Write the mean of maps with its 95 % interval by Student's t."""
+    """Format the mean over maps with its 95 % interval by Student's t."""
     mean, low, high = (float(end[0]) for end in mean_interval(values[None]))
     return f"{mean:+.2f} ({low:+.2f} to {high:+.2f})"
 
@@ -124,9 +127,7 @@ def with_interval(values: np.ndarray) -> str:
 def table(
     work: Work, folder: Path, maps: int = 20, samples: int = 1024
 ) -> dict[str, Rows]:
-    """Return what chosen actions cost more on fresh fields, by level and number of
-    fields.
-    """
+    """Return the optimism of chosen actions, by level and number of fields."""
     data = work.maps_in / "stakes-v1-seed1.h5"
     suite = stakes_suite(
         data, planners=("mppi",), models=("stakes-v1",), risks=("expected-time",)

@@ -1,6 +1,4 @@
-"""A\\*+DWA and CL-RRT, each without one of its parts: what the part is worth, by the
-suite `without.yaml`.
-"""
+"""Ablations of A\\*+DWA and CL-RRT, for the suite `without.yaml`."""
 
 from dataclasses import replace
 from typing import Any
@@ -14,8 +12,9 @@ from benchnav.planning.planners.astar import guided
 
 
 def farthest(ground: Any, points: Tensor, lookahead_m: float) -> tuple[Tensor, Tensor]:
-    """Return the farthest point of the path within the look-ahead, whatever lies
-    between, and that it is straight.
+    """Return the farthest waypoint within the look-ahead, without a check of the line.
+
+    The second value says that the line to it is free, for all episodes.
     """
     along_m = torch.linalg.vector_norm(points.diff(dim=1), dim=2).cumsum(dim=1)
     index = torch.where(along_m <= lookahead_m, torch.arange(along_m.shape[1]), 0).amax(
@@ -26,7 +25,7 @@ def farthest(ground: Any, points: Tensor, lookahead_m: float) -> tuple[Tensor, T
 
 
 class NoLines(AStarDWA):
-    """A\\*+DWA that heads for the farthest point of the path within the look-ahead."""
+    """A\\*+DWA that follows the farthest point of its path within the look-ahead."""
 
     def plan(self, step: Any, plan_state: Any) -> Any:
         with patch.object(guided, "choose_waypoint", farthest):
@@ -34,10 +33,10 @@ class NoLines(AStarDWA):
 
 
 class NoHalving(CLRRT):
-    """CL-RRT whose turning radius stays what it is after a failure."""
+    """CL-RRT that does not halve its turning radius after a failure."""
 
-    def _closed_loop(self, *given: Any) -> Any:
-        loop = super()._closed_loop(*given)
+    def _closed_loop(self, *arguments: Any) -> Any:
+        loop = super()._closed_loop(*arguments)
         return replace(
             loop, radius_m=torch.full_like(loop.radius_m, self.config.turning_radius_m)
         )

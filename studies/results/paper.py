@@ -1,8 +1,9 @@
-"""The paper's Table I next to a run's rows.
+"""Table I of the paper compared with a run.
 
-Theirs: Wilson's interval of 20 episodes, and Student's of a mean of 20 by its standard
-deviation. p: Fisher's exact test of success, Welch's of T_total, Holm's correction over
-the scenarios, each of the two apart.
+Intervals of the paper's values are Wilson's for success in 20 episodes, and Student's
+for a mean of 20, from its standard deviation. p is of Fisher's exact test for success
+and of Welch's test for T_total. Holm's correction is over the scenarios, separately for
+the two.
 """
 
 from collections.abc import Mapping
@@ -18,8 +19,8 @@ from benchnav.stats.holm import holm
 from benchnav.stats.intervals import wilson_interval
 from studies.tables import success, table
 
-# MPPI under CVaR at 0.9; Endo, Honda and Ishigami (2024), Table I: success, mean and
-# standard deviation of T_total.
+# Success, mean and standard deviation of T_total of MPPI under CVaR at 0.9: Endo, Honda
+# and Ishigami (2024), Table I.
 PAPER_EPISODES = 20
 PAPER = {"std": (0.90, 52.7, 22.5), "hg": (0.80, 60.2, 26.1), "hs": (0.85, 58.6, 25.7)}
 
@@ -49,7 +50,7 @@ def paper(run: Path) -> Table:
 
 
 def _cells(row: Mapping[Any, Any]) -> tuple[tuple[str, str], tuple[str, str]]:
-    """Return success and T_total of a scenario, each theirs and ours."""
+    """Return the cells of success and of T_total in a scenario: the paper's and ours."""
     rate, mean, std = PAPER[row["scenario"]]
     low, high = wilson_interval(rate, PAPER_EPISODES)
     half = t.ppf(0.975, PAPER_EPISODES - 1) * std / PAPER_EPISODES**0.5
@@ -65,7 +66,7 @@ def _cells(row: Mapping[Any, Any]) -> tuple[tuple[str, str], tuple[str, str]]:
 
 
 def _p_values(row: Mapping[Any, Any]) -> tuple[float, float]:
-    """Return p of success and of T_total, before correction."""
+    """Return the uncorrected p-values of success and of T_total."""
     rate, mean, std = PAPER[row["scenario"]]
     count = row["n_episodes"]
     theirs, ours = round(rate * PAPER_EPISODES), round(row["success_rate"] * count)

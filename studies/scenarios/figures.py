@@ -1,6 +1,4 @@
-"""Figures of the series: examples of maps, distributions of their cells, and curves
-over severity.
-"""
+"""Figures of the series: maps, distributions over cells, curves over severity."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -26,9 +24,9 @@ from studies.scenarios.statistics import (
 )
 from studies.study import Work
 
-EXAMPLE = 13  # of test/std, in all figures of the page
+EXAMPLE = 13  # index of the map of test/std that all figures of the page show
 COLOURS = {"std": "#222222", "hg": ORANGE, "hs": BLUE}
-# What classes an error is of, with the look of its curve.
+# Label, marker and line style of an error, by the classes that it is computed with.
 SOURCES = {
     "none": ("no class known", "", ":"),
     "predicted": ("classes predicted", "o", "-"),
@@ -76,9 +74,7 @@ def _picture(rgb: np.ndarray) -> np.ndarray:
 
 @styled()
 def draw_examples(pairs: Mapping[str, Maps], extent_m: tuple[float, float]) -> Figure:
-    """Draw one map in hg, std and hs: its picture, its slope, and the error of its
-    predicted E[λ].
-    """
+    """Draw one map in hg, std and hs: picture, slope and error of predicted E[λ]."""
     figure = Figure(figsize=(7.2, 4.25), layout="compressed")
     panels = figure.subplots(3, len(EXAMPLES), sharex=True, sharey=True)
     shown = [pairs[name] for name in EXAMPLES]
@@ -97,7 +93,7 @@ def draw_examples(pairs: Mapping[str, Maps], extent_m: tuple[float, float]) -> F
 
 @styled()
 def draw_tints(work: Work, folder: Path) -> dict[str, Figure]:
-    """Draw the picture of one map under the tints that the page shows."""
+    """Draw the picture of one map under each tint of `TINTS`."""
     data = load_recipe("shift-v1").to_dict()
     splits = {"test/std": {"scenario": "one", "maps": EXAMPLE + 1}}
     pictures = []
@@ -116,9 +112,7 @@ def draw_tints(work: Work, folder: Path) -> dict[str, Figure]:
 
 @styled()
 def draw_distributions(series: Mapping[str, Maps], steepest: float) -> Figure:
-    """Draw which fractions of all cells in std, hg and hs are above each slope, λ and
-    brightness.
-    """
+    """Draw the fractions of cells in std, hg and hs above each slope, λ and brightness."""
     labels = ("(a) slope [°]", "(b) realised λ", "(c) brightness (1 is full light)")
     figure, places = panel_grid(labels, 3, 2.0)
     panels = [panel for (panel,) in places]
@@ -152,13 +146,14 @@ def draw_distributions(series: Mapping[str, Maps], steepest: float) -> Figure:
 
 @styled()
 def draw_series(series: Mapping[str, Maps]) -> Figure:
-    """Draw accuracy and error over severity, and the accuracy of each map in low light
-    over its brightness.
+    """Draw accuracy and error over severity, and accuracy over brightness for hs.
+
+    The third panel has one point per map.
     """
     figure, places = panel_grid(["(a)", "(b)", "(c)"], 3, 2.2)
     accuracy, error, of_maps = (panel for (panel,) in places)
     for preset in ("hg", "hs"):
-        own = {
+        by_severity = {
             _severity(name): maps
             for name, maps in series.items()
             if name.startswith((preset, "std"))
@@ -172,10 +167,10 @@ def draw_series(series: Mapping[str, Maps]) -> Figure:
                 "lw": 1.2,
             }
             _draw_estimates(
-                error, own, f"square {source}", rms, look, f"{preset}, {words}"
+                error, by_severity, f"square {source}", rms, look, f"{preset}, {words}"
             )
         predicted = {"color": COLOURS[preset], "marker": "o", "ms": 3.5, "lw": 1.2}
-        _draw_estimates(accuracy, own, "right", first, predicted)
+        _draw_estimates(accuracy, by_severity, "right", first, predicted)
     dark = {
         _severity(name): maps for name, maps in series.items() if name.startswith("hs")
     }
@@ -207,7 +202,7 @@ def draw_series(series: Mapping[str, Maps]) -> Figure:
 
 def _draw_estimates(
     panel: Axes,
-    own: Mapping[float, Maps],
+    by_severity: Mapping[float, Maps],
     key: str,
     statistic: Statistic,
     look: Mapping[str, Any],
@@ -215,10 +210,20 @@ def _draw_estimates(
 ) -> None:
     """Draw a statistic in per cent over severity, with standard errors."""
     value, error = (
-        100 * np.array([estimate([maps[key]], statistic) for maps in own.values()]).T
+        100
+        * np.array(
+            [estimate([maps[key]], statistic) for maps in by_severity.values()]
+        ).T
     )
     draw_estimates(
-        panel, list(own), value, value - error, value + error, look, label, bars=True
+        panel,
+        list(by_severity),
+        value,
+        value - error,
+        value + error,
+        look,
+        label,
+        bars=True,
     )
 
 

@@ -1,8 +1,8 @@
-"""The series of shifts `shift-v1`, measured for docs/studies/scenarios.md.
+"""Measurements of the series of shifts `shift-v1`, for docs/studies/scenarios.md.
 
-Every statistic is a function of means over maps, so that one bootstrap over maps gives
-the standard error of each. It takes some minutes on one thread. Letters in shapes: B
-maps, H×W cells, C classes, K numbers a map.
+Every statistic is a function of means over maps, so one bootstrap over maps gives the
+standard error of each. The measurements take some minutes on one thread. Letters in
+shapes: B maps, H×W cells, C classes, K numbers per map.
 """
 
 from collections.abc import Mapping, Sequence
@@ -47,8 +47,10 @@ PAIRS: dict[str, Any] = {
 def measure_maps(
     model: FusedModel, recipe: Recipe, maps: Maps
 ) -> dict[str, np.ndarray]:
-    """Measures ground and prediction: numbers a map by name, shape [B], [B, K] or [B,
-    *, H, W].
+    """Measure terrain and predictions of maps.
+
+    Returns:
+        Numbers per map by name, of shape [B], [B, K] or [B, *, H, W].
     """
     pieces = []
     for start in range(0, len(maps["rgb"]), CHUNK_MAPS):
@@ -76,8 +78,11 @@ def _measure_chunk(
         torch.from_numpy(maps[k]) for k in ("rgb", "elevation_m", "slope_deg")
     )
     predicted = model.predict(Observation(rgb, elevation, inclination, recipe.grid))
-    classes, found = torch.from_numpy(ids.astype(np.int64)), predicted.weights.argmax(1)
-    own = (
+    classes, predicted_class = (
+        torch.from_numpy(ids.astype(np.int64)),
+        predicted.weights.argmax(1),
+    )
+    one_hot = (
         torch.nn.functional.one_hot(classes, count).movedim(-1, 1).to(predicted.weights)
     )
     result = {
@@ -92,29 +97,31 @@ def _measure_chunk(
         "stuck": (expected <= recipe.stuck_threshold).double().numpy(),
         "time": maps["reference_time_s"],
         "weights": predicted.weights.numpy(),
-        "right": (found == classes).double().numpy(),
-        "darker": (found < classes).numpy(),
+        "right": (predicted_class == classes).double().numpy(),
+        "darker": (predicted_class < classes).numpy(),
         "confusion": histogram(
-            (classes * count + found).numpy(), np.arange(count**2 + 1) - 0.5
+            (classes * count + predicted_class).numpy(), np.arange(count**2 + 1) - 0.5
         ),
         "wet clay": (
-            found == [c.name for c in recipe.classes].index("wet_clay")
+            predicted_class == [c.name for c in recipe.classes].index("wet_clay")
         ).numpy(),
     }
     sources = {
         "predicted": predicted.weights,
-        "true": own,
-        "none": torch.full_like(own, 1 / count),
+        "true": one_hot,
+        "none": torch.full_like(one_hot, 1 / count),
     }
     for name, weights in sources.items():
         mixture, draws = (
             replace(predicted, weights=weights),
             rng.generator(rng.stream_key(0, "docs", "pit")),
         )
-        place = pit(mixture, torch.from_numpy(maps["traversability"]), draws).numpy()
+        transformed = pit(
+            mixture, torch.from_numpy(maps["traversability"]), draws
+        ).numpy()
         result[f"held {name}"], result[f"tail {name}"] = (
-            np.abs(place - 0.5) <= 0.45,
-            place < 0.1,
+            np.abs(transformed - 0.5) <= 0.45,
+            transformed < 0.1,
         )
         result[f"error {name}"] = (mixture.mean() - expected).numpy()
         result[f"square {name}"] = result[f"error {name}"] ** 2
@@ -122,9 +129,7 @@ def _measure_chunk(
 
 
 def by_scenario(pairs: Mapping[str, Maps], name: str) -> Rows:
-    """Return a table with a row a scenario and the columns of its name in
-    `tables.yaml`.
-    """
+    """Return a table with a row per scenario and the columns of `name` in tables.yaml."""
 
     def cell(maps: Maps, of: Sequence[str], **how: Any) -> str:
         return show([maps[key] for key in of], **how)
@@ -137,8 +142,10 @@ def by_scenario(pairs: Mapping[str, Maps], name: str) -> Rows:
 
 
 def changes(model: FusedModel, maps: Maps, std: Maps) -> Maps:
-    """Return what changes from std on the same maps, with squared errors by where
-    ground and picture come from.
+    """Return the changes from std on the same maps.
+
+    Squared errors are split by the source of the picture and of the terrain, each of
+    which is either that of std or that of the scenario.
     """
 
     def squares(seen: Maps, ground: Maps) -> np.ndarray:
@@ -147,8 +154,8 @@ def changes(model: FusedModel, maps: Maps, std: Maps) -> Maps:
             *model.table.lookup(torch.from_numpy(ground["slope_deg"])),
         )
         chunks = zip(*(layer.split(CHUNK_MAPS) for layer in layers), strict=True)
-        found = torch.cat([TraversabilityMixture(*chunk).mean() for chunk in chunks])
-        return (found.numpy() - ground["expected"]) ** 2
+        expected = torch.cat([TraversabilityMixture(*chunk).mean() for chunk in chunks])
+        return (expected.numpy() - ground["expected"]) ** 2
 
     return {
         **{key: maps[key] - std[key] for key in ("expected", "stuck", "right")},
@@ -162,7 +169,7 @@ def changes(model: FusedModel, maps: Maps, std: Maps) -> Maps:
 
 
 def slope_table(std: Maps, hg: Maps) -> Rows:
-    """Return where on the slopes of hg-100 the errors are made."""
+    """Return the errors of hg-100 by slope."""
     rows = []
     for low, high in pairwise((0, 10, 15, 20, 25, 90)):
         of_std, of_hg = (
@@ -190,8 +197,9 @@ def slope_table(std: Maps, hg: Maps) -> Rows:
 
 
 def colour_table(recipe: Recipe) -> Rows:
-    """Return at which brightness a class looks as the next darker ones: the scale of
-    least squared difference.
+    """Return the brightness at which a class has the colour of each darker one.
+
+    The brightness is the factor on its colour with the least squared difference.
     """
     rows, colours = (
         [],
@@ -218,8 +226,10 @@ def colour_table(recipe: Recipe) -> Rows:
 def measure_series(
     model: FusedModel, recipe: Recipe
 ) -> dict[str, dict[str, np.ndarray]]:
-    """Measures the splits of shift-v1 and, made alike, a severity beyond each end, by
-    name of the scenario.
+    """Measure the splits of shift-v1 and one further severity beyond each end.
+
+    Returns:
+        The measurements by name of the scenario.
     """
     data = recipe.to_dict()
     series: dict[str, dict[str, np.ndarray]] = {}
@@ -231,9 +241,10 @@ def measure_series(
     longer = recipe_from_dict(data, "of the study")
     for split in ["test/std", *sorted(set(longer.splits) - {"test/std"})]:
         spec = longer.splits[split]
-        unasked = replace(longer, splits={split: replace(spec, solvable=False)})
+        unfiltered = replace(longer, splits={split: replace(spec, solvable=False)})
         maps, drawn_first = (
-            generate(made, split, np.arange(spec.maps)) for made in (longer, unasked)
+            generate(variant, split, np.arange(spec.maps))
+            for variant in (longer, unfiltered)
         )
         rejected_draws = (maps["elevation_m"] != drawn_first["elevation_m"]).any(
             axis=(1, 2)
@@ -245,17 +256,20 @@ def measure_series(
 
 
 def measure_pairs(model: FusedModel, recipe: Recipe) -> dict[str, Maps]:
-    """Measures the same maps under several scenarios: all are drawn on the random
-    streams of test/std.
+    """Measure the same maps under several scenarios.
+
+    The maps are the same since all are drawn from the random streams of test/std.
     """
     pairs: dict[str, Maps] = {}
     for name, entry in PAIRS.items():
         split = {"test/std": {"scenario": name, "maps": PAIRED_MAPS}}
-        one = recipe_from_dict(
+        scenario_recipe = recipe_from_dict(
             recipe.to_dict() | {"scenarios": {name: entry}, "splits": split}, name
         )
         pairs[name] = measure_maps(
-            model, one, generate(one, "test/std", np.arange(PAIRED_MAPS))
+            model,
+            scenario_recipe,
+            generate(scenario_recipe, "test/std", np.arange(PAIRED_MAPS)),
         )
     return pairs
 

@@ -1,6 +1,4 @@
-"""Statistics of means over maps, each with its standard error by the bootstrap over
-maps.
-"""
+"""Statistics of means over maps, with standard errors by a bootstrap over maps."""
 
 from collections.abc import Callable, Mapping, Sequence
 
@@ -16,20 +14,19 @@ Statistic = Callable[[np.ndarray], np.ndarray]
 
 
 def histogram(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Counts the cells of each map in bins, shape [B, bins]."""
+    """Count the cells of each map in bins, shape [B, bins]."""
     return np.stack([np.histogram(entry, edges)[0] for entry in values])
 
 
 def estimate(
     columns: Sequence[np.ndarray], statistic: Statistic
 ) -> tuple[float, float]:
-    """A statistic of means over maps, and its standard error by the bootstrap over
-    maps.
+    """Return a statistic of means over maps, and its standard error by the bootstrap.
 
     Args:
-        columns: [B], [B, K] or, to be averaged over the cells, [B, H, W]; put side by
-            side.
-        statistic: from means [*, K] to values [*].
+        columns: arrays to concatenate along K: [B], [B, K], or [B, H, W], which is
+            averaged over cells.
+        statistic: function from means [*, K] to values [*].
     """
     flat = [
         c.reshape(len(c), -1) if c.ndim < 3 else c.mean(axis=(1, 2))[:, None]
@@ -57,7 +54,7 @@ def show(
     scale: float = 1,
     digits: int = 1,
 ) -> str:
-    """Write `value ± standard error`, or only the value if it cannot vary."""
+    """Format `value ± standard error`, or only the value if the error is 0."""
     value, error = (
         scale * number for number in estimate(columns, STATISTICS[statistic])
     )
@@ -67,42 +64,41 @@ def show(
 
 
 def first(means: np.ndarray) -> np.ndarray:
-    """The first of the means."""
+    """Return the first mean."""
     return means[..., 0]
 
 
 def ratio(means: np.ndarray) -> np.ndarray:
-    """The first of the means over the second."""
+    """Return the ratio of the first mean to the second."""
     return means[..., 0] / means[..., 1]
 
 
 def rms(means: np.ndarray) -> np.ndarray:
-    """Root mean square from a mean square; over the cells of the second column, if
-    there is one.
+    """Return the root mean square, given a mean square.
+
+    With two columns, the mean is over the cells of the mask in the second.
     """
     return np.sqrt(first(means) if means.shape[-1] == 1 else ratio(means))
 
 
 def excess(means: np.ndarray) -> np.ndarray:
-    """By how much the first root mean square exceeds the second, from mean squares."""
+    """Return the difference of the first two root mean squares, given mean squares."""
     return np.sqrt(means[..., 0]) - np.sqrt(means[..., 1])
 
 
-def quantile(share: float, edges: np.ndarray) -> Statistic:
-    """The statistic that reads a quantile off a histogram."""
+def quantile(fraction: float, edges: np.ndarray) -> Statistic:
+    """Return the statistic that reads a quantile from a histogram."""
     return lambda counts: edges[
-        1 + (counts.cumsum(-1) < share * counts.sum(-1, keepdims=True)).sum(-1)
+        1 + (counts.cumsum(-1) < fraction * counts.sum(-1, keepdims=True)).sum(-1)
     ]
 
 
 def mean_iou(confusion: np.ndarray) -> np.ndarray:
-    """Intersection over union, averaged over the classes, from confusion counts [*,
-    C·C].
-    """
+    """Return the mean intersection over union, given confusion counts [*, C·C]."""
     count = round(confusion.shape[-1] ** 0.5)
     square = confusion.reshape(*confusion.shape[:-1], count, count)
-    both = np.diagonal(square, axis1=-2, axis2=-1)
-    return (both / (square.sum(-1) + square.sum(-2) - both)).mean(-1)
+    intersection = np.diagonal(square, axis1=-2, axis2=-1)
+    return (intersection / (square.sum(-1) + square.sum(-2) - intersection)).mean(-1)
 
 
 STATISTICS: dict[str, Statistic] = {

@@ -1,11 +1,13 @@
-"""Coverage of intervals and error rates of tests, on simulated benchmarks whose truth
-is known.
+"""Coverage of intervals and error rates of tests, on simulated benchmarks.
 
-Maps have a chance of success of their own (beta, with a given correlation within a
-map), and conditions have their chances and their noise partly in common. Times of
-arrival are lognormal, half of their spread the map's, longer where the chance is low,
-and a failure counts as T = 100 s. Tables have how often an interval covers the truth,
-and how often a family of comparisons in which nothing differs finds a difference.
+The true values of these benchmarks are known. Each map has its own probability of
+success (beta distributed, with a given correlation within a map). Conditions share a
+part of these probabilities and of the noise. Times to the goal are lognormal. Half of
+their variance is between maps, and times are longer on maps with a low probability of
+success. A failure counts as T = 100 s.
+
+The tables have the coverage of intervals, and the rate at which a family of comparisons
+between equal conditions finds a significant difference.
 """
 
 from collections.abc import Iterator, Sequence
@@ -23,17 +25,18 @@ from benchnav.stats.flips import sign_flip_p, signed_rank_p
 from benchnav.stats.holm import ALPHA
 from benchnav.stats.intervals import design_effect, success_interval, wilson_interval
 
-_MAPS_WITHIN = 0.2  # correlation within a map of a group, about the group's chance
+# Correlation within a map, about the probability of success of its group.
+_MAPS_WITHIN = 0.2
 RATES = (0.05, 0.2, 0.35, 0.5, 0.65, 0.8, 0.95)
-# Correlation within a map, and the share of chances and noise that two conditions have
-# in common.
+# Pairs of: correlation within a map; fraction of the probabilities of success and of
+# the noise that two conditions share.
 LIKENESS = ((0.1, 0.3), (0.3, 0.7), (0.6, 0.9))
 TIME_BUDGET_S = 100.0
 _MEDIAN_S, _SPREAD, _STEP_S = 33.0, 0.3, 0.1
 
 
 def chance_at(score: np.ndarray, rate: float, within: float) -> np.ndarray:
-    """Return the chance of success of maps by their normal scores."""
+    """Return the probability of success of maps, given their normal scores."""
     size = 1 / within - 1
     return beta.ppf(norm.cdf(score), rate * size, (1 - rate) * size)
 
@@ -44,14 +47,12 @@ def chances(
     shape: tuple[int, int],
     like: tuple[float, float],
 ) -> np.ndarray:
-    """Draw the chance of success of each condition on each map, shape [studies,
-    conditions, maps].
-    """
+    """Draw the probability of success, shape [studies, conditions, maps]."""
     within, common = like
     studies, maps = shape
     shared = generator.standard_normal((studies, 1, maps))
-    own = generator.standard_normal((studies, len(rates), maps))
-    scores = np.sqrt(common) * shared + np.sqrt(1 - common) * own
+    independent = generator.standard_normal((studies, len(rates), maps))
+    scores = np.sqrt(common) * shared + np.sqrt(1 - common) * independent
     grid = np.linspace(-6, 6, 4_001)
     columns = [
         np.interp(scores[:, i], grid, chance_at(grid, rate, within))
@@ -63,31 +64,43 @@ def chances(
 def outcomes(
     generator: np.random.Generator, chance: np.ndarray, draws: int, common: float
 ) -> np.ndarray:
-    """Success, bool, shape [studies, conditions, maps, draws]; a share of the noise is
-    the same for all conditions.
+    """Draw success, bool, shape [studies, conditions, maps, draws].
+
+    Args:
+        generator: source of all draws.
+        chance: probability of success, shape [studies, conditions, maps].
+        draws: episodes per map.
+        common: probability that a condition uses the noise that all conditions share.
     """
     shape = (*chance.shape, draws)
     noise = np.broadcast_to(generator.random((shape[0], 1, *shape[2:])), shape)
-    own = generator.random(shape)
-    return np.where(generator.random(shape) < common, noise, own) < chance[..., None]
+    independent = generator.random(shape)
+    return (
+        np.where(generator.random(shape) < common, noise, independent)
+        < chance[..., None]
+    )
 
 
 def times(
     generator: np.random.Generator, success: np.ndarray, hardness: np.ndarray
 ) -> np.ndarray:
-    """T_total in seconds, of the shape of `success`; hardness of maps as normal scores,
-    of that less the last.
+    """Draw T_total in seconds, of the shape of `success`.
+
+    Args:
+        generator: source of all draws.
+        success: shape [studies, conditions, maps, draws].
+        hardness: normal scores of maps, shape [studies, conditions, maps].
     """
-    own = generator.standard_normal(success.shape)
-    arrival = _MEDIAN_S * np.exp(_SPREAD * np.sqrt(0.5) * (hardness[..., None] + own))
+    independent = generator.standard_normal(success.shape)
+    arrival = _MEDIAN_S * np.exp(
+        _SPREAD * np.sqrt(0.5) * (hardness[..., None] + independent)
+    )
     steps = np.rint(np.minimum(arrival, TIME_BUDGET_S - 1) / _STEP_S)
     return np.where(success, steps * _STEP_S, TIME_BUDGET_S)
 
 
 def hardness(chance: np.ndarray, rates: Sequence[float], within: float) -> np.ndarray:
-    """Return normal scores of maps, the higher the lower their chance; of the shape of
-    `chance`.
-    """
+    """Return normal scores of maps that fall with `chance`, of its shape."""
     grid = np.linspace(-4, 4, 2_001)
     columns = [
         -np.interp(chance[:, i], chance_at(grid, rate, within), grid)
@@ -112,21 +125,20 @@ def drives(
 def true_difference_s(
     generator: np.random.Generator, rates: Sequence[float], like: tuple[float, float]
 ) -> tuple[float, float]:
-    """Return T_total of the first of two conditions, and how much it is over the
-    other's.
-    """
+    """Return the true T_total of the first of two conditions, and first − second."""
     _, far = drives(generator, rates, (1, 400_000), 1, like)
     return far[0, 0].mean(), (far[0, 0] - far[0, 1]).mean()
 
 
 def covers(ends: np.ndarray, truth: float) -> np.ndarray:
-    """Return which intervals, ends of shape [studies, 2], hold the truth."""
+    """Return which intervals, given ends [studies, 2], contain the true value."""
     return (ends[:, 0] <= truth) & (truth <= ends[:, 1])
 
 
 def rate_intervals(success: np.ndarray) -> np.ndarray:
-    """Return Wilson's intervals over the design effect, [studies, 2], of success
-    [studies, maps, draws].
+    """Return Wilson's intervals [studies, 2] of success [studies, maps, draws].
+
+    The number of episodes is divided by the design effect.
     """
     maps, draws = success.shape[1:]
     member = np.repeat(np.arange(maps), draws)
@@ -143,8 +155,12 @@ def rate_intervals(success: np.ndarray) -> np.ndarray:
 def difference_intervals(
     wins: np.ndarray, episodes: int, confidence: float = 0.95
 ) -> np.ndarray:
-    """Return intervals of the difference of success, [studies, 2], of successes by map
-    [studies, 2, maps].
+    """Return intervals [studies, 2] of the difference in success rate.
+
+    Args:
+        wins: successes per map, shape [studies, 2, maps].
+        episodes: episodes per map.
+        confidence: nominal coverage of the intervals.
     """
     return np.stack(
         success_interval(wins[:, 0] - wins[:, 1], episodes, confidence)[1:], axis=1
@@ -158,9 +174,7 @@ def cover_of_success(
     draws: int,
     rates: Sequence[float] = RATES,
 ) -> Iterator[float]:
-    """For each rate and likeness, yield how often the interval of success holds the
-    rate.
-    """
+    """Yield the coverage of the interval of success, per rate and likeness."""
     for rate, like in product(rates, LIKENESS):
         chance = chances(generator, (rate,), (studies, maps), like)
         success = outcomes(generator, chance, draws, like[1])[:, 0]
@@ -174,9 +188,7 @@ def cover_of_differences(
     draws: int,
     rates: Sequence[float] = RATES,
 ) -> Iterator[float]:
-    """For each pair of rates and likeness, yield how often the interval of the
-    difference of success holds it.
-    """
+    """Yield the coverage of intervals of a difference, per pair of rates and likeness."""
     for pair, like in product(combinations(rates, 2), LIKENESS):
         chance = chances(generator, pair, (studies, maps), like)
         wins = outcomes(generator, chance, draws, like[1]).sum(-1)
@@ -186,7 +198,7 @@ def cover_of_differences(
 def episodes_of(
     success: np.ndarray, total_time_s: np.ndarray
 ) -> Iterator[pd.DataFrame]:
-    """Yield the paired episodes of each study, as the package's statistics read them."""
+    """Yield the paired episodes of each study, in the format of `benchnav.stats`."""
     maps, draws = success.shape[2:]
     for won, taken in zip(success, total_time_s, strict=True):
         yield pd.DataFrame(
@@ -209,20 +221,19 @@ def cover_of_times(
     rates: tuple[float, float],
     resampled: int = 0,
 ) -> pd.DataFrame:
-    """Return cover and mean width of the intervals of T_total and of its difference
-    between two conditions.
+    """Return coverage and mean width of the intervals of T_total and its difference.
 
     Args:
-        generator: of all that is drawn.
-        studies: how many of each likeness.
-        shape: maps of a study, and episodes a map.
-        rates: of success; T_total is that of the first.
-        resampled: number of the studies for which a bootstrap (BCa) over maps is
-            computed too.
+        generator: source of all draws.
+        studies: number of studies per likeness.
+        shape: maps per study, and episodes per map.
+        rates: success rates of two conditions; T_total is that of the first.
+        resampled: number of studies for which a bootstrap (BCa) over maps is computed
+            too.
 
     Returns:
-        A row each for `T_total` and `ΔT_total`, and for the bootstrap's; columns
-        `cover` and `width`.
+        Rows `T_total`, `ΔT_total` and, with `resampled`, those of the bootstrap;
+        columns `cover` and `width`.
     """
     maps, draws = shape
     rows = []
@@ -233,16 +244,16 @@ def cover_of_times(
         episodes = list(episodes_of(success, taken))
         intervals = (
             [
-                total_time_mean(own, {"time_budget_s": TIME_BUDGET_S})[1:]
-                for own in episodes
+                total_time_mean(study, {"time_budget_s": TIME_BUDGET_S})[1:]
+                for study in episodes
             ],
-            [time_difference(own)[1:] for own in episodes],
+            [time_difference(study)[1:] for study in episodes],
         )
         values = by_map[:, 0], by_map[:, 0] - by_map[:, 1]
         for name, ends, truth, value in zip(
             ("T_total", "ΔT_total"), intervals, truths, values, strict=True
         ):
-            found = {name: np.array(ends)}
+            ends_by_method = {name: np.array(ends)}
             if resampled:
                 drawn = bootstrap(
                     (value[:resampled],),
@@ -251,18 +262,18 @@ def cover_of_times(
                     n_resamples=999,
                     rng=generator,
                 )
-                found[f"{name}, bootstrap"] = np.stack(
+                ends_by_method[f"{name}, bootstrap"] = np.stack(
                     drawn.confidence_interval, axis=1
                 )
             rows += [
                 pd.DataFrame(
                     {
-                        "name": key,
-                        "cover": covers(own, truth),
-                        "width": own[:, 1] - own[:, 0],
+                        "name": method,
+                        "cover": covers(method_ends, truth),
+                        "width": method_ends[:, 1] - method_ends[:, 0],
                     }
                 )
-                for key, own in found.items()
+                for method, method_ends in ends_by_method.items()
             ]
     return pd.concat(rows).groupby("name", sort=False).mean()
 
@@ -274,26 +285,27 @@ def false_findings(
     draws: int,
     rates: Sequence[float] = (0.05, 0.5, 0.8),
 ) -> Iterator[np.ndarray]:
-    """For each rate and likeness, yield how often any two of six equal settings differ
-    significantly.
+    """Yield the rates of studies in which any two of six equal settings differ.
 
-    By success, and by time.
+    There is one array per rate and likeness: by success, and by time.
     """
     pairs = list(combinations(range(6), 2))
     for rate, like in product(rates, LIKENESS):
         success, total_time_s = drives(
             generator, [rate] * 6, (studies, maps), draws, like
         )
-        found = np.zeros(2)
+        n_significant = np.zeros(2)
         for wins, taken in zip(success.sum(-1), total_time_s.mean(-1), strict=True):
             by_success = [sign_flip_p(wins[i] - wins[j]) for i, j in pairs]
             by_time = [
                 signed_rank_p(alike(taken[i] - taken[j], TIME_BUDGET_S))
                 for i, j in pairs
             ]
-            # Holm's correction finds something where its first step does.
-            found += [min(p) <= ALPHA / len(pairs) for p in (by_success, by_time)]
-        yield found / studies
+            # Holm's correction rejects any hypothesis only if its first step does.
+            n_significant += [
+                min(p) <= ALPHA / len(pairs) for p in (by_success, by_time)
+            ]
+        yield n_significant / studies
 
 
 def group_wins(
@@ -304,8 +316,9 @@ def group_wins(
     like: tuple[float, float],
     one_map: bool,
 ) -> np.ndarray:
-    """Draw successes by group, shape [studies, conditions, groups], all episodes on one
-    map or each on its own.
+    """Draw successes per group, shape [studies, conditions, groups].
+
+    With `one_map`, all episodes of a group are on one map; otherwise each has its own.
     """
     chance = chances(generator, rates, shape, like)
     if one_map:
@@ -323,27 +336,29 @@ def cover_of_groups(
     rates: tuple[float, float],
     like: tuple[float, float],
 ) -> dict[str, float]:
-    """Return cover of the intervals of a difference and of each rate, and half-widths;
-    also those of a cluster t.
+    """Return the coverage of intervals of a difference and of each rate, with few groups.
+
+    For the difference, half-widths and the values of a cluster t interval (`_t`) are
+    returned too.
     """
     drawn = [
         group_wins(generator, rates, (studies // 2, groups), episodes, like, one_map)
         for one_map in (True, False)
     ]
     wins, truth = np.concatenate(drawn), rates[0] - rates[1]
-    shares = (wins[:, 0] - wins[:, 1]) / episodes
-    half = t.ppf(0.975, groups - 1) * shares.std(-1, ddof=1) / np.sqrt(groups)
-    student = shares.mean(-1)[:, None] + np.stack((-half, half), axis=1)
-    found = {}
+    differences = (wins[:, 0] - wins[:, 1]) / episodes
+    half = t.ppf(0.975, groups - 1) * differences.std(-1, ddof=1) / np.sqrt(groups)
+    student = differences.mean(-1)[:, None] + np.stack((-half, half), axis=1)
+    results = {}
     for name, ends in (("", difference_intervals(wins, episodes)), ("_t", student)):
-        found |= {
+        results |= {
             f"cover{name}": covers(ends, truth).mean(),
             f"half{name}": np.ptp(ends, axis=1).mean() / 2,
         }
-    for place, rate in enumerate(rates):
-        ends = rate_intervals(np.arange(episodes) < wins[:, place, :, None])
-        found[f"cover_{place}"] = covers(ends, rate).mean()
-    return found
+    for index, rate in enumerate(rates):
+        ends = rate_intervals(np.arange(episodes) < wins[:, index, :, None])
+        results[f"cover_{index}"] = covers(ends, rate).mean()
+    return results
 
 
 def unlike(
@@ -354,12 +369,14 @@ def unlike(
     draws: int,
     same_maps: bool,
 ) -> np.ndarray:
-    """Successes of settings of one mean and unlike shape, shape [studies, settings,
-    maps].
+    """Draw successes of settings of equal mean and different shape.
 
-    The first half succeeds with a chance of 0.9 everywhere, the other always but for a
-    tenth of the maps, where it
-    always fails: the same maps for all of that half, or each its own.
+    The first half of the settings succeeds with probability 0.9 on every map. The other
+    half always fails on a tenth of the maps and always succeeds on the others. With
+    `same_maps`, the settings of that half fail on the same maps.
+
+    Returns:
+        Successes, shape [studies, settings, maps].
     """
     half = settings // 2
     steady = generator.binomial(draws, 0.9, (studies, half, maps))
@@ -373,11 +390,10 @@ def unlike(
 
 
 def called_worse(wins: np.ndarray, draws: int) -> np.ndarray:
-    """Which settings a report calls worse than the best, bool, of the shape [studies,
-    settings].
+    """Return which settings a report calls worse than the best, [studies, settings].
 
     Args:
         wins: successes, shape [studies, settings, maps].
-        draws: episodes a map.
+        draws: episodes per map.
     """
     return np.array([best_set_p(study.T, draws)[0] < ALPHA for study in wins])

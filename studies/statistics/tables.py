@@ -1,4 +1,4 @@
-"""The tables of the study, a script each."""
+"""Scripts of the study; each computes one table."""
 
 from collections.abc import Callable, Iterator
 from itertools import product
@@ -28,8 +28,8 @@ from studies.statistics.simulated import (
 )
 from studies.study import Work
 
-# Of the studies of few, large groups: rates of two conditions, correlation within a
-# group, and what they share.
+# Studies with few, large groups: success rates of two conditions; correlation within a
+# group, and the fraction that two conditions share.
 GROUPS, IN_A_GROUP = (5, 8, 12), (20, 60)
 GROUP_RATES, GROUP_LIKENESS = (
     ((0.99, 0.9), (0.8, 0.6)),
@@ -42,8 +42,9 @@ DRAWS = (1, 3)
 def _as_table(
     rows: Callable[[int, int], Iterator[dict[str, object]]],
 ) -> Callable[..., dict[str, pd.DataFrame]]:
-    """Make a script of a function that yields rows from the number of studies of each
-    condition and a seed.
+    """Turn a function that yields rows into a script.
+
+    The function takes the number of studies per condition and a seed.
     """
 
     def script(
@@ -56,9 +57,7 @@ def _as_table(
 
 @_as_table
 def intervals(studies: int, seed: int) -> Iterator[dict[str, object]]:
-    """Yield cover of the intervals of success and of its difference, and how often
-    `compare` errs.
-    """
+    """Yield coverage of intervals of success, and type I error rates of `compare`."""
     for maps, draws in product(MAPS, DRAWS):
         generator = np.random.default_rng([seed, maps, draws])
         success, difference = (
@@ -80,27 +79,23 @@ def intervals(studies: int, seed: int) -> Iterator[dict[str, object]]:
 
 @_as_table
 def times(studies: int, seed: int) -> Iterator[dict[str, object]]:
-    """Yield cover and width of the intervals of T_total and of its difference, and
-    those of a bootstrap.
-    """
+    """Yield coverage and width of intervals of T_total, also those of a bootstrap."""
     for maps, draws, rate in product((8, 20, 30), DRAWS, (0.8, 0.95, 0.99)):
         generator = np.random.default_rng([seed, maps, draws, round(100 * rate)])
         rates = rate, rate - 0.1
-        found = cover_of_times(
+        coverage = cover_of_times(
             generator, studies // 3, (maps, draws), rates, studies // 20
         )
         cells = {
             name: f"{100 * row['cover']:.1f} ({row['width']:.1f} s)"
-            for name, row in found.iterrows()
+            for name, row in coverage.iterrows()
         }
         yield {"maps": maps, "episodes a map": draws, "success": rate, **cells}
 
 
 @_as_table
 def groups(studies: int, seed: int) -> Iterator[dict[str, object]]:
-    """Cover and width of the intervals of success and of its difference on few, large
-    groups.
-    """
+    """Yield coverage and width of intervals of success with few, large groups."""
     for groups, episodes, like in product(GROUPS, IN_A_GROUP, GROUP_LIKENESS):
         generator = np.random.default_rng(
             [seed, groups, episodes, *(round(100 * value) for value in like)]
@@ -108,27 +103,28 @@ def groups(studies: int, seed: int) -> Iterator[dict[str, object]]:
         row: dict[str, object] = {"groups": groups, "episodes": episodes}
         row |= {"correlation": like[0], "shared": like[1]}
         covers: dict[str, object] = {}
-        for one, other in GROUP_RATES:
-            found = cover_of_groups(
-                generator, studies, groups, episodes, (one, other), like
+        for rate_a, rate_b in GROUP_RATES:
+            coverage = cover_of_groups(
+                generator, studies, groups, episodes, (rate_a, rate_b), like
             )
-            row[f"{one:g} − {other:g}"] = (
-                f"{100 * found['cover']:.1f} ({found['half']:.2f})"
+            row[f"{rate_a:g} − {rate_b:g}"] = (
+                f"{100 * coverage['cover']:.1f} ({coverage['half']:.2f})"
             )
-            row[f"{one:g} − {other:g}, t"] = (
-                f"{100 * found['cover_t']:.1f} ({found['half_t']:.2f})"
+            row[f"{rate_a:g} − {rate_b:g}, t"] = (
+                f"{100 * coverage['cover_t']:.1f} ({coverage['half_t']:.2f})"
             )
             covers |= {
-                f"{one:g}": f"{100 * found['cover_0']:.1f}",
-                f"{other:g}": f"{100 * found['cover_1']:.1f}",
+                f"{rate_a:g}": f"{100 * coverage['cover_0']:.1f}",
+                f"{rate_b:g}": f"{100 * coverage['cover_1']:.1f}",
             }
         yield row | covers
 
 
 @_as_table
 def best(studies: int, seed: int) -> Iterator[dict[str, object]]:
-    """How often a condition that is as good as the best is called worse, and one that
-    is 10 or 20 points worse.
+    """Yield how often a condition as good as the best is called worse, and the power.
+
+    The power is for a condition that is 10 or 20 points worse.
     """
     for settings, maps, draws in product((6, 12), (20, *MAPS), DRAWS):
         generator = np.random.default_rng([seed, settings, maps, draws])
@@ -141,15 +137,16 @@ def best(studies: int, seed: int) -> Iterator[dict[str, object]]:
         half = settings // 2
         rates = {f"all tied, {rate:g}": [rate] * settings for rate in (0.8, 0.95)}
         rates["half tied"] = [0.8] * half + [0.7] * half
-        for words, own in rates.items():
-            called = _called_worse(generator, own, (studies, maps), draws)
-            row[words] = _share(called[:, np.array(own) == max(own)].any(1))
-        for words, same_maps in (("unlike", False), ("unlike, same maps", True)):
+        for heading, case in rates.items():
+            called = _called_worse(generator, case, (studies, maps), draws)
+            is_best = np.array(case) == max(case)
+            row[heading] = _percentage(called[:, is_best].any(1))
+        for heading, same_maps in (("unlike", False), ("unlike, same maps", True)):
             wins = unlike(generator, studies, settings, maps, draws, same_maps)
-            row[words] = _share(called_worse(wins, draws).any(1))
+            row[heading] = _percentage(called_worse(wins, draws).any(1))
         for points in (10, 20):
-            own = [0.8] * (settings - 1) + [0.8 - points / 100]
-            called = _called_worse(generator, own, (studies, maps), draws)
+            case = [0.8] * (settings - 1) + [0.8 - points / 100]
+            called = _called_worse(generator, case, (studies, maps), draws)
             row[f"power, {points} points"] = f"{100 * called[:, -1].mean():.0f}"
         yield row
 
@@ -160,17 +157,16 @@ def _called_worse(
     shape: tuple[int, int],
     draws: int,
 ) -> np.ndarray:
-    """Draw studies of settings with these rates; return which are called worse,
-    [studies, settings].
-    """
+    """Draw studies with these rates; return which settings are called worse."""
     success, _ = drives(generator, rates, shape, draws, LIKENESS[1])
     return called_worse(success.sum(-1), draws)
 
 
 @_as_table
 def hypotheses(studies: int, seed: int) -> Iterator[dict[str, object]]:
-    """How often a single hypothesis is shown where it is false: no difference, or one
-    as large as the margin.
+    """Yield how often a false hypothesis is supported.
+
+    It is false because the conditions do not differ, or differ by the margin.
     """
     for maps, draws, rate in product((20, 50, 200), DRAWS, (0.8, 0.95)):
         generator = np.random.default_rng([seed, maps, draws, round(100 * rate), 1])
@@ -182,22 +178,24 @@ def hypotheses(studies: int, seed: int) -> Iterator[dict[str, object]]:
         low = difference_intervals(success.sum(-1), draws, 1 - 2 * ALPHA)[:, 0]
         pairs = episodes_of(success, taken)
         low_s, high_s = np.array(
-            [time_difference(own, 1 - 2 * ALPHA)[1:] for own in pairs]
+            [time_difference(episodes, 1 - 2 * ALPHA)[1:] for episodes in pairs]
         ).T
         yield {
             "maps": maps,
             "episodes a map": draws,
             "success": rate,
-            "difference, success": _share(
+            "difference, success": _percentage(
                 np.array([sign_flip_p(wins[0] - wins[1]) < ALPHA for wins in equal])
             ),
-            "non-inferiority, success": _share(low > -0.1),
-            "non-inferiority, T_total": _share(high_s < margin_s),
-            "equivalence, T_total": _share((high_s < margin_s) & (low_s > -margin_s)),
+            "non-inferiority, success": _percentage(low > -0.1),
+            "non-inferiority, T_total": _percentage(high_s < margin_s),
+            "equivalence, T_total": _percentage(
+                (high_s < margin_s) & (low_s > -margin_s)
+            ),
         }
 
 
-def _share(found: np.ndarray) -> str:
-    """A share in per cent with its 95 % interval of Clopper and Pearson."""
-    ends = binomtest(int(found.sum()), len(found)).proportion_ci()
-    return f"{100 * found.mean():.1f} ({100 * ends.low:.1f}–{100 * ends.high:.1f})"
+def _percentage(is_true: np.ndarray) -> str:
+    """Format a rate in per cent with its 95 % interval of Clopper and Pearson."""
+    ends = binomtest(int(is_true.sum()), len(is_true)).proportion_ci()
+    return f"{100 * is_true.mean():.1f} ({100 * ends.low:.1f}–{100 * ends.high:.1f})"

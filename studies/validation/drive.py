@@ -1,7 +1,7 @@
-"""Driving the trials: a loop of its own, in which two independent fields move the
-robot.
+"""Simulation of episodes in which two independent λ fields move the robot.
 
-None of the simulation of `benchnav` is used. Letters in shapes: B trials.
+It uses no part of the simulation of `benchnav`. Letters in shapes: B episodes, M pairs
+of fields, N cells of a padded map.
 """
 
 from typing import Any
@@ -21,18 +21,19 @@ from benchnav.planning.problem import Dynamics, motion_traversability
 from benchnav.planning.robots import component_wise
 from studies.validation.task import GOAL_M, GOAL_RADIUS_M, STEPS, Setup
 
-# λ of ground off the map that is free: a rollout stays there, at the
-# `min_traversability` of the setup.
+# λ off the map if `off_map` is `still`: it is above 0, so the cell is free, and a rollout
+# there moves at the `min_traversability` of the setup.
 _STILL = 1e-30
 
 
 class ManyTrialsMPPI(MPPI):
-    """MPPI that is compiled even at few samples: hundreds of trials of one shape share
-    the compiling.
+    """MPPI that is compiled even with few samples.
+
+    Compiling pays off, since hundreds of episodes have the same shape.
 
     Args:
-        config: settings.
-        setup: how rollouts see the ground: `motions` and `off_map`.
+        config: settings of MPPI.
+        setup: setup whose `motions` and `off_map` set the fields of rollouts.
     """
 
     worth_compiling = 0
@@ -50,8 +51,9 @@ class ManyTrialsMPPI(MPPI):
             )
 
     def _ground(self, plan_state: MPPIState, state: Tensor) -> Tensor:
-        """Return what rollouts are on in this step, shape [B·M, N], of pairs of fields
-        [B·M, 2·N].
+        """Return the padded λ fields of this step's rollouts.
+
+        The shape is [B·M, N], or [B·M, 2·N] with pairs of fields.
         """
         if self._is_paired:
             problem = plan_state.problem
@@ -73,22 +75,26 @@ def advance_pair(
     target: Tensor,
     dynamics: Dynamics,
 ) -> tuple[Tensor, Tensor]:
-    """Roll samples out as `mppi.advance_chunk` does, where one field scales v and
-    another ω.
+    """Roll out samples as `mppi_rollouts.advance_chunk` does, with a field for v and ω.
 
-    The motion of `ROVER` and the cost of `TimeAndDistance` are written out, with x, y
-    and θ apart: by `robot` and `objective`, which take whole states, a step takes three
-    times as long.
+    The motion of `ROVER` and the cost of `TimeAndDistance` are written out for separate
+    x, y and θ. With `robot` and `objective`, which take stacked states, a step takes
+    three times as long.
 
     Args:
-        padded_ground: a linear field and then an angular one, shape [B·M, 2·N]; the
-            others are those of `mppi`.
+        states: see `advance_chunk`.
+        cost: see `advance_chunk`.
+        sampled: see `advance_chunk`.
+        padded_ground: λ of linear motion followed by λ of angular motion, shape
+            [B·M, 2·N].
+        target: see `advance_chunk`.
+        dynamics: see `advance_chunk`.
     """
     mean, noise, low, high = sampled
     grid, robot, _, min_traversability = dynamics
     objective: Any = dynamics.objective  # a `TimeAndDistance`
     x, y, heading = states.unbind(-1)
-    away = distance(states, target)
+    goal_distance = distance(states, target)
     fields, angular = padded_ground.flatten(), padded_ground.shape[1] // 2
     first = torch.arange(len(padded_ground), dtype=torch.int32, device=states.device)[
         :, None
@@ -103,36 +109,40 @@ def advance_pair(
         )
         cell = first + row * (grid.width + 2) + column
         ground = fields[cell]
-        going = away > GOAL_RADIUS_M
+        going = goal_distance > GOAL_RADIUS_M
         cost = (
             cost
-            + torch.where(going, robot.dt_s + away**objective.power, 0)
+            + torch.where(going, robot.dt_s + goal_distance**objective.power, 0)
             + PENALTY * (ground <= 0)
         )
         advance, turn = (
-            going * robot.dt_s * motion_traversability(each, min_traversability)
-            for each in (ground, fields[cell + angular])
+            going
+            * robot.dt_s
+            * motion_traversability(traversability, min_traversability)
+            for traversability in (ground, fields[cell + angular])
         )
         x = x + advance * speed * torch.cos(heading)
         y = y + advance * speed * torch.sin(heading)
         heading = heading + turn * turn_rate
-        away = torch.sqrt((x - target[..., 0]) ** 2 + (y - target[..., 1]) ** 2)
+        goal_distance = torch.sqrt(
+            (x - target[..., 0]) ** 2 + (y - target[..., 1]) ** 2
+        )
     return component_wise(torch.stack((x, y, heading), dim=-1)), cost
 
 
 def drive(
     planner: MPPI, problem: Problem, traction: Tensor, generator: torch.Generator
 ) -> Tensor:
-    """Drives B trials until they have arrived or their time is over.
+    """Run B episodes until the robots reach the goal or the time limit.
 
     Args:
-        planner: is asked once a step; its computing takes no time of the trial's.
-        problem: with what is predicted.
+        planner: planner, called once per step; planning takes no simulated time.
+        problem: planning problem with the prediction.
         traction: true linear and angular λ, shape [B, 2, H, W].
-        generator: the planner's randomness, the same for all B.
+        generator: source of the planner's noise, the same for all B.
 
     Returns:
-        Time of arrival in seconds, infinite where there was none, shape [B].
+        Time to the goal in seconds, infinite if it was not reached, shape [B].
     """
     arrival_s = torch.full((len(problem),), torch.inf)
     state, observed = problem.start, torch.full((len(problem),), torch.nan)
@@ -154,13 +164,13 @@ def drive(
 
 
 def move(state: Tensor, action: Tensor, traction: Tensor, dt_s: float) -> Tensor:
-    """Moves robots for one step.
+    """Move robots by one step.
 
     Args:
         state: (x, y, θ), shape [B, 3].
         action: (v, ω), shape [B, 2].
         traction: linear and angular λ, shape [B, 2, H, W].
-        dt_s: time step.
+        dt_s: time step in seconds.
 
     Returns:
         The next states, shape [B, 3].
@@ -178,23 +188,21 @@ def move(state: Tensor, action: Tensor, traction: Tensor, dt_s: float) -> Tensor
 
 
 def traction_at(state: Tensor, traction: Tensor) -> Tensor:
-    """Linear and angular λ in the cells of 1 m where robots stand, 0 off the map, shape
-    [B, 2].
-    """
+    """Return linear and angular λ in the robots' cells of 1 m, 0 off the map, [B, 2]."""
     height, width = traction.shape[2:]
     column, row = state[:, 0].floor().long(), state[:, 1].floor().long()
     on_map = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    here = traction[
+    cell_traction = traction[
         torch.arange(len(state)),
         :,
         row.clamp(0, height - 1),
         column.clamp(0, width - 1),
     ]
-    return torch.where(on_map[:, None], here, 0.0)
+    return torch.where(on_map[:, None], cell_traction, 0.0)
 
 
 def has_arrived(state: Tensor) -> Tensor:
-    """Tells which robots are at the goal, bool, shape [B]."""
+    """Return which robots are within the goal's radius, bool, shape [B]."""
     return (
         torch.hypot(state[:, 0] - GOAL_M[0], state[:, 1] - GOAL_M[1]) <= GOAL_RADIUS_M
     )

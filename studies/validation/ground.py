@@ -1,15 +1,14 @@
-"""The ground of Cai et al.: traction as a mixture of Gaussians, drawn again until it
-lies in [0, 1].
+"""Terrain of Cai et al.: traction as a mixture of Gaussians, truncated to [0, 1].
 
-Such a draw has the distribution of the mixture *given* that it lies in [0, 1], with the
-CDF
+They resample values outside [0, 1]. An accepted value has the distribution of the
+mixture *given* that it is in [0, 1], whose CDF is
 
-    F(x) = (M(x) − M(0)) / (M(1) − M(0)),  M the CDF of the mixture.
+    F(x) = (M(x) − M(0)) / (M(1) − M(0)),  where M is the CDF of the mixture.
 
-A `TraversabilityMixture` is *clipped* instead: what lies below 0 becomes 0, which would
-give vegetation a mean of 0.36 in place of 0.50. `Ground.slices` cuts the distribution
-into 100 parts of one probability; point masses at their means are a mixture of the same
-mean and of the same CVaR at every whole per cent.
+A `TraversabilityMixture` is *clipped* instead: values below 0 become 0, which would
+give vegetation a mean of 0.36 instead of 0.50. `Ground.slices` therefore cuts the
+distribution into 100 parts of equal probability. Point masses at their means form a
+mixture of the same mean, and of the same CVaR at every whole per cent.
 
 Source: Cai, Everett, Sharma, Osteen and How (2023), "Probabilistic traversability model
 for risk-aware motion planning in off-road environments", IROS;
@@ -29,12 +28,12 @@ SLICES = 100
 
 @dataclass(frozen=True)
 class Ground:
-    """One kind of ground.
+    """Distribution of traction on one kind of terrain: a mixture of K Gaussians.
 
     Args:
-        weights: of the Gaussians, summing to 1, K of them.
-        means: K of them.
-        stds: K of them.
+        weights: weights of the K Gaussians, which sum to 1.
+        means: means of the K Gaussians.
+        stds: standard deviations of the K Gaussians.
     """
 
     weights: tuple[float, ...]
@@ -42,12 +41,12 @@ class Ground:
     stds: tuple[float, ...]
 
     def cdf(self, value: np.ndarray) -> np.ndarray:
-        """P(λ ≤ value) for values in [0, 1]."""
+        """Return P(λ ≤ value) for values in [0, 1]."""
         nothing, all_ = self._mixture_cdf(np.array([0.0, 1.0]))
         return (self._mixture_cdf(value) - nothing) / (all_ - nothing)
 
     def quantile(self, probability: np.ndarray) -> np.ndarray:
-        """The value that λ falls below with a probability in [0, 1]."""
+        """Return the quantile of λ at a probability in [0, 1]."""
         low = np.zeros_like(probability, dtype=float)
         width = 1.0
         for _ in range(_BISECTIONS):
@@ -56,26 +55,25 @@ class Ground:
         return low + width / 2
 
     def slices(self) -> np.ndarray:
-        """Means of λ within each of 100 parts of one probability, lowest first, shape
-        [100].
-        """
+        """Return the means of λ in 100 parts of equal probability, ascending, [100]."""
         edges = self.quantile(np.arange(1, SLICES) / SLICES)
         return (
             np.diff(self._partial_mean(np.concatenate(([0.0], edges, [1.0])))) * SLICES
         )
 
-    def histogram_cvar(self, share: float) -> float:
-        """Their tail mean: of a histogram of 20 bins, rounded up to the centre of a
-        bin.
+    def histogram_cvar(self, fraction: float) -> float:
+        """Return their tail mean, from a histogram of 20 bins.
 
-        The bins are taken whole until they hold the share, and centres are cut to
-        hundredths. They fill the histogram with 1 000 draws; here it is exact.
+        The tail consists of whole bins, from the lowest until their mass reaches the
+        fraction. Its mean is rounded up to the next centre of a bin, which is truncated
+        to two decimals. Their histogram has 1 000 draws; here it is exact.
 
         Args:
-            share: of the distribution, from below, in (0, 1]; 1 gives the mean.
+            fraction: fraction of the distribution in the lower tail, in (0, 1]; 1 gives
+                the mean.
         """
         centres, mass = self._histogram()
-        last = np.searchsorted(mass.cumsum(), share) if share < 1 else _BINS - 1
+        last = np.searchsorted(mass.cumsum(), fraction) if fraction < 1 else _BINS - 1
         tail = slice(0, int(last) + 1)
         mean = (mass[tail] * centres[tail]).sum() / mass[tail].sum()
         return float(np.floor(100 * centres[centres >= mean][0])) / 100
@@ -84,8 +82,8 @@ class Ground:
         """Return the point masses of their sampled fields, lowest first, each of
         probability 1/200, shape [200].
 
-        Their sampler cuts the mass of each bin to whole per cents and gives the
-        remainder to λ = 1. It then rounds 100·u, u uniform in [0, 1], so that 0 and 100
+        Their sampler truncates the mass of each bin to whole per cents and assigns the
+        remainder to λ = 1. It then rounds 100·u for u uniform in [0, 1], so 0 and 100
         have half the probability of other per cents. The 0 gives λ = 0.
         """
         centres, mass = self._histogram()
@@ -104,7 +102,7 @@ class Ground:
         return (np.asarray(self.weights) * ndtr(self._standardise(value))).sum(-1)
 
     def _partial_mean(self, value: np.ndarray) -> np.ndarray:
-        """E[λ; λ ≤ value] up to a constant."""
+        """Return E[λ; λ ≤ value] up to a constant."""
         z = self._standardise(value)
         density = np.exp(-0.5 * z**2) / np.sqrt(2 * np.pi)
         parts = np.asarray(self.means) * ndtr(z) - np.asarray(self.stds) * density

@@ -1,17 +1,17 @@
-"""Tables of the trials next to the published ones, as Markdown.
+"""Tables of our episodes compared with published ones, as Markdown.
 
-Intervals are Wilson's, 95 %, over trials. Two settings, or two runs, on the same trials
-are compared by the exact McNemar test, ours with theirs by Fisher's exact test and
-Newcombe's interval (1998, "Interval estimation for the difference between independent
-proportions: comparison of eleven methods", method 10).
+Intervals are Wilson's 95 % intervals over episodes. Two settings, or two runs, on the
+same episodes are compared by the exact McNemar test. Ours are compared with theirs by
+Fisher's exact test and Newcombe's interval (1998, "Interval estimation for the
+difference between independent proportions: comparison of eleven methods", method 10).
 
-What Cai et al. measured is counted in the log of trials that they publish with their
-code, `mppi_benchmark/envs_40_trials_5_densities_4_date_20220907-2234.pickle` in
-https://github.com/mit-acl/mppi_numba, method
-`risk_dyn`: λ̂ is the mean of the lowest fraction α of the distribution, which is our
-`cvar:1 − α`; α = 1 is our `mean`. `published.csv` has how many of 200 trials arrived
-within 15 s, and the mean time of those; `published_pairs.csv` of each density the
-trials in which `cvar:0.8` arrived and `mean` did not, and the reverse.
+The results of Cai et al. are counted in the log that they publish with their code,
+`mppi_benchmark/envs_40_trials_5_densities_4_date_20220907-2234.pickle` in
+https://github.com/mit-acl/mppi_numba, method `risk_dyn`. Their λ̂ is the mean of the
+lowest fraction α of the distribution, which is our `cvar:1 − α`; α = 1 is our `mean`.
+`published.csv` has the number of successes within 15 s in 200 episodes, and their mean
+time. `published_pairs.csv` has, per density, the numbers of episodes in which only
+`cvar:0.8` or only `mean` reached the goal.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,7 +33,7 @@ PUBLISHED = pd.read_csv(Path(__file__).with_name("published.csv")).set_index(LIN
 PUBLISHED_PAIRS = pd.read_csv(
     Path(__file__).with_name("published_pairs.csv")
 ).set_index("density")
-# What is compared on the same trials; of the first the log of theirs is counted too.
+# Pairs of settings on the same episodes. The first pair is counted in their log too.
 PAIRS = (("cvar:0.8", "mean"), ("cost-cvar:0.6", "cost"), ("cost-cvar:0.6", "cvar:0.6"))
 
 
@@ -41,7 +41,7 @@ def tabulate(rows: pd.DataFrame) -> str:
     """Return the table of success, and those of the pairs of settings that were run.
 
     Args:
-        rows: trials, from `run_trials`.
+        rows: one row per episode, from `run_trials`.
     """
     settings = set(rows["setting"])
     pairs = [tabulate_pairs(rows, *pair) for pair in PAIRS if {*pair} <= settings]
@@ -49,11 +49,12 @@ def tabulate(rows: pd.DataFrame) -> str:
 
 
 def tabulate_success(rows: pd.DataFrame) -> str:
-    """Return success and mean time of the successes, ours and theirs; p is corrected by
-    Holm's method over all lines.
+    """Return success and mean time of successes, ours and theirs.
+
+    p has Holm's correction over all lines.
 
     Args:
-        rows: trials, from `run_trials`.
+        rows: one row per episode, from `run_trials`.
     """
     ours = rows.groupby(LINE, sort=False).agg(
         arrived=("success", "sum"),
@@ -86,19 +87,20 @@ def tabulate_success(rows: pd.DataFrame) -> str:
     )
 
 
-def tabulate_pairs(rows: pd.DataFrame, one: str, other: str) -> str:
-    """Return what a setting gains over another on the same trials; of the first of
-    `PAIRS` also in theirs.
+def tabulate_pairs(rows: pd.DataFrame, a: str, b: str) -> str:
+    """Return the gain of setting `a` over setting `b` on the same episodes.
+
+    For the first of `PAIRS` the gain in their log is added.
 
     Args:
-        rows: trials, from `run_trials`; both settings are among them.
-        one: a setting.
-        other: the other.
+        rows: one row per episode of both settings, from `run_trials`.
+        a: setting whose gain is computed.
+        b: setting to compare with.
     """
     won = wins(rows)
-    sides = (won.xs(setting, level="setting") for setting in (one, other))
-    header = ["points", f"`{one}` alone, `{other}` alone", "p"]
-    has_theirs = (one, other) == PAIRS[0]
+    sides = (won.xs(setting, level="setting") for setting in (a, b))
+    header = ["points", f"only `{a}`, only `{b}`", "p"]
+    has_theirs = (a, b) == PAIRS[0]
     lines = []
     for density, changed in changes(*sides, ["density"]).items():
         line = [f"{100 * density:.0f} %", *show_changes(changed, sign_flip_p(changed))]
@@ -114,12 +116,12 @@ def tabulate_pairs(rows: pd.DataFrame, one: str, other: str) -> str:
 
 
 def tabulate_runs(runs: Mapping[str, pd.DataFrame]) -> str:
-    """Return success and mean time of several runs of the same trials, and what each
-    changes on the first.
+    """Return success and mean time of runs of the same episodes, and their differences.
+
+    Differences are to the first run; p has Holm's correction over the lines of a run.
 
     Args:
-        runs: trials by name, from `run_trials`; p is corrected by Holm's method over
-            the lines of a run.
+        runs: rows of episodes by name of the run, from `run_trials`.
     """
     first, *others = runs
     means = {
@@ -130,47 +132,51 @@ def tabulate_runs(runs: Mapping[str, pd.DataFrame]) -> str:
     cells = {
         name: {
             row.Index: f"{100 * row.success:.1f}, {show_time(row.time_s)} s"
-            for row in own.itertuples()
+            for row in means_of_run.itertuples()
         }
-        for name, own in means.items()
+        for name, means_of_run in means.items()
     }
     lines = [
-        [*show_line(line), *(own.get(line, NOTHING) for own in cells.values())]
+        [
+            *show_line(line),
+            *(cells_of_run.get(line, NOTHING) for cells_of_run in cells.values()),
+        ]
         for line in means[first].index
     ]
     tables = [markdown(["vegetation", "setting", *cells], lines)]
     for name in others:
         changed = changes(wins(runs[name]), wins(runs[first]), LINE)
-        corrected = holm(np.array([sign_flip_p(own) for own in changed.values()]))
+        p_values = [sign_flip_p(differences) for differences in changed.values()]
+        corrected = holm(np.array(p_values))
         lines = [
-            [*show_line(line), *show_changes(own, p)]
-            for (line, own), p in zip(changed.items(), corrected, strict=True)
+            [*show_line(line), *show_changes(differences, p)]
+            for (line, differences), p in zip(changed.items(), corrected, strict=True)
         ]
-        won = f"won with {name} alone, with {first} alone"
+        won = f"won only with {name}, only with {first}"
         tables.append(markdown(["vegetation", "setting", "points", won, "p"], lines))
     return "\n\n".join(tables)
 
 
 def wins(rows: pd.DataFrame) -> pd.Series:
-    """Return which trials were won."""
+    """Return success as 0 or 1, by density, setting, map and realisation."""
     return rows.set_index([*LINE, "map", "realisation"])["success"].astype(int)
 
 
 def changes(
-    one: pd.Series, other: pd.Series, by: list[str]
+    a: pd.Series, b: pd.Series, by: list[str]
 ) -> dict[tuple[float, str], np.ndarray]:
-    """Return by line which trials only one won, 1, and which only the other, −1; in the
-    order of the other.
+    """Return the differences a − b in success of each episode, by line.
+
+    A difference is 1, 0 or −1. Lines are in the order of `b`.
     """
-    both = other.to_frame("other").join(one.rename("one"), how="inner")
-    lines = (both["one"] - both["other"]).groupby(
-        by[0] if len(by) == 1 else by, sort=False
-    )
+    paired = b.to_frame("b").join(a.rename("a"), how="inner")
+    keys = by[0] if len(by) == 1 else by
+    lines = (paired["a"] - paired["b"]).groupby(keys, sort=False)
     return {line: changed.to_numpy() for line, changed in lines}
 
 
 def show_changes(changed: np.ndarray, p: float) -> list[str]:
-    """Write a difference in points, the counts that make it, and p."""
+    """Format a difference in points, the numbers of gains and losses, and p."""
     return [
         f"{100 * changed.mean():+.1f}",
         f"{(changed > 0).sum()}, {(changed < 0).sum()}",
@@ -179,36 +185,34 @@ def show_changes(changed: np.ndarray, p: float) -> list[str]:
 
 
 def show_line(line: tuple[float, str]) -> list[str]:
-    """Write density and setting."""
+    """Format density and setting."""
     return [f"{100 * line[0]:.0f} %", f"`{line[1]}`"]
 
 
 def show_share(successes: int, trials: int) -> str:
-    """Write a fraction in per cent with its interval."""
+    """Format a fraction in per cent with its interval."""
     low, high = wilson_interval(successes / trials, trials)
     return f"{100 * successes / trials:.1f} [{100 * low:.0f}, {100 * high:.0f}]"
 
 
 def show_difference(a: int, n_a: int, b: int, n_b: int) -> str:
-    """Write a difference of two independent rates in points, a/n_a − b/n_b, with its
-    interval.
-    """
+    """Format the difference a/n_a − b/n_b of independent rates with its interval."""
     low, high = confint_proportions_2indep(a, n_a, b, n_b, method="newcomb")
     return f"{100 * (a / n_a - b / n_b):+.1f} [{100 * low:.1f}, {100 * high:.1f}]"
 
 
 def show_time(seconds: float) -> str:
-    """Write seconds, or a dash if nothing arrived."""
+    """Format seconds, or a dash if there is no success."""
     return NOTHING if np.isnan(seconds) else f"{seconds:.1f}"
 
 
 def show_p(p: float) -> str:
-    """Write a p-value."""
+    """Format a p-value."""
     return f"{p:.2f}" if p >= 0.1 else f"{p:.1g}"
 
 
 def markdown(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    """Write a Markdown table whose cells may hold Markdown."""
+    """Format a Markdown table; cells may contain Markdown."""
     return "\n".join(
         f"| {' | '.join(line)} |" for line in [header, ["---"] * len(header), *lines]
     )

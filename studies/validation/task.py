@@ -1,7 +1,6 @@
-"""The task of Cai et al. as a `Problem`: their robot, cost and rules, and what is
-predicted of the ground.
+"""Task of Cai et al. as a `Problem`: their robot, cost, rules and prediction.
 
-Letters in shapes: B trials, K components, *B any leading dimensions.
+Letters in shapes: B episodes, D maps, N point masses, *B any leading dimensions.
 """
 
 from collections.abc import Sequence
@@ -44,15 +43,13 @@ _COST = "cost"
 
 @dataclass(frozen=True, kw_only=True)
 class Rover(Unicycle):
-    """Their unicycle, which stays where it has arrived: a rollout of theirs ends at the
-    goal.
-    """
+    """Unicycle of Cai et al., which stops at the goal, as their rollouts end there."""
 
     speed_mps: tuple[float, float] = (0.0, 3.0)
     turn_rate_radps: tuple[float, float] = (-np.pi, np.pi)
 
     def __call__(self, state: Tensor, action: Tensor, traversability: Tensor) -> Tensor:
-        """Advances one time step; see `Robot`."""
+        """Advance by one time step; see `Robot`."""
         away = distance(state, state.new_tensor(GOAL_M)) > GOAL_RADIUS_M
         return super().__call__(state, action, traversability * away)
 
@@ -62,15 +59,15 @@ ROVER = Rover()
 
 @dataclass(frozen=True)
 class TimeAndDistance(Objective):
-    """Their cost: dt + distance at each step until arrival, and the time for what is
-    left at a crawl.
+    """Cost of Cai et al.: dt + distance per step until arrival, and a terminal cost.
 
-    They count a step by the state after it. Here the state before it is counted, and
-    the last one at the end, which differs by what the start costs: the same for all
-    rollouts.
+    The terminal cost is the time for the remaining distance at a crawl. They evaluate a
+    step at its final state. Here a step is evaluated at its initial state, and the last
+    state is added at the end. The two differ by the cost of the start, which is the
+    same for all rollouts.
 
     Args:
-        power: of the distance in a step's cost.
+        power: exponent of the distance in a step's cost.
     """
 
     power: int = 1
@@ -78,12 +75,12 @@ class TimeAndDistance(Objective):
     def stage(
         self, state: Tensor, action: Tensor, traversability: Tensor, target: Tensor
     ) -> Tensor:
-        """Cost of one step; see `Objective`."""
+        """Return the cost of one step; see `Objective`."""
         away = distance(state, target)
         return (ROVER.dt_s + away**self.power) * (away > GOAL_RADIUS_M)
 
     def terminal(self, state: Tensor, traversability: Tensor, target: Tensor) -> Tensor:
-        """Cost of the last state; see `Objective`."""
+        """Return the cost of the last state; see `Objective`."""
         away = distance(state, target)
         return (
             ROVER.dt_s
@@ -94,13 +91,11 @@ class TimeAndDistance(Objective):
 
 @dataclass(frozen=True)
 class CellFields:
-    """Draws fields of independent cells from equally likely point masses: a
-    `FieldSource`.
+    """`FieldSource` of independent cells with equally likely point masses.
 
     Args:
-        atoms: N values of λ for each cell, shape [B, N, 9, 9].
-        names: of the trials, by which their fields are drawn; trials of one name have
-            the same.
+        atoms: N values of λ per cell, shape [B, N, 9, 9].
+        names: keys of the episodes' fields; episodes with one key have the same fields.
     """
 
     atoms: Tensor
@@ -122,28 +117,28 @@ class CellFields:
         return torch.stack(drawn)
 
     def select(self, members: Tensor) -> "CellFields":
-        """Keeps some trials, by index, int64."""
+        """Return the source of some episodes, given their indices, int64."""
         return CellFields(
-            self.atoms[members], tuple(self.names[place] for place in members.tolist())
+            self.atoms[members], tuple(self.names[index] for index in members.tolist())
         )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Setup:
-    """How it is planned; the defaults are theirs.
+    """Settings of planning; the defaults are those of Cai et al.
 
     Args:
         mppi: settings of the planner.
-        risk_map: `exact`, by our risk settings, or `histogram`, by their binning and
-            rounding; fields of λ likewise.
-        objective: `theirs`, or one of ours by name.
-        distance_power: of the distance in a step's cost.
-        min_traversability: least λ̂ that motion is given.
-        fields: on which sequences are rolled out where the risk is that of the cost.
-        motions: whether `one` field of λ serves both motions of a rollout, or `two`
-            independent ones.
-        off_map: whether a rollout off the map pays the `penalty` of ground that is not
-            free, or is only `still`.
+        risk_map: `exact` for our risk settings, or `histogram` for their binning and
+            rounding; it applies to fields of λ too.
+        objective: `theirs`, or the name of one of ours.
+        distance_power: exponent of the distance in a step's cost.
+        min_traversability: minimum λ̂ of motion.
+        fields: number of λ fields of a rollout, with risk on the cost.
+        motions: whether `one` field of λ scales both motions of a rollout, or `two`
+            independent ones do.
+        off_map: whether a rollout off the map incurs the `penalty` of non-free cells,
+            or only stands `still`.
     """
 
     mppi: MPPIConfig = THEIR_MPPI
@@ -156,22 +151,22 @@ class Setup:
     off_map: Literal["penalty", "still"] = "penalty"
 
     def __post_init__(self) -> None:
-        """Refuse two fields under an objective that rollouts on them do not have."""
+        """Check that rollouts on two fields have their objective."""
         expect(
             self.motions == "one" or self.objective == "theirs",
-            f"`objective` 'theirs' with `motions` 'two', got {self.objective!r}.",
+            f"`objective` 'theirs' with `motions` 'two', got {self.objective!r}. Set "
+            "`motions` to 'one'.",
         )
 
 
 def predict(vegetation: np.ndarray) -> TraversabilityMixture:
-    """The true distribution of traction in each cell, which planners of both sides are
-    given.
+    """Return the true distribution of traction, which their and our planners are given.
 
     Args:
-        vegetation: where it grows, bool, shape [B, 9, 9].
+        vegetation: mask of vegetation, shape [B, 9, 9].
 
     Returns:
-        Point masses, parameters of shape [B, 100, 9, 9].
+        Point masses, with parameters of shape [B, 100, 9, 9].
     """
     atoms = atoms_by_cell(vegetation, VEGETATION.slices(), DIRT.slices())
     return TraversabilityMixture(
@@ -182,8 +177,12 @@ def predict(vegetation: np.ndarray) -> TraversabilityMixture:
 def atoms_by_cell(
     vegetation: np.ndarray, of_vegetation: np.ndarray, of_dirt: np.ndarray
 ) -> Tensor:
-    """Return the N point masses of each cell's ground, shape [B, N, 9, 9], from
-    vegetation [B, 9, 9].
+    """Return the point masses of each cell, shape [B, N, 9, 9].
+
+    Args:
+        vegetation: mask of vegetation, shape [B, 9, 9].
+        of_vegetation: point masses of vegetation, shape [N].
+        of_dirt: point masses of dirt, shape [N].
     """
     atoms = np.where(
         vegetation[:, None], of_vegetation[:, None, None], of_dirt[:, None, None]
@@ -192,15 +191,13 @@ def atoms_by_cell(
 
 
 def planner_config(setting: str, setup: Setup) -> MPPIConfig:
-    """Settings of the planner under a risk setting: the setup's own, with risk on the
-    cost where that is asked for.
-    """
+    """Return the setup's planner settings, with risk on the cost if `setting` has it."""
     if not setting.startswith(_COST):
         return setup.mppi
     return replace(
         setup.mppi,
         risk_on="cost",
-        level=round(1 - tail_share(setting), 9),
+        level=round(1 - tail_fraction_of(setting), 9),
         fields=setup.fields,
     )
 
@@ -211,33 +208,30 @@ def pose(
     setup: Setup,
     names: Sequence[int] | None = None,
 ) -> Problem:
-    """Poses the trials of some maps under some risk settings.
-
-    Fields of λ are drawn cell by cell.
+    """Return the problem of all maps under all risk settings.
 
     Args:
-        vegetation: where it grows on D maps, bool, shape [D, 9, 9].
-        settings: S of them, such as `mean` or `cvar:0.8`.
-        setup: how it is planned.
-        names: of the D maps, by which fields of λ are drawn; their places if they are
-            not given.
+        vegetation: mask of vegetation, shape [D, 9, 9].
+        settings: S risk settings, such as `mean` or `cvar:0.8`.
+        setup: settings of planning.
+        names: keys of the D maps' λ fields; if None, the indices of the maps.
 
     Returns:
-        D·S trials, all settings of the first map first.
+        A problem of D·S episodes, ordered by map and then by setting.
     """
     mixture = predict(vegetation)
     risk_maps = [
         infer_risk(setting, vegetation, mixture, setup) for setting in settings
     ]
-    each = torch.arange(len(vegetation)).repeat_interleave(len(settings))
-    trials, mixture = len(each), mixture.select(each)
+    map_index = torch.arange(len(vegetation)).repeat_interleave(len(settings))
+    trials, mixture = len(map_index), mixture.select(map_index)
     names = range(len(vegetation)) if names is None else names
     atoms = mixture.means
     if setup.risk_map == "histogram":
         atoms = atoms_by_cell(
             vegetation, VEGETATION.histogram_atoms(), DIRT.histogram_atoms()
-        )[each]
-    fields = CellFields(atoms, tuple(names[place] for place in each.tolist()))
+        )[map_index]
+    fields = CellFields(atoms, tuple(names[index] for index in map_index.tolist()))
     flat = torch.zeros(trials, *GRID.shape)
     rules = Rules(
         free_space=FreeSpace(by="mean", above=0.0),
@@ -264,29 +258,27 @@ def pose(
 def infer_risk(
     setting: str, vegetation: np.ndarray, mixture: TraversabilityMixture, setup: Setup
 ) -> Tensor:
-    """λ̂ of one risk setting, shape [D, 9, 9]; the mean where the risk is that of the
-    cost.
-    """
+    """Return λ̂ of a risk setting, shape [D, 9, 9]; with risk on the cost, the mean."""
     setting = "mean" if setting.startswith(_COST) else setting
     if setup.risk_map == "exact":
         return risk.apply(registry.make("risk", setting), mixture)
-    share = tail_share(setting)
+    tail_fraction = tail_fraction_of(setting)
     risk_map = np.where(
-        vegetation, VEGETATION.histogram_cvar(share), DIRT.histogram_cvar(share)
+        vegetation,
+        VEGETATION.histogram_cvar(tail_fraction),
+        DIRT.histogram_cvar(tail_fraction),
     )
     return torch.from_numpy(risk_map).float()
 
 
-def tail_share(setting: str) -> float:
-    """Return their α: 1 for `mean` and `cost`, 1 − level for `cvar:level` and
-    `cost-cvar:level`.
-    """
+def tail_fraction_of(setting: str) -> float:
+    """Return their α: 1 − level, or 1 for settings without a level."""
     level = setting.partition(":")[2]
     return round(1 - float(level or 0), 9)
 
 
 def choose_objective(setup: Setup) -> Objective:
-    """J of a setup."""
+    """Return the objective of a setup."""
     if setup.objective == "theirs":
         return TimeAndDistance(setup.distance_power)
     return registry.make(

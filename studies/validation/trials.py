@@ -1,7 +1,6 @@
-"""The experiment of Cai et al. with our planner and risk settings: trials of all
-densities and risk settings.
+"""Experiment of Cai et al. with our planner and risk settings.
 
-What is theirs, what is ours and what differs stands in `docs/studies/validation.md`.
+`docs/studies/validation.md` compares their experiment with ours.
 """
 
 from collections.abc import Iterator, Sequence
@@ -35,44 +34,47 @@ def run_trials(
     seed: int,
     setup: Setup,
 ) -> Iterator[pd.DataFrame]:
-    """Run maps × realisations trials of each density and setting.
+    """Run maps × realisations episodes of each density and setting.
 
-    The planner's noise is named by (seed, map, realisation), as the world is: trials of
-    one map and realisation share it, and no others do.
+    The key of the planner's noise is (seed, map, realisation), like that of the world.
+    So only episodes of the same map and realisation have the same noise.
 
     Args:
         densities: fractions of vegetation.
         settings: risk settings.
-        maps: maps a density.
-        realisations: draws of traction a map.
+        maps: number of maps per density.
+        realisations: number of draws of traction per map.
         seed: root of all draws.
-        setup: how it is planned.
+        setup: settings of planning.
 
     Yields:
-        Rows of one map: `density`, `setting`, `map`, `realisation`, `success`, `time_s`
-            (NaN without arrival).
+        Rows of one realisation of a map: `density`, `setting`, `map`, `realisation`,
+            `success`, `time_s` (NaN for failures).
     """
-    alike: dict[MPPIConfig, list[str]] = {}
+    settings_by_config: dict[MPPIConfig, list[str]] = {}
     for setting in settings:
-        alike.setdefault(planner_config(setting, setup), []).append(setting)
-    planners = {config: ManyTrialsMPPI(config, setup) for config in alike}
+        settings_by_config.setdefault(planner_config(setting, setup), []).append(
+            setting
+        )
+    planners = {config: ManyTrialsMPPI(config, setup) for config in settings_by_config}
     names = [round(1e6 * density) for density in densities]
-    for member in range(maps):
-        which = np.array([member])
+    for map_number in range(maps):
+        map_index = np.array([map_number])
         vegetation = np.concatenate(
-            [draw_vegetation(seed, which, density) for density in densities]
+            [draw_vegetation(seed, map_index, density) for density in densities]
         )
         problems = {
-            config: pose(vegetation, own, setup, names) for config, own in alike.items()
+            config: pose(vegetation, group, setup, names)
+            for config, group in settings_by_config.items()
         }
         for realisation in range(realisations):
-            drawn = draw_traction(
-                seed, which.repeat(len(densities)), realisation, vegetation
+            fields = draw_traction(
+                seed, map_index.repeat(len(densities)), realisation, vegetation
             )
-            for config, own in alike.items():
-                traction = torch.from_numpy(drawn.repeat(len(own), axis=0)).float()
+            for config, group in settings_by_config.items():
+                traction = torch.from_numpy(fields.repeat(len(group), axis=0)).float()
                 generator = rng.generator(
-                    rng.stream_key(seed, "cai", "planner", member, realisation)
+                    rng.stream_key(seed, "cai", "planner", map_number, realisation)
                 )
                 arrival_s = (
                     drive(planners[config], problems[config], traction, generator)
@@ -80,10 +82,10 @@ def run_trials(
                     .numpy()
                 )
                 labels = pd.MultiIndex.from_product(
-                    (densities, own), names=("density", "setting")
+                    (densities, group), names=("density", "setting")
                 )
                 yield labels.to_frame(index=False).assign(
-                    map=member,
+                    map=map_number,
                     realisation=realisation,
                     success=np.isfinite(arrival_s),
                     time_s=np.where(np.isfinite(arrival_s), arrival_s.round(1), np.nan),
@@ -100,30 +102,35 @@ def trials(
     seed: int = 0,
     **setup: Any,
 ) -> dict[str, str]:
-    """Run trials, store them as trials.csv, and return their tables; options as in
-    `run_trials` and `Setup`.
+    """Run episodes, store their rows as `trials.csv`, and return their tables.
+
+    The options are those of `run_trials` and `Setup`.
     """
     settings: Setup = read(Setup, setup, of("the options"))
-    made = pd.concat(
+    rows_by_map = pd.concat(
         track(
             run_trials(densities, risks, maps, realisations, seed, settings), "trials"
         )
     )
     for name, order in (("density", densities), ("setting", risks)):
-        made[name] = pd.Categorical(made[name], order)
-    rows = made.sort_values(["density", "setting", "map", "realisation"])
+        rows_by_map[name] = pd.Categorical(rows_by_map[name], order)
+    rows = rows_by_map.sort_values(["density", "setting", "map", "realisation"])
     write_text(folder / "trials.csv", rows.to_csv(index=False))
     return together(work, folder, [folder.name.removeprefix("validation-")])
 
 
 def together(work: Work, folder: Path, parts: Sequence[str]) -> dict[str, str]:
-    """Return the tables of the trials of several parts."""
+    """Return the tables of the episodes of several parts together."""
     return {"trials": tabulate(pd.concat(_read(work, part) for part in parts))}
 
 
 def compared(work: Work, folder: Path, runs: dict[str, str]) -> dict[str, str]:
-    """Return the table of several parts by a name each, and what each changes on the
-    first.
+    """Return the table of several parts, and the differences of each to the first.
+
+    Args:
+        work: where the study is run.
+        folder: folder of the run.
+        runs: parts by the name that the table shows.
     """
     return {
         "runs": tabulate_runs({name: _read(work, part) for name, part in runs.items()})

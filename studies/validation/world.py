@@ -1,13 +1,12 @@
-"""The worlds of Cai et al.: where vegetation grows, and the two frozen fields of
-traction.
+"""Worlds of Cai et al.: vegetation, and two fixed fields of traction.
 
 A map has 9 × 9 cells of 1 m. Its border of one cell is dirt; a cell inside is
 vegetation with a given probability. Linear and angular traction are drawn independently
-for each cell, once a trial, and stay.
+for each cell, once per episode.
 
-All draws are named by (seed, map, realisation): every setting and every density meets
-the same noise, and more vegetation is the same vegetation and more. Letters in shapes:
-M maps.
+The keys of all draws are (seed, map, realisation), so all settings and densities have
+the same noise. A higher density adds vegetation to that of a lower one. Letters in
+shapes: M maps.
 """
 
 import numpy as np
@@ -21,15 +20,15 @@ BORDER_CELLS = 1
 
 
 def draw_vegetation(seed: int, maps: np.ndarray, density: float) -> np.ndarray:
-    """Tells where vegetation grows.
+    """Draw the mask of vegetation.
 
     Args:
         seed: root of all draws.
-        maps: which maps, integers ≥ 0, shape [M].
-        density: probability of vegetation in a cell that is not of the border.
+        maps: indices of maps, integers ≥ 0, shape [M].
+        density: probability of vegetation in a cell inside the border.
 
     Returns:
-        Bool, shape [M, 9, 9].
+        Mask of vegetation, shape [M, 9, 9].
     """
     grown = (
         rng.uniform(rng.stream_key(seed, "cai", "vegetation"), maps, GRID.shape)
@@ -43,16 +42,16 @@ def draw_vegetation(seed: int, maps: np.ndarray, density: float) -> np.ndarray:
 def draw_traction(
     seed: int, maps: np.ndarray, realisation: int, vegetation: np.ndarray
 ) -> np.ndarray:
-    """Draws linear and angular traction.
+    """Draw linear and angular traction.
 
     Args:
         seed: root of all draws.
-        maps: which maps, shape [M].
-        realisation: which draw of each map.
-        vegetation: where it grows, bool, shape [M, 9, 9].
+        maps: indices of maps, shape [M].
+        realisation: index of the draw.
+        vegetation: mask of vegetation, shape [M, 9, 9].
 
     Returns:
-        λ in [0, 1], the linear field first, shape [M, 2, 9, 9].
+        λ of linear and of angular motion, in [0, 1], shape [M, 2, 9, 9].
     """
     rank = rng.uniform(
         rng.stream_key(seed, "cai", "traction", realisation), maps, (2, *GRID.shape)

@@ -1,8 +1,8 @@
 """Tables, tests and the figure of the study.
 
-`models` has a row a varied model, by label: `size`, the number of maps that it was
-trained on, `seed`, `what` is varied and its `dose`, which is 1 as trained, and its
-`loss`.
+The table `models` has one row per varied model, indexed by label. Its columns are
+`size`, the number of training maps; `seed`; `what`, the varied property; `dose`, by how
+much it is varied, 1 for a model as trained; and `loss`.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -19,7 +19,7 @@ from benchnav.stats.intervals import mean_interval
 from benchnav.viz import legend_outside, line_looks, panel_grid, risk_name, styled
 
 RISKS, SPLIT = ("expected-time", "cvar:0.8"), "test/std"
-# of each the minimum is the best
+# Lower is better for all of these.
 SCORES = (
     "rmse_expected",
     "nll",
@@ -42,11 +42,11 @@ GROUP = ["size", "what", "dose"]
 
 
 def slopes_by_map(loss: pd.Series, success: pd.DataFrame) -> np.ndarray:
-    """Return least-squares slopes of success on the loss over models, one a map.
+    """Return the least-squares slope of success on the loss over models, per map.
 
     Args:
-        loss: of each model.
-        success: rate of success of each model, a row, and map, a column.
+        loss: loss of each model.
+        success: success rate, with a row per model and a column per map.
 
     Returns:
         Success per unit of loss, shape [M].
@@ -59,8 +59,12 @@ def slopes_by_map(loss: pd.Series, success: pd.DataFrame) -> np.ndarray:
 def doses_results(
     rows: pd.DataFrame, models: pd.DataFrame, digest: str
 ) -> dict[str, pd.DataFrame | Figure]:
-    """Return the test of the hypothesis, exploratory slopes and contrasts, and success
-    and time against dose.
+    """Return the test of the hypothesis, and exploratory slopes, contrasts and doses.
+
+    Args:
+        rows: rows of the episodes.
+        models: table of varied models.
+        digest: SHA-256 of the file of the hypothesis.
     """
     by_map = _success_by_map(rows)
     loss = models["loss"]
@@ -84,15 +88,15 @@ def doses_results(
         for key, labels in models.groupby(GROUP, sort=False).groups.items()
     }
     compared = []
-    for one, other in contrasts(sorted(set(models["size"].tolist()))):
-        a, b = groups[one], groups[other]
+    for first, second in contrasts(sorted(set(models["size"].tolist()))):
+        a, b = groups[first], groups[second]
         gain = 100 * (by_map.loc[a].mean(0) - by_map.loc[b].mean(0)).to_numpy()
         difference = {
             **_interval("points", gain),
             "p": mean_flip_p(gain),
             "loss": loss[a].mean() - loss[b].mean(),
         }
-        compared.append({"one": one, "other": other, **difference})
+        compared.append({"one": first, "other": second, **difference})
     table = success_table(rows, groups, (models["size"].max(), "temperature", 1.0))
     table.insert(
         0, "pinball", models.groupby(GROUP, sort=False)["loss"].mean().to_numpy()
@@ -124,8 +128,9 @@ def _interval(name: str, values: np.ndarray) -> dict[str, float]:
 
 
 def _slope(slopes: np.ndarray, direction: str = "") -> dict[str, float]:
-    """Return the mean of the maps' slopes in points of success per 0.001 of loss, and p
-    of the exchange test.
+    """Return the mean slope over maps with its interval, and p of the exchange test.
+
+    The slope is in points of success per 0.001 of loss.
     """
     return {
         **_interval("points per 0.001", 0.1 * slopes),
@@ -134,7 +139,7 @@ def _slope(slopes: np.ndarray, direction: str = "") -> dict[str, float]:
 
 
 def exploratory(models: pd.DataFrame) -> Iterator[tuple[str, pd.Index]]:
-    """Yield parts of the models whose slope is computed too."""
+    """Yield names and labels of subsets of models, for exploratory slopes."""
     yield "training maps alone, temperature as trained", models.query("dose == 1").index
     largest = models[models["size"] == models["size"].max()]
     for what in ("temperature", "soft", "brightness"):
@@ -143,15 +148,17 @@ def exploratory(models: pd.DataFrame) -> Iterator[tuple[str, pd.Index]]:
             largest.query("what == @what or dose == 1").index,
         )
     yield "without brightness", models.query("what != 'brightness'").index
-    for seed, own in models.groupby("seed"):
-        yield f"seed {seed}", own.index
+    for seed, models_of_seed in models.groupby("seed"):
+        yield f"seed {seed}", models_of_seed.index
 
 
 def contrasts(
     sizes: list[int],
 ) -> Iterator[tuple[tuple[int, str, float], tuple[int, str, float]]]:
-    """Yield pairs of doses on both sides of what was trained: too cautious and too
-    bold, too sure and too vague.
+    """Yield pairs of doses below and above that of training.
+
+    They compare too cautious with too bold models, and too certain with too uncertain
+    ones.
     """
     yield (sizes[-1], "soft", 2.0), (sizes[-1], "soft", 0.0)
     for size in sizes:
@@ -161,11 +168,10 @@ def contrasts(
 def success_table(
     rows: pd.DataFrame, groups: Mapping[object, list[str]], first: object
 ) -> pd.DataFrame:
-    """Return a row a group of models: success and time under each risk setting, and its
-    gain over the first group.
+    """Return success and time per risk setting and the gain, with a row per group.
 
-    The gain is in points of success over both risk settings, with its interval and p by
-    maps, corrected by Holm.
+    The gain is that over the first group of models, in points of success over both risk
+    settings, with its interval and p by maps; p has Holm's correction.
     """
     by_map = _success_by_map(rows)
     centre, lines = by_map.loc[groups[first]].mean(0), {}
@@ -181,15 +187,15 @@ def success_table(
             success, time_s = means.loc[risk]
             cells |= {f"success {risk}": 100 * success, f"T_total {risk}": time_s}
         lines[key] = {**cells, **_interval("gain", gain), "p": mean_flip_p(gain)}
-    found = pd.DataFrame(lines).T
+    table = pd.DataFrame(lines).T
     others = [key != first for key in groups]
-    found.loc[others, "p"] = holm(found.loc[others, "p"].to_numpy())
-    return found
+    table.loc[others, "p"] = holm(table.loc[others, "p"].to_numpy())
+    return table
 
 
 @styled()
 def draw_doses(table: pd.DataFrame) -> Figure:
-    """Draw success over the loss, a mark a dose, a panel a risk setting."""
+    """Draw success over the loss: one marker per dose, one panel per risk setting."""
     sizes = table["training maps"].astype(str)
     kind = table["what"].where(
         table["what"] != "temperature", "temperature, " + sizes + " maps"
@@ -202,10 +208,10 @@ def draw_doses(table: pd.DataFrame) -> Figure:
     trained = table[table["dose"] == 1]
     for (panel,), risk in zip(places, RISKS, strict=True):
         for name, look in looks.items():
-            own = table[kind == name]
+            points = table[kind == name]
             panel.plot(
-                own["pinball"],
-                own[f"success {risk}"],
+                points["pinball"],
+                points[f"success {risk}"],
                 label=name,
                 **{**look, "ls": "none", "ms": 5},
             )
@@ -218,8 +224,9 @@ def draw_doses(table: pd.DataFrame) -> Figure:
 
 
 def quality(table: pd.DataFrame, against: str = "") -> pd.DataFrame:
-    """Return means over seeds with the half width of their t interval; with `against`,
-    differences to that method.
+    """Return means over seeds with the half width of their t interval.
+
+    With `against`, they are of the differences to that method.
     """
     shown = [name for name in SHOWN if name in table and table[name].notna().any()]
     wide = table.set_index(["split", "method", "seed"])[shown]
@@ -238,9 +245,7 @@ def quality(table: pd.DataFrame, against: str = "") -> pd.DataFrame:
 
 
 def _over_seeds(values: pd.Series) -> str:
-    """Write a mean over seeds with the half width of its t interval, if there are
-    several.
-    """
+    """Format a mean over seeds, with several also the half width of its t interval."""
     if values.isna().all():
         return NOTHING
     half = t.ppf(0.975, max(1, len(values) - 1)) * values.std() / len(values) ** 0.5
@@ -250,8 +255,9 @@ def _over_seeds(values: pd.Series) -> str:
 def ranked(
     rows: pd.DataFrame, table: pd.DataFrame, labels: Iterable[str]
 ) -> dict[str, pd.DataFrame]:
-    """Return success of every method, against the first, and how it ranks with each
-    score (Kendall's τ).
+    """Return the success of all methods, and its rank correlation with each score.
+
+    Gains are over the first method. The rank correlation is Kendall's τ.
     """
     groups: dict[object, list[str]] = {}
     for label in labels:
@@ -264,9 +270,9 @@ def ranked(
     success = methods[[f"success {risk}" for risk in RISKS]].mean(axis=1)
     ranks = []
     for name, values in methods[list(SCORES)].items():
-        known = values.dropna()
-        tau, p = kendalltau(known, success[known.index])
-        ranks.append({"score": name, "methods": len(known), "tau": tau, "p": p})
+        scored = values.dropna()
+        tau, p = kendalltau(scored, success[scored.index])
+        ranks.append({"score": name, "methods": len(scored), "tau": tau, "p": p})
     return {
         "success": methods.reset_index(names="method"),
         "ranks": pd.DataFrame(ranks),

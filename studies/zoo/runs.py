@@ -1,8 +1,7 @@
-"""Quality of models varied on purpose, and what it is worth to a robot; the methods of
-the zoo.
+"""Effect of model quality on success: deliberately varied models, methods of the zoo.
 
-Each step is stored in the folder `zoo` of the runs and not done again. `maps`, `sizes`
-and `seeds` of a part may be changed in study.yaml, to see in minutes that all runs.
+Each step is stored in the folder `zoo` of the runs and is not repeated. To try a part
+in minutes, reduce its `maps`, `sizes` and `seeds` in study.yaml.
 """
 
 import json
@@ -39,8 +38,9 @@ Results = dict[str, pd.DataFrame | Figure]
 
 
 def models_of(sizes: Sequence[int], seeds: Sequence[int]) -> pd.DataFrame:
-    """Return all varied models; soft modes and brightness vary at the largest size
-    only.
+    """Return all varied models.
+
+    Soft modes and brightness vary only at the largest number of training maps.
     """
     rows = [
         {
@@ -59,7 +59,7 @@ def models_of(sizes: Sequence[int], seeds: Sequence[int]) -> pd.DataFrame:
 
 
 def make_maps(path: Path, recipe: str, counts: Mapping[str, int]) -> Path:
-    """Make so many maps of the splits of a recipe, if they are missing."""
+    """Create a dataset of a recipe with `counts` maps per split, if it is missing."""
     if not path.exists():
         sizes = (f"splits.{split}.maps={count}" for split, count in counts.items())
         splits = f"[{','.join(counts)}]"
@@ -80,12 +80,10 @@ def make_maps(path: Path, recipe: str, counts: Mapping[str, int]) -> Path:
 def fit(
     out: Path, name: str, words: str, size: int, seed: int, recipe: str = RECIPE
 ) -> Path:
-    """Train a checkpoint on so many maps of a recipe, the first of the largest set, if
-    it is not finished.
-    """
-    place = out / f"{recipe}-n{size}-{name}-s{seed}"
-    done = place.with_suffix(".done")
-    if not done.exists():
+    """Train a checkpoint on the first `size` maps of a recipe, unless it is finished."""
+    checkpoint = out / f"{recipe}-n{size}-{name}-s{seed}"
+    marker = checkpoint.with_suffix(".done")
+    if not marker.exists():
         data = out / f"{recipe}-n{size}.h5"
         make_maps(data, recipe, {"train": size, "valid": max(4, size // 4)})
         family, *options = words.split()
@@ -96,20 +94,18 @@ def fit(
             "--data",
             data,
             "--out",
-            place,
+            checkpoint,
             "--resume",
             "--seed",
             seed,
             *options,
         )
-        done.touch()
-    return place
+        marker.touch()
+    return checkpoint
 
 
 def fit_fused(out: Path, size: int, seed: int) -> Path:
-    """Train a fused model; on small sets for more epochs, so that every network takes
-    100 steps or more.
-    """
+    """Train a fused model for enough epochs that its network takes 100 steps or more."""
     epochs = max(20, -(-100 // -(-size // 16)))
     longer = (
         f"--settings.classifier.max_epochs {epochs} "
@@ -121,13 +117,16 @@ def fit_fused(out: Path, size: int, seed: int) -> Path:
 def measure(
     path: Path, parts: list[dict[str, Any]], data: Path, maps: int
 ) -> pd.Series:
-    """Return the pinball loss of the lower fifth of every model on the maps that are
-    driven on.
+    """Return the pinball loss of the lower fifth of each model on the test maps.
+
+    Losses are stored in `path` and read from there if present.
     """
-    found: dict[str, float] = json.loads(path.read_text()) if path.exists() else {}
+    loss_by_label: dict[str, float] = (
+        json.loads(path.read_text()) if path.exists() else {}
+    )
     dataset = TerrainDataset(data)
     for part in parts:
-        if part["label"] in found:
+        if part["label"] in loss_by_label:
             continue
         model, losses = load_model(registry.read_part("model", part)), []
         for indices, _ in dataset.chunks(SPLIT, fields=()):
@@ -138,15 +137,15 @@ def measure(
                 predict(model, terrain), terrain.traversability
             )
             losses += loss.mean((1, 2)).tolist()
-        found[part["label"]] = sum(losses) / len(losses)
-        write_text(path, json.dumps(found, indent=1))
-    return pd.Series(found)
+        loss_by_label[part["label"]] = sum(losses) / len(losses)
+        write_text(path, json.dumps(loss_by_label, indent=1))
+    return pd.Series(loss_by_label)
 
 
 def drive(
     out: Path, name: str, models: list[dict[str, Any]], maps: int, draws: int
 ) -> pd.DataFrame:
-    """Run a suite, or what is missing of it; return the rows of its episodes."""
+    """Run the missing units of the suite of these models; return the episodes' rows."""
     suite = {
         "data": str(drive_maps(out, maps)),
         "world": "stakes",
@@ -164,12 +163,12 @@ def drive(
 
 
 def drive_maps(out: Path, maps: int) -> Path:
-    """Return the maps that are driven on."""
+    """Return the path of the test maps on which robots drive; create them if missing."""
     return make_maps(out / "drive.h5", RECIPE, {SPLIT: maps})
 
 
 def begin(work: Work) -> Path:
-    """Return the folder of all parts."""
+    """Create and return the folder of all parts."""
     out = work.out / "zoo"
     out.mkdir(parents=True, exist_ok=True)
     return out
@@ -183,27 +182,28 @@ def doses(
     sizes: Sequence[int] = SIZES,
     seeds: Sequence[int] = SEEDS,
 ) -> Results:
-    """Test the hypothesis: quality varied on purpose, measured and driven with.
+    """Test the hypothesis on deliberately varied models.
 
     Raises:
-        ConfigError: If these runs were begun under another hypothesis.
+        ConfigError: If these runs were started under another hypothesis.
     """
     out, digest = begin(work), runs.digest_of(HYPOTHESIS)
-    kept = out / "hypothesis.sha256"
-    if not kept.exists():
-        kept.write_text(digest)
-    known = kept.read_text()
+    digest_file = out / "hypothesis.sha256"
+    if not digest_file.exists():
+        digest_file.write_text(digest)
+    stored_digest = digest_file.read_text()
     expect(
-        known == digest,
-        f"the hypothesis that {out} was begun under, {known}, got {digest}.",
+        stored_digest == digest,
+        f"hypothesis.yaml of SHA-256 {stored_digest}, under which {out} was started, "
+        f"got {digest}. Use another `--out`.",
     )
     print(f"hypothesis {digest}", flush=True)
     models = models_of(sizes, seeds)
     parts = []
-    for label, own in models.to_dict("index").items():
+    for label, fields in models.to_dict("index").items():
         options = {
-            "checkpoint": str(fit_fused(out, own["size"], own["seed"])),
-            own["what"]: own["dose"],
+            "checkpoint": str(fit_fused(out, fields["size"], fields["seed"])),
+            fields["what"]: fields["dose"],
         }
         parts.append({"part": f"{VARIED}:Varied", "label": label, "options": options})
     models["loss"] = measure(
@@ -222,19 +222,20 @@ def compare(
     size: int = SIZES[-1],
     seeds: Sequence[int] = SEEDS,
 ) -> Results:
-    """Compare methods on the maps of two recipes, to train and to test on; differences
-    are to the first method.
+    """Compare methods, trained on maps of one recipe and tested on those of another.
+
+    Differences are to the first method.
 
     Args:
-        work: of the study.
-        folder: of the run.
-        methods: words of `benchnav-train fit` by name.
-        recipes: of the maps to train and to test on.
-        maps: number of test maps of each split.
-        draws: of λ on each map, on which robots drive with every model; if 0, none
-            drives.
-        size: number of maps to train on.
-        seeds: of training.
+        work: folders and extent of the work.
+        folder: folder of the run.
+        methods: arguments of `benchnav-train fit`, by name of the method.
+        recipes: recipes of the training maps and of the test maps.
+        maps: number of test maps per split.
+        draws: number of λ fields per map on which robots drive with each model; if 0,
+            no robot drives.
+        size: number of training maps.
+        seeds: seeds of training.
     """
     out, part = begin(work), folder.name
     test = make_maps(
@@ -242,7 +243,7 @@ def compare(
     )
     tables, parts = [], []
     for seed in seeds:
-        places = {
+        checkpoints = {
             fit(out, method, words, size, seed, recipes[0]): method
             for method, words in methods.items()
         }
@@ -252,7 +253,7 @@ def compare(
             command(
                 "benchnav-train",
                 "compare",
-                *places,
+                *checkpoints,
                 "--data",
                 test,
                 "--splits",
@@ -262,12 +263,12 @@ def compare(
             )
         table = pd.read_csv(quality_of / "compare.csv")
         names = table["model"].map(
-            {place.name: method for place, method in places.items()}
+            {checkpoint.name: method for checkpoint, method in checkpoints.items()}
         )
         tables.append(table.assign(method=names.fillna(table["model"]), seed=seed))
         parts += [
-            {"part": str(place), "label": f"{method}-s{seed}"}
-            for place, method in places.items()
+            {"part": str(checkpoint), "label": f"{method}-s{seed}"}
+            for checkpoint, method in checkpoints.items()
         ]
     table = pd.concat(tables, ignore_index=True)
     results: Results = {"quality": quality(table)}
@@ -275,5 +276,5 @@ def compare(
         results["difference"] = quality(table, next(iter(methods)))
     if draws:
         rows = drive(out, f"run-{part}", parts, maps, draws)
-        results |= ranked(rows, table, [own["label"] for own in parts])
+        results |= ranked(rows, table, [part["label"] for part in parts])
     return results

@@ -1,4 +1,4 @@
-"""A fused model with its quality varied on purpose."""
+"""Fused model whose quality is varied deliberately."""
 
 from dataclasses import replace
 
@@ -10,15 +10,14 @@ from benchnav.models.fused import FusedModel
 
 
 class Varied(TraversabilityModel):
-    """The fused model of a checkpoint with one thing about it changed.
+    """Fused model of a checkpoint with changed properties.
 
     Args:
         checkpoint: folder of the fused model.
-        temperature: by which that of its class probabilities is multiplied; under 1 it
-            is surer than it was.
-        soft: by which the weights of its soft modes are multiplied; at 0 it knows of
-            none.
-        brightness: of the image that it is given; at 1 the image as it is.
+        temperature: factor on the temperature of class probabilities; below 1, the
+            model is more certain than as trained.
+        soft: factor on the weights of soft modes; at 0, the model has none.
+        brightness: factor on the brightness of its input image.
     """
 
     def __init__(

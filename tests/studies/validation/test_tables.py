@@ -77,7 +77,7 @@ def test_pairs_are_those_of_one_trial() -> None:
     line = tabulate_pairs(shuffled, "cvar:0.8", "mean").splitlines()[-1]
     assert line == "| 100 % | +25.0 | 2, 1 | 1.00 | +79.0 | 159, 1 | 2e-46 |"
     head, _, line = tabulate_pairs(shuffled, "mean", "cvar:0.8").splitlines()
-    assert head == "| vegetation | points | `mean` alone, `cvar:0.8` alone | p |"
+    assert head == "| vegetation | points | only `mean`, only `cvar:0.8` | p |"
     assert line == "| 100 % | -25.0 | 1, 2 | 1.00 |"
 
 
@@ -94,7 +94,7 @@ def test_a_run_stands_beside_the_first_trial_by_trial() -> None:
         == "| 100 % | `mean` | 83.3, 10.0 s | 25.0, 20.0 s | 20.0, 11.6 s |"
     )
     header, _, mean, cautious = change.split("\n")
-    assert "won with b alone, with a alone" in header
+    assert "won only with b, only with a" in header
     # Two won and nine lost of twelve; p of the binomial tail, twice over two lines.
     p = 2 * 2 * binom.cdf(2, 11, 0.5)
     assert mean == f"| 100 % | `mean` | -58.3 | 2, 9 | {show_p(p)} |"

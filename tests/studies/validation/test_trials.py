@@ -136,7 +136,7 @@ def test_trials_are_stored_and_tabulated_together(
         in trials.together(work, folder, ["a", "b"])["trials"]
     )
     runs = trials.compared(work, folder, {"one": "a", "other": "a"})["runs"]
-    assert "won with other alone, with one alone" in runs
+    assert "won only with other, only with one" in runs
 
 
 def test_each_part_has_usable_options() -> None:
