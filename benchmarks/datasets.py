@@ -1,12 +1,11 @@
-"""How fast datasets are made and read, next to plain h5py on the same maps in the same
-run.
+"""Time of creating and reading datasets, compared with plain h5py on the same maps.
 
     python -m benchmarks.datasets
 
-Making is timed from the call to the closed file, with solvable test maps and their
-reference times. Reading is the batches of an epoch as training takes them from 2 000
-shards, turned and mirrored, in one process of one thread, and seconds are those of its
-core; the files lie in the page cache.
+Creation is timed from the call to the closed file, and includes solvable test maps and
+their reference times. Reading is that of a training epoch from 2 000 shards, with
+rotated and mirrored maps, in one process of one thread. Its seconds are CPU time, with
+the files in the page cache.
 """
 
 import tempfile
@@ -30,15 +29,13 @@ FIELDS = ("rgb", "class_id")
 
 
 def make(recipe: Recipe, path: Path, jobs: int = 2, shard_cells: int = 0) -> None:
-    """Make a dataset."""
+    """Create a dataset."""
     for _ in create(recipe, path, jobs=jobs, overwrite=True, shard_cells=shard_cells):
         pass
 
 
 def write_plainly(recipe: Recipe, path: Path) -> None:
-    """Write what one would without this package: the same maps, through HDF5's own
-    filters.
-    """
+    """Write the same maps without this package, through HDF5's own filters."""
     with h5py.File(path, "w") as file:
         for split, spec in recipe.splits.items():
             for name, values in generate(recipe, split, np.arange(spec.maps)).items():
@@ -54,7 +51,7 @@ def write_plainly(recipe: Recipe, path: Path) -> None:
 
 
 def time_making(folder: Path) -> None:
-    """Print how many maps of `paper-v1` are made a second."""
+    """Print the number of maps of `paper-v1` created per second."""
     recipe = load_recipe("paper-v1")
     works = {
         "generate, h5py's own filters": lambda: write_plainly(
@@ -73,7 +70,7 @@ def time_making(folder: Path) -> None:
 
 
 def make_shards(path: Path) -> None:
-    """Make 20 000 maps of 32 × 32 cells in 2 000 files."""
+    """Create 20 000 maps of 32 × 32 cells in 2 000 files."""
     paper = load_recipe("paper-v1")
     splits = {"train": Split(scenario="std", maps=SHARDS * MAPS_A_SHARD)}
     small = {"height": 32, "width": 32, "start_m": (4.0, 4.0), "goal_m": (12.0, 12.0)}
@@ -89,8 +86,9 @@ def make_shards(path: Path) -> None:
 
 
 def time_reading(folder: Path) -> None:
-    """Print how fast an epoch is read in windows of shards and in any order, and a file
-    opened for each map.
+    """Print the speed of reading an epoch in any order and in windows of shards.
+
+    The peer opens a file for each map.
     """
     torch.set_num_threads(1)
     make_shards(folder / "shards")

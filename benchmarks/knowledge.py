@@ -1,15 +1,16 @@
-"""What it costs to learn while driving: episodes with the belief `copula` next to the
-same ones without.
+"""Time of learning online: episodes with the belief `copula` compared with `static`.
 
     python -m benchmarks.knowledge
 
-50 episodes on maps of `stakes-v1-test` in the world `stakes`, A*+DWA, the oracle under
-expected-time, one thread. A row has the processor's time of a second of driving of an
-episode, its ratio to `static` in the same turn, and how much of
-it is learning and planning: medians of three turns. `copula` is given λ within 1 m and
-may replan each 0.5 s. Another table has the milliseconds of an update of one episode,
-on the first and the last 4 m of 24 m: they grow with the cells that a probe reaches,
-and not with the path. Some two minutes.
+50 episodes run on maps of `stakes-v1-test` in the world `stakes`, with A*+DWA and the
+oracle under `expected-time`, on one thread. A row has the CPU time per simulated second
+of an episode, its ratio to `static` in the same turn, and the fractions for learning
+and planning; all are medians of three turns. `copula` observes λ within 1 m and may
+replan every 0.5 s.
+
+A second table has the time of an update in one episode, on the first and the last 4 m
+of a path of 24 m. It grows with the footprint of the probe, but not with the path. Both
+tables take about two minutes.
 """
 
 import time
@@ -48,45 +49,50 @@ BELIEFS: dict[str, dict[str, Any]] = {
 
 
 def drive(unit: Unit, built: Built, steps: int = STEPS) -> dict[str, float]:
-    """Return milliseconds of a second of driving of an episode, and which fractions are
-    learning and planning.
-    """
-    start, began = time.process_time(), time.perf_counter()
-    found, _ = simulate(unit, built, Settings(), stop=lambda step: step == steps)
-    took, waited = time.process_time() - start, time.perf_counter() - began
+    """Return CPU milliseconds per simulated second, and fractions of learning, planning."""
+    cpu_start_s, start_s = time.process_time(), time.perf_counter()
+    episodes, _ = simulate(unit, built, Settings(), stop=lambda step: step == steps)
+    cpu_s, elapsed_s = time.process_time() - cpu_start_s, time.perf_counter() - start_s
     return {
         "ms a second driven": 1e3
-        * took
-        / (built.problem.dt_s * int(found.steps.sum())),
-        "learning": found.learning_s / waited,
-        "planning": float(found.planning_s.sum()) / waited,
+        * cpu_s
+        / (built.problem.dt_s * int(episodes.steps.sum())),
+        "learning": episodes.learning_s / elapsed_s,
+        "planning": float(episodes.planning_s.sum()) / elapsed_s,
     }
 
 
 def drives() -> list[dict[str, Any]]:
     """Return the rows of the first table."""
-    made = {}
+    built_units = {}
     for name, options in BELIEFS.items():
         unit = one_unit(
             stakes_suite(Path("stakes-v1-test"), **LEARNS, **options), EPISODES
         )
-        made[name] = unit, build_unit(unit)
-        drive(*made[name], steps=10)  # compiles, and loads what is loaded once
+        built_units[name] = unit, build_unit(unit)
+        drive(*built_units[name], steps=10)  # warm up: compile and load
     turns = []
     for _ in range(TURNS):
-        turn = {name: drive(*own) for name, own in made.items()}
+        turn = {name: drive(*built_unit) for name, built_unit in built_units.items()}
         static = turn["static"]["ms a second driven"]
         turns += [
-            {"belief": name, **own, "times static": own["ms a second driven"] / static}
-            for name, own in turn.items()
+            {
+                "belief": name,
+                **measured,
+                "times static": measured["ms a second driven"] / static,
+            }
+            for name, measured in turn.items()
         ]
     medians = pd.DataFrame(turns).groupby("belief", sort=False).median().reset_index()
     return medians.to_dict("records")
 
 
 def update(resolution_m: float, radius_m: float) -> dict[str, Any]:
-    """Return milliseconds of an update on the first and the last 4 m of 24 m, and how
-    many cells were sensed.
+    """Return the time of an update on the first and last 4 m of 24 m, and the footprint.
+
+    Args:
+        resolution_m: size of a cell in metres.
+        radius_m: radius of the probe in metres.
     """
     height, width = round(12 / resolution_m), round(28 / resolution_m)
     covariance = CovarianceModel(
@@ -110,11 +116,11 @@ def update(resolution_m: float, radius_m: float) -> dict[str, Any]:
     )
     belief, times = Copula(), []
     state = belief.init(prior, covariance)
-    for number in range(49):
-        pose = torch.tensor([[2 + 0.5 * number, 6.0, 0.0]])
-        sensed = Probe(radius_m).sense(terrain, field, pose, NoiseKey((0,), number))
+    for index in range(49):
+        pose = torch.tensor([[2 + 0.5 * index, 6.0, 0.0]])
+        measurement = Probe(radius_m).sense(terrain, field, pose, NoiseKey((0,), index))
         start = time.process_time()
-        state = belief.update(state, sensed)
+        state = belief.update(state, measurement)
         times.append(1e3 * (time.process_time() - start))
     return {
         "cells": f"{resolution_m:g} m",

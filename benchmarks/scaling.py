@@ -1,10 +1,9 @@
-"""How the time of a plan grows: with samples, horizon, episodes and the size of the
-map.
+"""Planning time over samples, horizon, episodes and size of the map.
 
     python -m benchmarks.scaling OUT.png
 
-One thread, medians. Each curve changes one setting of: 5 000 samples, 5 s (50 steps),
-20 episodes, a map of 64 × 64 cells.
+Times are medians on one thread. Each curve changes one of these settings: 5 000
+samples, a horizon of 5 s (50 steps), 20 episodes, a map of 64 × 64 cells.
 """
 
 import sys
@@ -37,7 +36,7 @@ SIZES = (64, 128, 256, 512, 1024)
 
 
 def problem_of(episodes: int = 20, size: int = 64) -> Problem:
-    """Return a problem on uneven ground, the same for all episodes."""
+    """Return a problem with random λ, the same for all episodes."""
     generator = torch.Generator().manual_seed(0)
     ground = 0.35 + 0.6 * torch.rand((1, size, size), generator=generator).expand(
         episodes, -1, -1

@@ -1,11 +1,11 @@
-"""Do large things work in little memory? A map of 1024 × 1024 cells, 100 000 maps, a
-raster of 30 000 × 30 000 cells.
+"""Time and memory of commands on large inputs.
 
     python -m benchmarks.sizes                # 10 minutes and 10 GB of disk, in a temporary folder
 
-Every line is the command that it names, in processes of its own; the time is from start
-to end, the memory the maximum that one process held. The two processes that make 100
-000 maps are killed (SIGKILL) once each and restarted.
+The inputs are a map of 1024 × 1024 cells, 100 000 maps, and a raster of 30 000 × 30 000
+cells. Every row is for the command that it names, in new processes. The time is from
+start to end, the memory the maximum of one process. The two processes that create
+100 000 maps are killed (SIGKILL) once each and restarted.
 """
 
 import multiprocessing
@@ -22,7 +22,7 @@ import numpy as np
 from benchmarks.timing import show
 
 MIB = 2**10
-SIDE, BAND = 30_000, 500  # cells of the raster, and rows that are written at a time
+SIDE, BAND = 30_000, 500  # side of the raster in cells, and rows per write
 MANY = (
     "benchnav-datagen create paper-v1 id=big splits.train.maps=100000 --out big --shard"
 )
@@ -43,14 +43,14 @@ COMMANDS = (
 
 
 class Processes:
-    """Processes in a folder, and the most memory that one of them held, in KiB."""
+    """Processes that run in a folder, with the peak memory of a single one in KiB."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.memory = 0
 
     def start(self, words: str) -> subprocess.Popen[bytes]:
-        """Start a command, its words parted by spaces."""
+        """Start a command whose words are separated by spaces."""
         program, *rest = words.split()
         command = [Path(sys.executable).with_name(program), *rest]
         return subprocess.Popen(
@@ -68,22 +68,24 @@ class Processes:
         return process.returncode
 
     def make_many(self) -> bool:
-        """Make 100 000 maps by two processes, each killed after 30 s of work; return
-        whether one failed.
+        """Create 100 000 maps with two processes, each killed once after 30 s.
+
+        Returns:
+            Whether one of them failed after its restart.
         """
-        shares = [f"{MANY} {share}/2" for share in (1, 2)]
-        making = [self.start(words) for words in shares]
-        for place, words in enumerate(shares):
+        shards = [f"{MANY} {index}/2" for index in (1, 2)]
+        processes = [self.start(words) for words in shards]
+        for index, words in enumerate(shards):
             time.sleep(30)
-            making[place].kill()
-            self.wait(making[place])
-            making[place] = self.start(words)
-        ended = [self.wait(process) for process in making]
-        return any(ended)
+            processes[index].kill()
+            self.wait(processes[index])
+            processes[index] = self.start(words)
+        statuses = [self.wait(process) for process in processes]
+        return any(statuses)
 
 
 def run(folder: Path, words: str) -> dict[str, Any]:
-    """Run a command to its end; return its row."""
+    """Run a command to its end; return its row of the table."""
     begun, processes = time.perf_counter(), Processes(folder)
     if (
         processes.make_many()
@@ -99,7 +101,7 @@ def run(folder: Path, words: str) -> dict[str, Any]:
 
 
 def write_raster(path: Path) -> None:
-    """Write hills of 5 to 400 m and rough ground, 0.5 m a cell, in UTM zone 33."""
+    """Write rough terrain with hills of 5 to 400 m, in cells of 0.5 m, UTM zone 33."""
     import rasterio
     from rasterio.transform import from_origin
 
@@ -139,8 +141,8 @@ def main() -> None:
     """Print the table."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        # In a process of its own: what this one held would count for those that it
-        # starts.
+        # Write in another process: the peak memory of this one would be counted for
+        # the processes that it starts.
         writer = multiprocessing.get_context("spawn").Process(
             target=write_raster, args=(folder / "dem.tif",)
         )

@@ -1,11 +1,10 @@
-"""How long a large map takes tile by tile, and how much memory: that of the whole
-process at its most.
+"""Time and peak memory of the process that predicts a large map tile by tile.
 
     python -m benchmarks.tiles                       # 4096 × 4096 cells, the shipped checkpoint stakes-v1
     python -m benchmarks.tiles paper-v1 2048 512     # another checkpoint, side of the map and of a tile
 
-The map is laid out of shipped maps, drawn at random. What is written is its CVaR at
-level 0.9 and its mean. Times are those of one core.
+The map is a mosaic of shipped maps, drawn at random. Its CVaR at level 0.9 and its mean
+are written. Times are those of one core.
 """
 
 import sys
@@ -29,7 +28,7 @@ MEASURES: dict[str, Callable[[Any], Tensor]] = {
 
 
 def large_map(name: str, side: int) -> Observation:
-    """Lay a map out of shipped maps."""
+    """Return a mosaic of shipped maps, drawn at random."""
     dataset = TerrainDataset(find_dataset(f"{name}-test"))
     split = next(iter(dataset.splits))
     maps = dataset.terrain(split).observe()

@@ -1,4 +1,4 @@
-"""What all measurements share: clocks, memory, problems of shipped maps, tables."""
+"""Common functions of benchmarks: clocks, memory, problems of shipped maps, tables."""
 
 import resource
 import sys
@@ -24,7 +24,7 @@ def seconds(
     repeats: int,
     clock: Callable[[], float] = time.perf_counter,
 ) -> list[float]:
-    """Return how long some work takes, each time that it is repeated."""
+    """Return the seconds that each repeat of some work takes."""
     times = []
     for _ in range(repeats):
         start = clock()
@@ -34,12 +34,12 @@ def seconds(
 
 
 def milliseconds(work: Callable[[], object], repeats: int = REPEATS) -> float:
-    """Return the median time of some work, which is done three times before."""
+    """Return the median time of some work in milliseconds, after three warm-up runs."""
     return 1e3 * median(seconds(work, 3 + repeats)[3:])
 
 
 def per_second(count: int, times: list[float]) -> dict[str, float]:
-    """Return the median rate of `count` things in each of these times, and its range."""
+    """Return the median rate per second, and its range, of `count` items per time."""
     return {
         "median": count / median(times),
         "lowest": count / max(times),
@@ -48,14 +48,14 @@ def per_second(count: int, times: list[float]) -> dict[str, float]:
 
 
 def peak_gib() -> float:
-    """Return the most memory that this process has held."""
-    # The kernel counts kilobytes on Linux and bytes on macOS.
+    """Return the peak memory of this process in GiB."""
+    # The unit is kilobytes on Linux and bytes on macOS.
     unit = 1 if sys.platform == "darwin" else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**30
 
 
 def problem_of(episodes: int) -> Problem:
-    """Return the problem of the first maps of std, whose λ distributions are known."""
+    """Return the problem of the first maps of std under the true distributions of λ."""
     suite = Suite(
         data="paper-v1-test",
         scenarios=("std",),
@@ -67,9 +67,7 @@ def problem_of(episodes: int) -> Problem:
 
 
 def plan_ms(planner: Any, problem: Problem, repeats: int = REPEATS) -> float:
-    """Return the time of a step of a planner that has begun, divided by the number of
-    episodes.
-    """
+    """Return the planning time of a step, after the first, in ms per episode."""
     state = planner.init(problem, torch.Generator().manual_seed(0))
     observed = torch.full((len(problem),), torch.nan)
     step = Step(state=problem.start, traversability=observed, time_s=0.0)

@@ -1,14 +1,14 @@
-"""What a unit of a suite costs besides planning and driving: 36 cells of 200 episodes,
-in units of 50.
+"""Overhead of a unit of a suite: its time without planning and simulation.
 
     benchnav-datagen create full-v1
     python -m benchmarks.units [DATASET]
 
-The cells are the straight line and A*+DWA, on three scenarios, under six seeds; the
-oracle predicts, and the risk setting is the mean. One process runs them one after
-another, as a worker of `benchnav-eval run` does. A row a planner: the median time of a
-unit, that of its overhead (reading and predicting maps, risk maps, drawing noise,
-tables and files), and the most memory that the process has held. About five minutes.
+36 cells of 200 episodes run in units of 50: the straight line and A*+DWA, on three
+scenarios, under six seeds, with the oracle and the risk setting `mean`. One process
+runs them in sequence, as a worker of `benchnav-eval run` does. There is one row per
+planner. It has the median time of a unit, that of its overhead (reading and predicting
+maps, risk maps, noise, tables and files), and the peak memory of the process. It takes
+about five minutes.
 """
 
 import sys
@@ -45,17 +45,17 @@ def main(data: str = "full-v1") -> None:
     )
     extent = Extent.product(range(SEEDS), 1, MAPS)
     conditions = {
-        own.id: (own, extent)
-        for own in conditions_of(suite, lambda data: list(SCENARIOS))
+        condition.id: (condition, extent)
+        for condition in conditions_of(suite, lambda data: list(SCENARIOS))
     }
     driving: list[float] = []
     settings, simulate = units_of_run.Settings(), units_of_run.simulate
 
-    def timed(*given: Any, **options: Any) -> Any:
+    def timed(*arguments: Any, **options: Any) -> Any:
         start = time.perf_counter()
-        answer = simulate(*given, **options)
+        result = simulate(*arguments, **options)
         driving.append(time.perf_counter() - start)
-        return answer
+        return result
 
     rows = []
     with TemporaryDirectory() as folder, patch.object(units_of_run, "simulate", timed):
@@ -64,13 +64,13 @@ def main(data: str = "full-v1") -> None:
             units_of_run.run_unit(
                 unit, Path(folder), settings.origins().of(unit), settings
             )
-            took = time.perf_counter() - start
+            elapsed_s = time.perf_counter() - start
             planner = unit.condition.labels["planner"]
             rows.append(
                 {
                     "planner": planner,
-                    "a unit, s": took,
-                    "its overhead, s": took - driving[-1],
+                    "a unit, s": elapsed_s,
+                    "its overhead, s": elapsed_s - driving[-1],
                 }
             )
     medians = pd.DataFrame(rows).groupby("planner", sort=False).median().reset_index()
