@@ -1,4 +1,4 @@
-"""A figure for reports: when episodes failed, by scenario and planner."""
+"""A custom figure for reports: times of failures, by scenario and planner."""
 
 import matplotlib.figure
 import numpy as np
@@ -14,7 +14,7 @@ from benchnav.viz import (
 
 
 class WhenFailed(Figure):
-    """Histograms of the times at which failed episodes ended."""
+    """Histogram of the end times of failed episodes."""
 
     name = "when-failed"
 
@@ -28,13 +28,13 @@ class WhenFailed(Figure):
         scenarios = dict(list(data.failures.groupby("scenario")))
         colours = planner_colours(list(data.failures["planner"].unique()))
         bins = np.linspace(0, data.failures["end_time_s"].max(), 21)
-        figure, places = panel_grid(
+        figure, panels = panel_grid(
             list(scenarios), across=3, high_in=1.8, sharex=True, sharey=True
         )
-        for (panel,), rows in zip(places, scenarios.values(), strict=True):
-            for planner, own in rows.groupby("planner"):
+        for (panel,), rows in zip(panels, scenarios.values(), strict=True):
+            for planner, episodes in rows.groupby("planner"):
                 look = {"color": colours[planner], "label": planner_name(planner)}
-                panel.hist(own["end_time_s"], bins, histtype="step", **look)
+                panel.hist(episodes["end_time_s"], bins, histtype="step", **look)
             panel.set(xlabel="end of the episode [s]", ylabel="episodes")
         legend_outside(figure)
         return figure

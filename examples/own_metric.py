@@ -1,4 +1,4 @@
-"""A metric of your own: by how much a drive is longer than the straight line.
+"""A custom metric: length of a drive relative to the straight line.
 
 benchnav-eval run --data stakes-v1 --model stakes-v1 --world stakes --scenarios '[std]' --maps 8 \
     --planners '[straight,astar_dwa]' --metrics '[examples/own_metric.py:Detour,energy:120]' --out runs/metrics
@@ -13,7 +13,7 @@ from benchnav.metrics import Episode, Metric
 
 
 class Detour(Metric):
-    """Length of the driven path over the straight line from the start to the goal's edge; NaN for a failure."""
+    """Driven length over that of the straight line to the goal's edge; NaN if failed."""
 
     name = "detour"
     column = "detour"
@@ -21,7 +21,7 @@ class Detour(Metric):
     better = "lower"
 
     def compute(self, episode: Episode) -> float:
-        """Returns the ratio, about 1 for a straight drive."""
+        """Return the ratio of the two lengths, about 1 for a straight drive."""
         if not episode.success:
             return math.nan
         driven_m = np.linalg.norm(np.diff(episode.positions_m, axis=0), axis=1).sum()

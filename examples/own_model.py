@@ -1,13 +1,12 @@
-"""A traversability model of one's own: a small network with a loss of its own, trained
-as ours are.
+"""A custom traversability model: a small network and its loss, trained like ours.
 
     benchnav-train fit examples/own_model.py:CellModel --data DATASET --out checkpoints/mine --members 3
     benchnav-train evaluate examples/own_model.py:CellModel@checkpoints/mine --data DATASET
     benchnav-eval run --model examples/own_model.py:CellModel@checkpoints/mine --data DATASET
 
-The network looks at one cell at a time, at the layers that `inputs` names, and gives
-one Gaussian, clipped to [0, 1]. Its loss is the continuous ranked probability score of
-a Gaussian (Gneiting and Raftery, 2007).
+The network predicts each cell from the layers of that cell that `inputs` lists. The
+prediction is one Gaussian, clipped to [0, 1]. Its loss is the continuous ranked
+probability score of a Gaussian (Gneiting and Raftery, 2007).
 """
 
 import math
@@ -23,8 +22,13 @@ from benchnav.models import TrainableModel, TrainingConfig
 
 @dataclass(frozen=True, kw_only=True)
 class CellConfig(TrainingConfig):
-    """Each field is a setting: `--settings.hidden 64 --settings.inputs '[rgb,
-    slope_deg, elevation_m]'`.
+    """Settings of the model, such as `--settings.hidden 64` or `--settings.inputs [rgb]`.
+
+    Args:
+        inputs: layers of the observation that the network reads.
+        hidden: number of hidden channels.
+        least_std: minimum standard deviation of λ.
+        max_epochs: number of training epochs.
     """
 
     inputs: tuple[str, ...] = ("rgb", "slope_deg")

@@ -1,10 +1,10 @@
-"""A planner of one's own: full speed ahead along the best of a fan of arcs.
+"""A custom planner: full speed along the best of a fan of arcs.
 
     benchnav-eval run --planners '[straight,examples/own_planner.py:Fan]' --risks '[mean,cvar:0.9]' --out runs/fan
 
-It is found by its file; its constructor's parameters are its options, as in
-`{part: examples/own_planner.py:Fan, label: wide fan, options: {arcs: 31}}`. Its tests
-need one line, `check_planner("examples/own_planner.py:Fan")` of `benchnav.testing`.
+Commands find it by its file. The parameters of its constructor are its options, as in
+`{part: examples/own_planner.py:Fan, label: wide fan, options: {arcs: 31}}`. One line
+tests it: `check_planner("examples/own_planner.py:Fan")` of `benchnav.testing`.
 """
 
 import torch
@@ -13,7 +13,12 @@ from benchnav.planning import Plan, Planner, Problem, Step
 
 
 class Fan(Planner[Problem]):
-    """Rolls every arc out through F under λ̂ and takes the one of least cost."""
+    """Planner that rolls out every arc under λ̂ and follows that of minimum cost.
+
+    Args:
+        arcs: number of arcs.
+        horizon_s: duration of a rollout in seconds.
+    """
 
     steers = (("speed_mps", "turn_rate_radps"), ("speed_mps", "steering_rad"))
 
@@ -21,7 +26,7 @@ class Fan(Planner[Problem]):
         self.arcs, self.horizon_s = arcs, horizon_s
 
     def init(self, problem: Problem, generator: torch.Generator) -> Problem:
-        return problem  # the plan state: all that is kept from step to step
+        return problem  # the plan state, which is passed from step to step
 
     def plan(
         self, step: Step, plan_state: Problem

@@ -1,4 +1,4 @@
-"""A robot F and an objective J of one's own, which `check_robot` and `check_objective` of `benchnav.testing` try.
+"""A custom robot and objective; `check_robot` and `check_objective` of `benchnav.testing` test them.
 
 benchnav-eval run --robots '[examples/own_robot.py:Tracked]' --objectives '[examples/own_robot.py:Energy]' \
   --planners '[straight,astar_dwa,mppi]' --risks '[mean]' --out runs/tracked
@@ -11,21 +11,21 @@ from benchnav.planning import Objective, Unicycle, distance
 
 @dataclass(frozen=True, kw_only=True)
 class Tracked(Unicycle):
-    """A tracked vehicle: it drives as a unicycle, but soft ground hinders its turning twice as much."""
+    """Tracked vehicle: a unicycle whose turn rate is scaled by λ to the power of `turn_loss`."""
 
     speed_mps: tuple[float, float] = (-0.3, 0.8)
     turn_loss: float = 2.0
 
     def __call__(self, state, action, traversability):
         turning = traversability.clamp(min=0.05) ** (self.turn_loss - 1)
-        # (v, ω): ω alone
+        # Only ω of the action (v, ω) is scaled further.
         slowed = action * turning[..., None] ** action.new_tensor([0.0, 1.0])
         return super().__call__(state, slowed, traversability)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Energy(Objective):
-    """Distance to the goal, and what the tracks waste where they slip; A* minimises its `path_cost`."""
+    """Distance to the goal plus the energy that slipping tracks waste; A* minimises `path_cost`."""
 
     waste: float = 2.0
 

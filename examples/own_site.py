@@ -1,15 +1,14 @@
-"""A site of one's own, from a robot's drives to a suite of episodes: a dataset, a
-model, its measures, planners.
-
-Real drives come from a robot's log; see `read_bag.py`. Here robots drive in this
-package's own simulation, over ground that is drawn and written as GeoTIFFs, as a survey
-gives them: elevation, photo, land cover. They log their position and two speeds. All
-else is done by commands, as for real ground:
+"""A custom site, from a robot's drives to a dataset, a trained model and a suite.
 
     python examples/own_site.py [FOLDER]
 
-Real ground seldom has a map of classes. Without `--classes` and `--solvable` all works
-up to `evaluate`; a suite simulates λ by the class table, and so needs them.
+For a real site, the drives are in a robot's log; see `read_bag.py`. Here, robots drive
+in the simulation of this package. The terrain is generated and written as the GeoTIFFs
+of a survey: elevation, photo and land cover. Robots log their position, their commanded
+speed and their measured speed. All further steps are commands, as for a real site.
+
+Real sites seldom have a map of classes. Without `--classes` and `--solvable`, all steps
+up to `evaluate` work. A suite needs both, since it simulates λ with the class table.
 """
 
 import os
@@ -34,11 +33,10 @@ MAPS = ("height=48", "width=48", "places={least_distance_m: 10, margin_m: 2}")
 
 
 def command(line: str, folder: Path, *more: str) -> None:
-    """Runs a command in the folder, as a user would."""
+    """Run a command in the folder, as a user would."""
     name, *words = line.split()
     print(f"\n$ {line} {' '.join(more)}", flush=True)
-    # So small networks and suites are done before more threads, or compiling, would
-    # pay.
+    # For networks and suites this small, one thread without compiling is fastest.
     quick = os.environ | {"OMP_NUM_THREADS": "1", "TORCH_COMPILE_DISABLE": "1"}
     subprocess.run(
         [Path(sys.executable).with_name(name), *words, *more],
@@ -49,8 +47,9 @@ def command(line: str, folder: Path, *more: str) -> None:
 
 
 def survey(folder: Path) -> Terrain:
-    """Draws the ground and writes what a survey knows of it; rows of rasters run
-    southward.
+    """Generate terrain and write the rasters of a survey; return it for all drives.
+
+    The rows of rasters run from north to south, those of maps from south to north.
     """
     recipe = load_recipe("stakes-v1", ["id=ground", *SIZE])
     for _ in create_dataset(recipe, folder / "ground.h5"):
@@ -64,63 +63,63 @@ def survey(folder: Path) -> Terrain:
         ("classes", "class_id"),
     ):
         bands = maps[field][0].reshape(-1, HEIGHT, WIDTH)[:, ::-1]
-        about = {
+        profile = {
             "count": len(bands),
             "dtype": bands.dtype,
             "crs": "EPSG:32654",
             "transform": corner,
         }
         with rasterio.open(
-            folder / f"{name}.tif", "w", "GTiff", WIDTH, HEIGHT, **about
+            folder / f"{name}.tif", "w", "GTiff", WIDTH, HEIGHT, **profile
         ) as file:
             file.write(bands)
     return dataset.terrain("site", [0] * DRIVES)
 
 
 def drive(terrain: Terrain) -> pd.DataFrame:
-    """Lets robots drive straight from place to place, each several times, and logs what
-    they know of themselves.
-    """
+    """Drive robots in straight legs to random goals; return their logs."""
     task = planning.Task(
         robot=planning.Unicycle(),
         objective=planning.GoalDistance(),
         rules=planning.Rules(),
     )
     extent = torch.tensor(terrain.grid.extent_m)
-    share = torch.rand(DRIVES, 2, generator=GENERATOR)
-    share[:, 0] = (torch.arange(DRIVES) + 0.5) / DRIVES  # all along the site
-    position = 2 + share * (extent - 4)
+    fraction = torch.rand(DRIVES, 2, generator=GENERATOR)
+    fraction[:, 0] = (torch.arange(DRIVES) + 0.5) / DRIVES  # all along the site
+    position = 2 + fraction * (extent - 4)
     logs, steps = [], round(LEG_S / task.robot.dt_s)
     for leg in range(LEGS):
-        way = REACH_M * (2 * torch.rand(DRIVES, 2, generator=GENERATOR) - 1)
-        goal = torch.minimum((position + way).clamp(min=2), extent - 2)
-        # The λ of the ground is the same on every drive.
+        offset = REACH_M * (2 * torch.rand(DRIVES, 2, generator=GENERATOR) - 1)
+        goal = torch.minimum((position + offset).clamp(min=2), extent - 2)
+        # λ is the same on every drive.
         world = planning.World(noise="stored", time_budget_s=LEG_S)
-        unknown = torch.full((DRIVES,), torch.nan)
+        missing = torch.full((DRIVES,), torch.nan)
         places = planning.Endpoints(
-            start_m=position, goal_m=goal, reference_time_s=unknown
+            start_m=position, goal_m=goal, reference_time_s=missing
         )
         simulation = planning.Simulation(terrain, task, world, places, 0, range(DRIVES))
-        # Which `Straight` does not look at.
+        # A problem needs a prediction, but `Straight` does not use it.
         predicted = planning.Prediction(
             terrain.observe(), terrain.truth, terrain.traversability
         )
         problem = planning.pose_problem(task, predicted, position, goal, LEG_S)
         planner, state = planning.Straight(), simulation.init(problem.start)
-        plan, met = planner.init(problem, GENERATOR), unknown
+        plan, observed = planner.init(problem, GENERATOR), missing
         for step in range(steps):
-            now = planning.Step(
-                state=state.state, traversability=met, time_s=step * task.robot.dt_s
+            step_input = planning.Step(
+                state=state.state,
+                traversability=observed,
+                time_s=step * task.robot.dt_s,
             )
-            action, plan, _ = planner.plan(now, plan)
-            after, met = simulation.step(state, action)
-            moved = (after.state - state.state)[:, :2].norm(dim=1) / task.robot.dt_s
+            action, plan, _ = planner.plan(step_input, plan)
+            after, observed = simulation.step(state, action)
+            speed = (after.state - state.state)[:, :2].norm(dim=1) / task.robot.dt_s
             columns = {
-                "time_s": torch.full((DRIVES,), leg * LEG_S + now.time_s),
+                "time_s": torch.full((DRIVES,), leg * LEG_S + step_input.time_s),
                 "x_m": WEST + state.state[:, 0].double(),
                 "y_m": SOUTH + state.state[:, 1].double(),
                 "commanded_m_s": action[:, 0],
-                "measured_m_s": moved + 0.02 * torch.randn(DRIVES, generator=GENERATOR),
+                "measured_m_s": speed + 0.02 * torch.randn(DRIVES, generator=GENERATOR),
                 "drive": torch.arange(DRIVES),
             }
             logs.append(pd.DataFrame(columns)[state.running.numpy()])
@@ -133,8 +132,8 @@ def main(folder: Path) -> None:
     log = drive(survey(folder))
     log.to_csv(folder / "drives.csv.gz", index=False)
     print(
-        f"{DRIVES} drives of {len(log)} rows, {log['measured_m_s'].sum() * 0.1:.0f} m "
-        "in all"
+        f"{DRIVES} drives, {len(log)} rows, {log['measured_m_s'].sum() * 0.1:.0f} m in "
+        "total"
     )
     rasters = (
         "--dem dem.tif --photo photo.tif --classes classes.tif --solvable "
@@ -160,6 +159,6 @@ def main(folder: Path) -> None:
 
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as temporary:
-        own = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(temporary)
-        own.mkdir(parents=True, exist_ok=True)
-        main(own)
+        folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(temporary)
+        folder.mkdir(parents=True, exist_ok=True)
+        main(folder)

@@ -1,12 +1,11 @@
-"""A policy by PPO of stable-baselines3, trained in `benchnav/OffRoad-v1`, and as a
-planner.
+"""Train a policy with PPO of stable-baselines3 in `benchnav/OffRoad-v1`; plan with it.
 
     benchnav-datagen create stakes-v1 --splits '[train]' --first 64 --out datasets/stakes-train.h5
     python examples/ppo.py datasets/stakes-train.h5 ppo.zip --steps 100000
     benchnav-eval run --data stakes-v1 --model stakes-v1 --planners '[straight,examples/ppo.py:Policy]' --out runs/ppo
 
-`Batched` gives stable-baselines3 all sub-environments as one batch: 16 take a tenth of
-the time of one after the other.
+`Batched` passes all sub-environments to stable-baselines3 as one batch: 16 of them take
+a tenth of the time that they take in sequence.
 """
 
 import argparse
@@ -21,14 +20,12 @@ from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 import benchnav  # noqa: F401 - registers the environment
 from benchnav.env import PolicyPlanner
 
-# What the robot knows, which should be in training as it will be in the evaluation.
+# Model and risk setting of the robot, which training and evaluation should share.
 KNOWS = {"model": "stakes-v1", "risk": "expected-time"}
 
 
 class Batched(VecEnv):
-    """The vector environment as stable-baselines3 has it: ended episodes start anew in
-    the same step.
-    """
+    """Vector environment for stable-baselines3, which resets episodes when they end."""
 
     def __init__(self, count: int, **settings) -> None:
         self.envs = gymnasium.make_vec(
@@ -76,12 +73,14 @@ class Batched(VecEnv):
 
     def set_attr(self, attr_name, value, indices=None):
         raise NotImplementedError(
-            "sub-environments are one batch and have no attributes of their own"
+            "Expected no attribute of a sub-environment, got `set_attr`. All of them "
+            "are one batch."
         )
 
     def env_method(self, method_name, *method_args, indices=None, **method_kwargs):
         raise NotImplementedError(
-            "sub-environments are one batch and have no methods of their own"
+            "Expected no method of a sub-environment, got `env_method`. All of them "
+            "are one batch."
         )
 
     def env_is_wrapped(self, wrapper_class, indices=None):
@@ -92,7 +91,7 @@ class Batched(VecEnv):
 
 
 class Looks(BaseFeaturesExtractor):
-    """A small convolutional network for the crop, beside the numbers."""
+    """Features of a policy: a small convolutional network on the crop, and the state."""
 
     def __init__(self, observation_space, width: int = 128) -> None:
         super().__init__(observation_space, width + observation_space["state"].shape[0])
@@ -112,7 +111,7 @@ class Looks(BaseFeaturesExtractor):
 
 
 class Policy(PolicyPlanner):
-    """A trained policy as a planner."""
+    """Planner that follows a trained policy."""
 
     def __init__(self, path: str = "ppo.zip") -> None:
         policy = PPO.load(path, device="cpu").policy
@@ -149,8 +148,10 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("data", help="dataset with a train split")
-    parser.add_argument("out", help="file of the policy, .zip")
-    parser.add_argument("--steps", type=int, default=100_000)
-    given = parser.parse_args()
-    train(given.data, given.out, given.steps)
+    parser.add_argument("data", help="dataset with the split train")
+    parser.add_argument("out", help="file for the policy, .zip")
+    parser.add_argument(
+        "--steps", type=int, default=100_000, help="number of training steps"
+    )
+    arguments = parser.parse_args()
+    train(arguments.data, arguments.out, arguments.steps)

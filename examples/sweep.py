@@ -1,5 +1,4 @@
-"""A sweep with Optuna: tunes learning rate and width of the example's model by the
-validation loss, and prunes trials.
+"""Tune learning rate and width of the example's model with Optuna, and prune trials.
 
 pip install optuna
 python examples/sweep.py DATASET FOLDER [TRIALS]
@@ -16,7 +15,7 @@ from benchnav.models import TrainOptions, fit_model, load_checkpoint
 try:
     import optuna
 except ImportError:
-    sys.exit("Expected Optuna, got none. Install it: pip install optuna")
+    sys.exit("Expected the package optuna, got None. Install it: pip install optuna")
 
 MODEL = Path(__file__).with_name("own_model.py")
 
@@ -55,4 +54,7 @@ def sweep(data: str, folder: Path, trials: int = 20) -> optuna.Study:
 
 if __name__ == "__main__":
     best = sweep(sys.argv[1], Path(sys.argv[2]), *map(int, sys.argv[3:4])).best_trial
-    print(f"best: trial {best.number}, validation loss {best.value:.4f}, {best.params}")
+    print(
+        f"best Optuna trial: {best.number}, validation loss {best.value:.4f}, "
+        f"{best.params}"
+    )

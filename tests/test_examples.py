@@ -165,7 +165,7 @@ def test_a_bag_becomes_a_log_of_drives(tmp_path: Path) -> None:
     assert "pip install rosbags" in read_bag().stderr
     for name in ("highlevel", "typesys"):
         (tmp_path / "rosbags" / f"{name}.py").write_text(ODOMETRY)
-    assert "one.bag, which is not there" in read_bag().stderr
+    assert "Expected an existing bag, got one.bag" in read_bag().stderr
     (tmp_path / "one.bag").touch()
     has = "; the bag has /cmd_vel (geometry_msgs/msg/Twist), /imu (sensor_msgs/msg/Imu), /odom "
     for option, expected in (
@@ -285,6 +285,7 @@ def test_a_sweep_finds_the_best_of_its_trials(tmp_path: Path) -> None:
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert re.search(
-        r"best: trial \d, validation loss -?\d\.\d+, \{'learning_rate'", done.stdout
+        r"best Optuna trial: \d, validation loss -?\d\.\d+, \{'learning_rate'",
+        done.stdout,
     )
     assert (tmp_path / "trials" / "trial-0" / "config.json").is_file()

@@ -105,9 +105,9 @@ def test_pip_installs_where_uv_does_not(
     monkeypatch.setattr(subprocess, "run", installers.run)
     assert install.main() == 3
     said = capsys.readouterr().err
-    assert (
-        said
-        == f"benchnav: installing with pip, several minutes, since uv failed: {why}\n"
+    assert said == (
+        "benchnav: installing with pip, which takes several minutes, because uv "
+        f"failed: {why}\n"
     )
     assert installers.commands[-1][0] == "pip"
     constraint = ["--constraint", str(SCRIPT.parents[1] / "constraints.txt")]

@@ -1,12 +1,11 @@
-"""Draws the picture and the moving picture of README.md: one map, two risk settings,
-one robot that was immobilised.
+"""Draw the picture and the animation of README.md: one map under two risk settings.
 
     benchnav-eval run --config demo --out runs/demo
     python tools/hero.py runs/demo
 
-writes docs/figures/hero.png and docs/figures/hero.gif. The map is the one on which the
-first setting is immobilised and the second reaches the goal, and the driven paths lie
-farthest apart.
+This writes docs/figures/hero.png and docs/figures/hero.gif. On the map, the robot under
+the first setting is immobilised and that under the second reaches the goal. Among such
+maps, it is the one whose driven paths are farthest apart.
 """
 
 import argparse
@@ -38,50 +37,47 @@ Pair = tuple[Recording, Recording]
 
 
 def find_pair(folder: Path) -> Pair:
-    """Recordings of the two settings on the map where their paths lie farthest apart
-    and their outcomes differ.
-    """
+    """Return the recordings of both settings on the map of the module's docstring."""
     rows = read_results(folder, False).episodes
     first, second = (
         rows[(rows["risk"] == risk) & (rows["planner"] == "astar_dwa")]
         for risk in RISKS
     )
     keys = ["seed", "realisation", "map"]
-    both = first[first["outcome"] == "immobilised"].merge(
+    shared = first[first["outcome"] == "immobilised"].merge(
         second[second["success"]], on=keys
     )[keys]
     pairs = zip(
-        *(driven(folder, own.merge(both, on=keys)) for own in (first, second)),
+        *(driven(folder, ended.merge(shared, on=keys)) for ended in (first, second)),
         strict=True,
     )
-    return max(pairs, key=lambda pair: apart(*(own.track for own in pair)))
+    return max(pairs, key=lambda pair: apart(pair[0].track, pair[1].track))
 
 
 def driven(folder: Path, rows: pd.DataFrame) -> list[Recording]:
-    """Recordings of the episodes of one condition, in order."""
+    """Return the recordings of one condition's episodes, in order."""
     return list(record_driven(folder, rows.reset_index(drop=True)))
 
 
 def apart(a: np.ndarray, b: np.ndarray) -> float:
-    """The largest distance of a position on a path to another path, in metres."""
+    """Return the largest distance of a position of path `a` to path `b`, in metres."""
     return float(np.linalg.norm(a[:, None] - b[None], axis=-1).min(1).max())
 
 
 def heights(recording: Recording, positions: np.ndarray) -> np.ndarray:
-    """Elevation at positions (x, y), smooth from cell to cell."""
+    """Return the smoothed elevation at positions (x, y), in metres."""
     column, row = (positions / recording.resolution_m - 0.5).T
     smooth = gaussian_filter(recording.elevation_m, 1.0)
     return map_coordinates(smooth, (row, column), order=1, mode="nearest")
 
 
 def draw_terrain(panel: Axes3D, pair: Pair) -> None:
-    """The terrain from the side, with both paths and the cells that immobilise a robot."""
+    """Draw the terrain in perspective with both paths and the immobilising cells."""
     first = pair[0]
     rows, columns = first.elevation_m.shape
     x, y = ((np.arange(size) + 0.5) * first.resolution_m for size in (columns, rows))
-    colours = (
-        np.moveaxis(first.rgb, 0, -1) / 255
-    ) ** 1.4  # which are shaded, and light
+    # The image is shaded already. The exponent darkens it, since it is light.
+    colours = (np.moveaxis(first.rgb, 0, -1) / 255) ** 1.4
     colours[first.immobilising] = to_rgb(maps.IMMOBILISING)
     panel.computed_zorder = False
     panel.plot_surface(
@@ -95,11 +91,13 @@ def draw_terrain(panel: Axes3D, pair: Pair) -> None:
         shade=False,
         zorder=1,
     )
-    for own, (name, colour) in zip(pair, RISKS.values(), strict=True):
-        high = heights(own, own.track) + 0.3
+    for recording, (name, colour) in zip(pair, RISKS.values(), strict=True):
+        high = heights(recording, recording.track) + 0.3
         for edge, width in (("white", 4.2), (colour, 2.2)):
             label = f"planned on the {name}" if edge == colour else "_edge"
-            panel.plot(*own.track.T, high, color=edge, lw=width, label=label, zorder=3)
+            panel.plot(
+                *recording.track.T, high, color=edge, lw=width, label=label, zorder=3
+            )
     end = first.track[-1]
     positions = {"start": first.track[0], "goal": first.goal_m, "immobilised": end}
     for (name, (x_m, y_m)), top in zip(
@@ -120,7 +118,7 @@ def draw_terrain(panel: Axes3D, pair: Pair) -> None:
 
 @styled()
 def draw_hero(pair: Pair) -> Figure:
-    """The terrain with both paths, and both maps of λ̂."""
+    """Draw the terrain with both paths, and both maps of λ̂."""
     figure = Figure(figsize=(10.5, 3.6), layout="constrained")
     places = figure.add_gridspec(1, 4, width_ratios=(1.45, 1, 1, 0.05))
     terrain = figure.add_subplot(places[0], projection="3d")
@@ -130,17 +128,19 @@ def draw_hero(pair: Pair) -> Figure:
     terrain.legend(
         handles=handles, loc="lower left", fontsize=8, bbox_to_anchor=(0, -0.08)
     )
-    for place, own in enumerate(pair):
-        panel = figure.add_subplot(places[1 + place])
-        name, colour = RISKS[own.about["risk"]]
-        image = maps.show_map(panel, own.predicted, own.grid.extent_m, **maps.LAMBDA)
-        maps.overlay(panel, own.immobilising, own.grid.extent_m, maps.IMMOBILISING)
-        drives.draw_drive(panel, drive_at(own, len(own.actions)), 2.2, 1.2, colour)
+    for index, recording in enumerate(pair):
+        panel = figure.add_subplot(places[1 + index])
+        name, colour = RISKS[recording.about["risk"]]
+        extent_m = recording.grid.extent_m
+        image = maps.show_map(panel, recording.predicted, extent_m, **maps.LAMBDA)
+        maps.overlay(panel, recording.immobilising, extent_m, maps.IMMOBILISING)
+        whole_drive = drive_at(recording, len(recording.actions))
+        drives.draw_drive(panel, whole_drive, 2.2, 1.2, colour)
         panel.set(xticks=[], yticks=[])
         panel.set_title(
-            f"λ̂ = {name}: {own.outcome} after {own.end_s:.0f} s", fontsize=9
+            f"λ̂ = {name}: {recording.outcome} after {recording.end_s:.0f} s", fontsize=9
         )
-        maps.draw_scale(panel, own.grid.extent_m, 8)
+        maps.draw_scale(panel, extent_m, 8)
     figure.colorbar(
         image,
         cax=figure.add_subplot(places[3]),
@@ -150,9 +150,9 @@ def draw_hero(pair: Pair) -> Figure:
 
 
 def frames(pair: Pair) -> Iterator[Image.Image]:
-    """Frames of the video of both episodes, a quarter as large."""
+    """Yield frames of the video of both episodes, at `GIF_SIZE`."""
     video = Frames(pair)
-    end_s = max(own.end_s for own in pair)
+    end_s = max(recording.end_s for recording in pair)
     for time_s in [*np.arange(0, end_s, SPEED * TICK_MS / 1000), end_s]:
         yield Image.fromarray(video.draw(float(time_s))).resize(
             GIF_SIZE, Image.Resampling.LANCZOS
@@ -160,25 +160,25 @@ def frames(pair: Pair) -> Iterator[Image.Image]:
 
 
 def main() -> None:
-    """Draw both pictures."""
+    """Draw the picture and the animation."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("run", type=Path)
     parser.add_argument("--out", type=Path, default=FIGURES)
-    given = parser.parse_args()
-    pair = find_pair(given.run)
+    arguments = parser.parse_args()
+    pair = find_pair(arguments.run)
     print(f"map {pair[0].about['map']}")
-    save(draw_hero(pair), given.out / "hero.png", "png", dpi=170)
-    # One palette for all, by coverage, which keeps the colours of few pixels: those of
-    # the marks.
+    save(draw_hero(pair), arguments.out / "hero.png", "png", dpi=170)
+    # All frames have one palette. Maximum coverage keeps colours of few pixels, such as
+    # those of the marks.
     images = list(frames(pair))
     palette = images[len(images) // 2].quantize(256, method=Image.Quantize.MAXCOVERAGE)
     first, *rest = (
         image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images
     )
     first.save(
-        given.out / "hero.gif",
+        arguments.out / "hero.gif",
         save_all=True,
         append_images=rest,
         duration=[TICK_MS] * len(rest) + [2500],

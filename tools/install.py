@@ -1,10 +1,9 @@
-"""Installs the package, editable, with some of its extras into the environment of the
-Python that runs this file.
+"""Install the package, editable, with extras into the environment of this Python.
 
-uv installs in about a minute what takes pip several. If uv fails for any reason, pip
-installs. uv does not read pip's settings, so those that name where packages come from
-are passed on; with others that change what is installed, pip installs as well. Needs
-only Python and pip, since it runs before anything is installed.
+uv takes about a minute, pip several. If uv fails for any reason, pip is used. uv does
+not read pip's settings, so the sources of packages among them are passed on. If other
+settings change what is installed, pip is used too. This script runs before anything is
+installed, so it needs only Python and pip.
 
     .venv/bin/python tools/install.py [--constraint FILE] EXTRA[,EXTRA …]
 """
@@ -29,11 +28,11 @@ UV = (
     "--python",
     sys.executable,
 )
-# pip takes the best version of all indexes. Bytecode is compiled as pip does, or else
-# each process would do so in an environment that nobody else may write to.
+# Like pip, choose the best version over all indexes and compile bytecode. Without
+# bytecode, every process would compile the modules again if it may not write to the
+# environment.
 AS_PIP = ("--index-strategy", "unsafe-best-match", "--compile-bytecode")
-# A setting of pip, the variable that uv reads for it, and what uv separates its values
-# by.
+# Setting of pip, environment variable of uv, separator of the variable's values.
 SOURCES = (
     ("index-url", "UV_DEFAULT_INDEX", " "),
     ("extra-index-url", "UV_INDEX", " "),
@@ -54,14 +53,14 @@ ONLY_PIP = (
 
 
 def read_settings(listing: str) -> dict[str, str]:
-    """Reads the settings that `pip install` would use.
+    """Read the settings that `pip install` would use.
 
     Args:
-        listing: what `pip config list` prints, such as `global.timeout='60'`.
+        listing: output of `pip config list`, such as `global.timeout='60'`.
 
     Returns:
-        Values by name: those of variables before those of `[install]`, and these before
-            those of `[global]`.
+        Values by name. Environment variables override `[install]`, which overrides
+            `[global]`.
     """
     sections: dict[str, dict[str, str]] = {"global": {}, "install": {}, ":env:": {}}
     for line in listing.splitlines():
@@ -75,7 +74,7 @@ def read_settings(listing: str) -> dict[str, str]:
 
 
 def uv_environment(settings: dict[str, str]) -> dict[str, str]:
-    """Returns variables that have uv look for packages where pip does.
+    """Return environment variables that make uv use pip's sources of packages.
 
     Args:
         settings: settings of pip, by name.
@@ -84,7 +83,7 @@ def uv_environment(settings: dict[str, str]) -> dict[str, str]:
         Values by the name of the variable.
 
     Raises:
-        ValueError: If a setting is not known to uv.
+        ValueError: If a setting has no counterpart in uv.
     """
     unknown = [name for name in ONLY_PIP if name in settings]
     if unknown:
@@ -97,18 +96,18 @@ def uv_environment(settings: dict[str, str]) -> dict[str, str]:
 
 
 def install_with_uv(requirement: list[str]) -> None:
-    """Installs uv, then the requirement.
+    """Install uv, and the requirement with uv.
 
     Args:
         requirement: arguments of `pip install`.
 
     Raises:
-        OSError, ValueError, subprocess.CalledProcessError: If uv cannot be used, or
-        fails.
+        OSError, ValueError, subprocess.CalledProcessError: If uv cannot be used or
+            fails.
     """
 
     def run(*command: str, **variables: str) -> str:
-        environment = variables | os.environ  # what the user says to uv goes first
+        environment = variables | os.environ  # the user's settings of uv come first
         return subprocess.run(
             command, env=environment, check=True, capture_output=True, text=True
         ).stdout
@@ -119,15 +118,13 @@ def install_with_uv(requirement: list[str]) -> None:
 
 
 def why(error: Exception) -> str:
-    """Returns the first line of what an installer printed about an error, or of the
-    error itself.
-    """
+    """Return the first line that an installer printed, or else that of the error."""
     printed = (getattr(error, "stderr", "") or "").strip()
     return (printed or str(error)).splitlines()[0]
 
 
 def main() -> int:
-    """Installs with uv, or else with pip, and returns the exit status."""
+    """Install with uv, or with pip if uv fails; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("extras", help="extras to install, such as docs or dask,geo")
     parser.add_argument(
@@ -144,8 +141,8 @@ def main() -> int:
         install_with_uv(requirement)
     except (OSError, ValueError, subprocess.CalledProcessError) as error:
         print(
-            "benchnav: installing with pip, several minutes, since uv failed: "
-            f"{why(error)}",
+            "benchnav: installing with pip, which takes several minutes, because uv "
+            f"failed: {why(error)}",
             file=sys.stderr,
         )
         return subprocess.run([*PIP, "install", *requirement]).returncode

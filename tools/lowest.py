@@ -1,9 +1,8 @@
-"""Prints constraints that hold every dependency at the lowest version that
-pyproject.toml allows.
+"""Print constraints that pin every dependency to its lowest version in pyproject.toml.
 
-`make test-lowest` installs these and runs the tests, so that the lower bounds are
-versions that really work. It needs nothing but Python itself, since it runs before
-anything is installed.
+`make test-lowest` installs these versions and runs the tests, which shows that the
+lower bounds work. This script runs before anything is installed, so it needs only
+Python.
 
     python tools/lowest.py [PYPROJECT] > constraints.txt
 """
@@ -15,44 +14,44 @@ from collections.abc import Iterable
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-# What tests need, and what they try where it is there; not what only checks the
-# sources.
+# Extras that tests need or use if installed; not those that only check the sources.
 EXTRAS = ("dask", "geo", "test")
 
 
 def lowest(requirements: Iterable[str]) -> dict[str, str]:
-    """Reads the lower bounds of requirements.
+    """Read the lower bounds of requirements.
 
     Args:
-        requirements: such as `numpy>=2.1` or `jsonargparse[signatures]>=4.49`.
+        requirements: requirements such as `numpy>=2.1` or
+            `jsonargparse[signatures]>=4.49`.
 
     Returns:
-        Versions by name, without extras.
+        Versions by name of the package, without extras.
 
     Raises:
-        ValueError: a requirement has no lower bound, or one package has two.
+        ValueError: If a requirement has no lower bound, or a package has two.
     """
-    found: dict[str, str] = {}
+    versions: dict[str, str] = {}
     for requirement in requirements:
-        read = re.fullmatch(
+        match = re.fullmatch(
             r"([A-Za-z0-9._-]+)(?:\[[^\]]*\])?\s*>=\s*([0-9][0-9.]*)(?:\s*,.*)?",
             requirement,
         )
-        if read is None:
+        if match is None:
             raise ValueError(
                 "Expected a requirement with a lower bound, such as numpy>=2.1, got "
                 f"{requirement!r}."
             )
-        name, version = read.groups()
-        if found.setdefault(name, version) != version:
+        name, version = match.groups()
+        if versions.setdefault(name, version) != version:
             raise ValueError(
-                f"Expected one lower bound of {name}, got {found[name]} and {version}."
+                f"Expected one lower bound of {name}, got {versions[name]} and {version}."
             )
-    return found
+    return versions
 
 
 def read_requirements(pyproject: Path) -> list[str]:
-    """The requirements of the package and of the extras that tests use."""
+    """Return the requirements of the package and of the extras that tests use."""
     project = tomllib.loads(pyproject.read_text())["project"]
     extras = (project["optional-dependencies"][name] for name in EXTRAS)
     return [

@@ -1,10 +1,9 @@
-"""Writes the pages of the three commands for the documentation, from their parsers, and
-that of the metrics.
+"""Write the reference pages of the three commands and of the metrics.
 
     python tools/reference.py docs/reference/commands
 
-A page a command, a section a subcommand, a row an option, as `--help` has them; and a
-row a metric, as its object has them.
+Each command has a page, each subcommand a section, and each option a row, with the
+contents of `--help`. The page of metrics has a row per metric, from its object.
 """
 
 import inspect
@@ -37,55 +36,61 @@ PROGRAMS = {
 
 
 def documented(target: Any) -> dict[str, str]:
-    """What docstrings say of each parameter of a function, or of each field of a
-    dataclass and of its bases.
+    """Return the documentation of a function's parameters or a dataclass's fields.
+
+    Fields of base classes are included.
     """
-    found: dict[str, str] = {}
+    descriptions: dict[str, str] = {}
     for owner in reversed(getattr(target, "__mro__", (target,))):
-        told = parse(inspect.getdoc(owner) or "").params if owner is not object else []
-        found |= {
-            own.arg_name: " ".join((own.description or "").split()) for own in told
+        parameters = (
+            parse(inspect.getdoc(owner) or "").params if owner is not object else []
+        )
+        descriptions |= {
+            parameter.arg_name: " ".join((parameter.description or "").split())
+            for parameter in parameters
         }
-    return found
+    return descriptions
 
 
 def line(*cells: str) -> str:
-    """A row of a table."""
+    """Return a row of a Markdown table."""
     return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
 
 
-def row(name: str, option: Option, about: str) -> str:
-    """The row of an option."""
-    shown = ""
+def row(name: str, option: Option, meaning: str) -> str:
+    """Return the row of an option."""
+    default = ""
     if option.default is NO_DEFAULT:
-        shown = "needed"
+        default = "needed"
     elif not dataclass_in(option.kind):
         value = (
             yaml.safe_dump(plain(option.default), default_flow_style=True)
             .removesuffix("...\n")
             .strip()
         )
-        shown = f"`{value}`"
-    return line(f"`{name}`", in_words(option.kind).replace("'", "`"), shown, about)
+        default = f"`{value}`"
+    return line(f"`{name}`", in_words(option.kind).replace("'", "`"), default, meaning)
 
 
 def section(program: str, name: str, command: Command) -> str:
-    """The section of a subcommand."""
-    about = documented(command.function)
+    """Return the section of a subcommand."""
+    meanings = documented(command.function)
     for kind in command.settings.values():
-        about |= documented(kind)
+        meanings |= documented(kind)
     rows = []
-    for option in (
+    names = (
         *command.positionals,
-        *(own for own in command.options if own not in command.positionals),
-    ):
-        own = command.options[option]
-        flag = option.upper() if option in command.positionals else f"--{option}"
-        rows.append(row(flag, own, about.get(option, "")))
-        if group := dataclass_in(own.kind):
-            told = documented(group)
+        *(name for name in command.options if name not in command.positionals),
+    )
+    for option_name in names:
+        option = command.options[option_name]
+        is_positional = option_name in command.positionals
+        flag = option_name.upper() if is_positional else f"--{option_name}"
+        rows.append(row(flag, option, meanings.get(option_name, "")))
+        if group := dataclass_in(option.kind):
+            fields = documented(group)
             rows += [
-                row(f"{flag}.{key}", item, told.get(key, ""))
+                row(f"{flag}.{key}", item, fields.get(key, ""))
                 for key, item in list_options(group).items()
             ]
     shipped = f", or one of {', '.join(command.shipped)}" if command.shipped else ""
@@ -108,48 +113,55 @@ def section(program: str, name: str, command: Command) -> str:
 
 
 def metrics_page() -> str:
-    """The page of the metrics: those of every run in the order of columns, then those
-    that a suite can name.
-    """
-    every = [metric.name for metric in SHIPPED]
+    """Return the page of metrics: first those of every run, then those on request."""
+    shipped = [metric.name for metric in SHIPPED]
     head = [
         line("name", "column", "unit", "better", "meaning"),
         "|---|---|---|---|---|",
     ]
     parts = []
     for title, names in (
-        ("In every run", every),
+        ("In every run", shipped),
         (
             "By name, in `metrics`",
-            [name for name in registry.names("metric") if name not in every],
+            [name for name in registry.names("metric") if name not in shipped],
         ),
     ):
         rows = []
         for name in names:
-            own = registry.make("metric", name).quantity
-            better = "" if own.better == "neither" else own.better
+            quantity = registry.make("metric", name).quantity
+            better = "" if quantity.better == "neither" else quantity.better
             rows.append(
-                line(f"`{name}`", f"`{own.column}`", own.unit, better, own.meaning)
+                line(
+                    f"`{name}`",
+                    f"`{quantity.column}`",
+                    quantity.unit,
+                    better,
+                    quantity.meaning,
+                )
             )
         parts.append("\n".join([f"## {title}", "", *head, *rows, ""]))
-    said = (
+    introduction = (
         "A metric is one number for each episode: a column of `episodes.parquet`. "
         "Hypotheses and `compare --metric` "
         "take its name; the unit is that of differences and margins. "
         "[A metric of your own](../../how-to/own-parts.md#metric) is a class in a "
         "file."
     )
-    return "\n".join(["# Metrics of episodes", "", said, "", *parts])
+    return "\n".join(["# Metrics of episodes", "", introduction, "", *parts])
 
 
 def main() -> None:
-    """Writes the pages."""
+    """Write the pages."""
     folder = Path(sys.argv[1])
     folder.mkdir(parents=True, exist_ok=True)
     for name, module in PROGRAMS.items():
         program = f"benchnav-{name}"
         commands: dict[str, Command] = import_module(module).COMMANDS
-        sections = [section(program, own, command) for own, command in commands.items()]
+        sections = [
+            section(program, subcommand, command)
+            for subcommand, command in commands.items()
+        ]
         write_text(folder / f"{name}.md", f"# {program}\n\n" + "\n".join(sections))
     write_text(folder / "metrics.md", metrics_page())
 

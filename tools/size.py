@@ -1,7 +1,7 @@
 """Count the tokens of Python code, without comments, docstrings and layout.
 
-    python tools/size.py                    # by package, and by area
-    python tools/size.py --against REVISION # next to those of a revision of the repository
+    python tools/size.py                    # per folder
+    python tools/size.py --against REVISION # compared with a revision of the repository
 
 Run it with Python 3.11: later versions split f-strings into tokens.
 """
@@ -25,14 +25,14 @@ _LAYOUT = {
     tokenize.ENCODING,
     tokenize.ENDMARKER,
 }
-# Names that do not say what a value is.
-_EVERYDAY_WORDS = """
-found own place known told made whole both here there left every asked given each one
-other way said kept wanted met about share held most least
-"""
-EVERYDAY = frozenset(_EVERYDAY_WORDS.split())
-MAX_LINES = 450  # of a file
-# What is counted: of a checkout or a revision, by the first folders of a path.
+# Names that do not say what their value is.
+EVERYDAY = frozenset({
+    "found", "own", "place", "known", "told", "made", "whole", "both", "here", "there",
+    "left", "every", "asked", "given", "each", "one", "other", "way", "said", "kept",
+    "wanted", "met", "about", "share", "held", "most", "least",
+})  # fmt: skip
+MAX_LINES = 450  # per file
+# Folders at the root whose files are counted.
 _COUNTED = ("benchnav", "benchmarks", "studies", "tools", "tests")
 
 
@@ -54,7 +54,7 @@ def _docstring_lines(module: ast.Module) -> set[int]:
             node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
         ):
             continue
-        # A string by itself documents the statement above it.
+        # A statement that is only a string documents the statement above it.
         for statement in node.body:
             is_text = isinstance(statement, ast.Expr) and isinstance(
                 statement.value, ast.Constant
@@ -134,52 +134,48 @@ def _git(*words: str) -> str:
 
 
 def by_folder(files: dict[str, int]) -> Counter[str]:
-    """Sum by the first folder, and of the package by the second."""
+    """Sum tokens per folder of the first two levels; of large packages, of three."""
     totals: Counter[str] = Counter()
     for path, tokens in files.items():
         folders = path.split("/")[:-1]
-        totals[
-            "/".join(
-                folders[
-                    : 3
-                    if folders[:2] in (["benchnav", "eval"], ["benchnav", "models"])
-                    else 2
-                ]
-            )
-        ] += tokens
+        is_large = folders[:2] in (["benchnav", "eval"], ["benchnav", "models"])
+        depth = 3 if is_large else 2
+        totals["/".join(folders[:depth])] += tokens
         totals["package"] += tokens * (folders[0] == "benchnav")
     return totals
 
 
 def main() -> None:
-    """Print a table."""
+    """Print a table of tokens, or of the style of each package."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--against", default="", help="a revision to compare with")
-    parser.add_argument("--files", action="store_true", help="each file")
+    parser.add_argument("--against", default="", help="revision to compare with")
+    parser.add_argument("--files", action="store_true", help="one row per file")
     parser.add_argument(
-        "--style", action="store_true", help="density of lines, and names"
+        "--style",
+        action="store_true",
+        help="tokens per logical line, and everyday names",
     )
-    given = parser.parse_args()
-    if given.style:
+    arguments = parser.parse_args()
+    if arguments.style:
         print_style()
         return
     if sys.version_info[:2] != (3, 11):
         print(
-            f"warning: Python {sys.version_info[0]}.{sys.version_info[1]} may split "
-            "tokens otherwise than 3.11"
+            f"warning: Python {sys.version_info[0]}.{sys.version_info[1]} may count "
+            "tokens differently from 3.11"
         )
-    now, before = sizes(), sizes(given.against) if given.against else {}
-    if not given.files:
-        now, before = by_folder(now), by_folder(before)
-    for name in sorted(now.keys() | before.keys()):
+    current, before = sizes(), sizes(arguments.against) if arguments.against else {}
+    if not arguments.files:
+        current, before = by_folder(current), by_folder(before)
+    for name in sorted(current.keys() | before.keys()):
         change = (
-            f" {before.get(name, 0):8} {now.get(name, 0) - before.get(name, 0):+8}"
-            if given.against
+            f" {before.get(name, 0):8} {current.get(name, 0) - before.get(name, 0):+8}"
+            if arguments.against
             else ""
         )
-        print(f"{name:50} {now.get(name, 0):8}{change}")
+        print(f"{name:50} {current.get(name, 0):8}{change}")
 
 
 if __name__ == "__main__":

@@ -1,3 +1,1 @@
-"""A planner and a model for BenchNav, which finds them by the entry points in
-pyproject.toml.
-"""
+"""Planner and model for BenchNav, which finds them by entry points in pyproject.toml."""

@@ -1,4 +1,4 @@
-"""A planner that looks along rays."""
+"""A planner that compares the time to the goal along rays."""
 
 import math
 
@@ -8,11 +8,11 @@ from benchnav.planning import Plan, Planner, Problem, Step
 
 
 class Rays(Planner[Problem]):
-    """Turns to the ray along which the way to the goal costs least time, by λ̂.
+    """Planner that turns to the ray with the shortest estimated time to the goal.
 
     Args:
-        rays: how many directions it looks in.
-        length_m: how far it looks.
+        rays: number of directions.
+        length_m: length of a ray in metres.
     """
 
     steers = (("speed_mps", "turn_rate_radps"),)
@@ -21,41 +21,45 @@ class Rays(Planner[Problem]):
         self.rays, self.length_m = rays, length_m
 
     def init(self, problem: Problem, generator: torch.Generator) -> Problem:
-        """The plan state: all that is kept from step to step."""
+        """Return the plan state, which is passed from step to step."""
         return problem
 
     def plan(
         self, step: Step, plan_state: Problem
     ) -> tuple[torch.Tensor, Problem, Plan]:
-        """Actions of shape [B, 2]: speed and turn rate."""
-        problem, here, heading = plan_state, step.state[:, :2], step.state[:, 2]
-        to_goal = problem.goal_m - here
-        turns = torch.arange(self.rays, device=here.device) * (2 * math.pi / self.rays)
+        """Return the actions [B, 2] (speed, turn rate), the plan state and the plan."""
+        problem, position, heading = plan_state, step.state[:, :2], step.state[:, 2]
+        to_goal = problem.goal_m - position
+        turns = torch.arange(self.rays, device=position.device) * (
+            2 * math.pi / self.rays
+        )
         angles = torch.atan2(to_goal[:, 1], to_goal[:, 0])[:, None] + turns  # [B, R]
         # no further than the goal
-        far = to_goal.norm(dim=1).clamp(max=self.length_m)[:, None]
-        shares = torch.linspace(0.1, 1, 10, device=here.device)
+        length = to_goal.norm(dim=1).clamp(max=self.length_m)[:, None]
+        fractions = torch.linspace(0.1, 1, 10, device=position.device)
         # [B, R, 2]
-        along = torch.stack((angles.cos(), angles.sin()), dim=-1) * far[..., None]
+        along = torch.stack((angles.cos(), angles.sin()), dim=-1) * length[..., None]
         # [B, R, N, 2]
-        points = here[:, None, None] + shares[:, None] * along[:, :, None]
+        points = position[:, None, None] + fractions[:, None] * along[:, :, None]
         pose = torch.cat(
             (points, angles[:, :, None, None].expand(*points.shape[:3], 1)), dim=-1
         )
         # off the map λ̂ is 0
         pace = 1 / problem.traversability_at(pose).clamp(min=1e-3)
         pace = torch.where(problem.free_at(pose), pace, 1e3)
-        left = (problem.goal_m[:, None] - points[:, :, -1]).norm(dim=-1)
-        best = (far * pace.mean(dim=-1) + left).argmin(dim=1, keepdim=True)  # [B, 1]
-        off = angles.gather(1, best).squeeze(1) - heading
-        off = torch.atan2(off.sin(), off.cos())
+        remaining = (problem.goal_m[:, None] - points[:, :, -1]).norm(dim=-1)
+        best = (length * pace.mean(dim=-1) + remaining).argmin(
+            dim=1, keepdim=True
+        )  # [B, 1]
+        turn = angles.gather(1, best).squeeze(1) - heading
+        turn = torch.atan2(turn.sin(), turn.cos())
         low, high = problem.action_bounds
         action = torch.stack(
-            (high[0] * off.cos().clamp(min=0), off / problem.dt_s), dim=1
+            (high[0] * turn.cos().clamp(min=0), turn / problem.dt_s), dim=1
         )
         drawn = {"samples": points} if step.draw else {}
         return (
             action.clamp(low, high),
             plan_state,
-            Plan.empty(len(problem), here.device, **drawn),
+            Plan.empty(len(problem), position.device, **drawn),
         )
