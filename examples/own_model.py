@@ -4,9 +4,8 @@
     benchnav-train evaluate examples/own_model.py:CellModel@checkpoints/mine --data DATASET
     benchnav-eval run --model examples/own_model.py:CellModel@checkpoints/mine --data DATASET
 
-The network predicts each cell from the layers of that cell that `inputs` lists. The
-prediction is one Gaussian, clipped to [0, 1]. Its loss is the continuous ranked
-probability score of a Gaussian (Gneiting and Raftery, 2007).
+The network predicts a Gaussian, clipped to [0, 1], from a single cell's `inputs`. The
+loss is the continuous ranked probability score (Gneiting and Raftery, 2007).
 """
 
 import math
