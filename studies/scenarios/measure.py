@@ -37,8 +37,8 @@ PAIRS: dict[str, Any] = {
     "std": {"preset": "std"},
     "hg-050": {"preset": "hg", "severity": 0.5},
     "hg-100": {"preset": "hg"},
-    "hg-100, craters alone": {"preset": "hg", "relief_m": [1.4, 1.7]},
-    "hg-100, relief alone": {"preset": "hg", "crater_count": [0, 0]},
+    "hg-100, only craters": {"preset": "hg", "relief_m": [1.4, 1.7]},
+    "hg-100, only relief": {"preset": "hg", "crater_count": [0, 0]},
     "hs-050": {"preset": "hs", "severity": 0.5},
     "hs-100": {"preset": "hs"},
 }
@@ -119,7 +119,7 @@ def _measure_chunk(
         transformed = pit(
             mixture, torch.from_numpy(maps["traversability"]), draws
         ).numpy()
-        result[f"held {name}"], result[f"tail {name}"] = (
+        result[f"covered {name}"], result[f"tail {name}"] = (
             np.abs(transformed - 0.5) <= 0.45,
             transformed < 0.1,
         )
