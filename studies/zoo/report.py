@@ -140,11 +140,11 @@ def _slope(slopes: np.ndarray, direction: str = "") -> dict[str, float]:
 
 def exploratory(models: pd.DataFrame) -> Iterator[tuple[str, pd.Index]]:
     """Yield names and labels of subsets of models, for exploratory slopes."""
-    yield "training maps alone, temperature as trained", models.query("dose == 1").index
+    yield "only training maps, temperature as trained", models.query("dose == 1").index
     largest = models[models["size"] == models["size"].max()]
     for what in ("temperature", "soft", "brightness"):
         yield (
-            f"{what} alone, of the largest training set",
+            f"only {what}, with the largest training set",
             largest.query("what == @what or dose == 1").index,
         )
     yield "without brightness", models.query("what != 'brightness'").index
