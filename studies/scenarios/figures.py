@@ -150,41 +150,18 @@ def draw_series(series: Mapping[str, Maps]) -> Figure:
 
     The third panel has one point per map.
     """
-    figure, places = panel_grid(["(a)", "(b)", "(c)"], 3, 2.2)
-    accuracy, error, of_maps = (panel for (panel,) in places)
+    figure, panels = panel_grid(["(a)", "(b)", "(c)"], 3, 2.2)
+    accuracy, error, of_maps = (panel for (panel,) in panels)
     for preset in ("hg", "hs"):
-        by_severity = {
-            _severity(name): maps
-            for name, maps in series.items()
-            if name.startswith((preset, "std"))
-        }
+        by_severity = _by_severity(series, (preset, "std"))
+        style = {"color": COLOURS[preset], "ms": 3.5, "lw": 1.2}
         for source, (words, marker, dashes) in SOURCES.items():
-            look = {
-                "color": COLOURS[preset],
-                "marker": marker,
-                "ls": dashes,
-                "ms": 3.5,
-                "lw": 1.2,
-            }
-            _draw_estimates(
-                error, by_severity, f"square {source}", rms, look, f"{preset}, {words}"
-            )
-        predicted = {"color": COLOURS[preset], "marker": "o", "ms": 3.5, "lw": 1.2}
-        _draw_estimates(accuracy, by_severity, "right", first, predicted)
-    dark = {
-        _severity(name): maps for name, maps in series.items() if name.startswith("hs")
-    }
-    light = np.concatenate(
-        [np.median(maps["brightness"], axis=(1, 2)) for maps in dark.values()]
-    )
-    right = np.concatenate([maps["right"].mean(axis=(1, 2)) for maps in dark.values()])
-    severity = np.concatenate(
-        [np.full(len(maps["right"]), value) for value, maps in dark.items()]
-    )
-    points = of_maps.scatter(
-        light, 100 * right, c=severity, cmap="viridis_r", s=4, lw=0
-    )
-    figure.colorbar(points, ax=of_maps, label="severity of hs")
+            look = style | {"marker": marker, "ls": dashes}
+            label = f"{preset}, {words}"
+            _draw_estimates(error, by_severity, f"square {source}", rms, look, label)
+        look = style | {"marker": "o"}
+        _draw_estimates(accuracy, by_severity, "right", first, look)
+    _draw_maps(figure, of_maps, _by_severity(series, ("hs",)))
     lit = np.median(series["std"]["brightness"], axis=(1, 2))
     of_maps.axvspan(
         lit.min(), lit.max(), color="0.88", lw=0, zorder=0, label="light of std"
@@ -200,6 +177,24 @@ def draw_series(series: Mapping[str, Maps]) -> Figure:
     return figure
 
 
+def _draw_maps(figure: Figure, panel: Axes, dark: Mapping[float, Maps]) -> None:
+    """Draw the accuracy of each map over its brightness, coloured by severity."""
+    light, accuracy, severity = [], [], []
+    for value, maps in dark.items():
+        light.append(np.median(maps["brightness"], axis=(1, 2)))
+        accuracy.append(100 * maps["right"].mean(axis=(1, 2)))
+        severity.append(np.full(len(maps["right"]), value))
+    points = panel.scatter(
+        np.concatenate(light),
+        np.concatenate(accuracy),
+        c=np.concatenate(severity),
+        cmap="viridis_r",
+        s=4,
+        lw=0,
+    )
+    figure.colorbar(points, ax=panel, label="severity of hs")
+
+
 def _draw_estimates(
     panel: Axes,
     by_severity: Mapping[float, Maps],
@@ -209,22 +204,21 @@ def _draw_estimates(
     label: str = "",
 ) -> None:
     """Draw a statistic in per cent over severity, with standard errors."""
-    value, error = (
-        100
-        * np.array(
-            [estimate([maps[key]], statistic) for maps in by_severity.values()]
-        ).T
-    )
-    draw_estimates(
-        panel,
-        list(by_severity),
-        value,
-        value - error,
-        value + error,
-        look,
-        label,
-        bars=True,
-    )
+    estimates = [estimate([maps[key]], statistic) for maps in by_severity.values()]
+    value, error = 100 * np.array(estimates).T
+    severities = list(by_severity)
+    low, high = value - error, value + error
+    draw_estimates(panel, severities, value, low, high, look, label, bars=True)
+
+
+def _by_severity(
+    series: Mapping[str, Maps], prefixes: tuple[str, ...]
+) -> dict[float, Maps]:
+    return {
+        _severity(name): maps
+        for name, maps in series.items()
+        if name.startswith(prefixes)
+    }
 
 
 def _severity(name: str) -> float:

@@ -29,6 +29,7 @@ from studies.study import Rows, Work
 
 MODEL = "paper-v1"
 COLUMNS = yaml.safe_load(Path(__file__).with_name("tables.yaml").read_text())
+LAYERS = ("rgb", "elevation_m", "slope_deg")  # of an observation, in its order
 PAIRED_MAPS, CHUNK_MAPS = 200, 20
 BEYOND: dict[str, Any] = {
     f"{preset}-150": {"preset": preset, "severity": 1.5} for preset in ("hg", "hs")
@@ -52,43 +53,36 @@ def measure_maps(
     Returns:
         Numbers per map by name, of shape [B], [B, K] or [B, *, H, W].
     """
-    pieces = []
+    measured = []
     for start in range(0, len(maps["rgb"]), CHUNK_MAPS):
-        chunk = {
-            name: values[start : start + CHUNK_MAPS] for name, values in maps.items()
-        }
-        pieces.append(_measure_chunk(model, recipe, chunk))
+        indices = slice(start, start + CHUNK_MAPS)
+        chunk = {name: values[indices] for name, values in maps.items()}
+        measured.append(_measure_chunk(model, recipe, chunk))
     return {
-        name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]
+        name: np.concatenate([chunk[name] for chunk in measured])
+        for name in measured[0]
     }
 
 
 def _measure_chunk(
     model: FusedModel, recipe: Recipe, maps: Maps
 ) -> dict[str, np.ndarray]:
-    slope, ids, count = (
-        maps["slope_deg"].astype(np.float64),
-        maps["class_id"],
-        len(recipe.classes),
-    )
-    latent = latent_mean(ids, slope, recipe.classes), latent_std(ids, recipe.classes)
-    mean, std = (torch.from_numpy(values)[:, None] for values in latent)
+    slope = maps["slope_deg"].astype(np.float64)
+    ids = maps["class_id"]
+    n_classes = len(recipe.classes)
+    mean = torch.from_numpy(latent_mean(ids, slope, recipe.classes))[:, None]
+    std = torch.from_numpy(latent_std(ids, recipe.classes))[:, None]
     expected = TraversabilityMixture(torch.ones_like(mean), mean, std).mean()
-    rgb, elevation, inclination = (
-        torch.from_numpy(maps[k]) for k in ("rgb", "elevation_m", "slope_deg")
-    )
-    predicted = model.predict(Observation(rgb, elevation, inclination, recipe.grid))
-    classes, predicted_class = (
-        torch.from_numpy(ids.astype(np.int64)),
-        predicted.weights.argmax(1),
-    )
-    one_hot = (
-        torch.nn.functional.one_hot(classes, count).movedim(-1, 1).to(predicted.weights)
-    )
+    layers = (torch.from_numpy(maps[name]) for name in LAYERS)
+    predicted = model.predict(Observation(*layers, recipe.grid))
+    classes = torch.from_numpy(ids.astype(np.int64))
+    predicted_class = predicted.weights.argmax(1)
+    pair_id = (classes * n_classes + predicted_class).numpy()
+    names = [kind.name for kind in recipe.classes]
+    full_light = np.array([sum(kind.colour) for kind in recipe.classes])
     result = {
         "rgb": maps["rgb"],
-        "brightness": maps["rgb"].sum(1)
-        / np.array([sum(c.colour) for c in recipe.classes])[ids],
+        "brightness": maps["rgb"].sum(1) / full_light[ids],
         "relief": np.ptp(maps["elevation_m"], axis=(1, 2)),
         "slope": histogram(slope, SLOPE_EDGES),
         "slope_deg": slope,
@@ -99,46 +93,42 @@ def _measure_chunk(
         "weights": predicted.weights.numpy(),
         "right": (predicted_class == classes).double().numpy(),
         "darker": (predicted_class < classes).numpy(),
-        "confusion": histogram(
-            (classes * count + predicted_class).numpy(), np.arange(count**2 + 1) - 0.5
-        ),
-        "wet clay": (
-            predicted_class == [c.name for c in recipe.classes].index("wet_clay")
-        ).numpy(),
+        "confusion": histogram(pair_id, np.arange(n_classes**2 + 1) - 0.5),
+        "wet clay": (predicted_class == names.index("wet_clay")).numpy(),
     }
+    one_hot = torch.nn.functional.one_hot(classes, n_classes).movedim(-1, 1)
+    true_weights = one_hot.to(predicted.weights)
     sources = {
         "predicted": predicted.weights,
-        "true": one_hot,
-        "none": torch.full_like(one_hot, 1 / count),
+        "true": true_weights,
+        "none": torch.full_like(true_weights, 1 / n_classes),
     }
+    realised = torch.from_numpy(maps["traversability"])
     for name, weights in sources.items():
-        mixture, draws = (
-            replace(predicted, weights=weights),
-            rng.generator(rng.stream_key(0, "docs", "pit")),
-        )
-        transformed = pit(
-            mixture, torch.from_numpy(maps["traversability"]), draws
-        ).numpy()
-        result[f"covered {name}"], result[f"tail {name}"] = (
-            np.abs(transformed - 0.5) <= 0.45,
-            transformed < 0.1,
-        )
-        result[f"error {name}"] = (mixture.mean() - expected).numpy()
-        result[f"square {name}"] = result[f"error {name}"] ** 2
+        mixture = replace(predicted, weights=weights)
+        draws = rng.generator(rng.stream_key(0, "docs", "pit"))
+        transformed = pit(mixture, realised, draws).numpy()
+        error = (mixture.mean() - expected).numpy()
+        result[f"covered {name}"] = np.abs(transformed - 0.5) <= 0.45
+        result[f"tail {name}"] = transformed < 0.1
+        result[f"error {name}"] = error
+        result[f"square {name}"] = error**2
     return result
 
 
 def by_scenario(pairs: Mapping[str, Maps], name: str) -> Rows:
     """Return a table with a row per scenario and the columns of `name` in tables.yaml."""
 
-    def cell(maps: Maps, of: Sequence[str], **how: Any) -> str:
-        return show([maps[key] for key in of], **how)
+    def cell(maps: Maps, of: Sequence[str], **options: Any) -> str:
+        return show([maps[key] for key in of], **options)
 
-    return [
-        {"scenario": scenario}
-        | {heading: cell(maps, **column) for heading, column in COLUMNS[name].items()}
-        for scenario, maps in pairs.items()
-    ]
+    rows = []
+    for scenario, maps in pairs.items():
+        row = {"scenario": scenario}
+        for heading, column in COLUMNS[name].items():
+            row[heading] = cell(maps, **column)
+        rows.append(row)
+    return rows
 
 
 def changes(model: FusedModel, maps: Maps, std: Maps) -> Maps:
@@ -148,14 +138,13 @@ def changes(model: FusedModel, maps: Maps, std: Maps) -> Maps:
     which is either that of std or that of the scenario.
     """
 
-    def squares(seen: Maps, ground: Maps) -> np.ndarray:
-        layers = (
-            torch.from_numpy(seen["weights"]),
-            *model.table.lookup(torch.from_numpy(ground["slope_deg"])),
-        )
+    def squares(picture: Maps, terrain: Maps) -> np.ndarray:
+        slope = torch.from_numpy(terrain["slope_deg"])
+        weights = torch.from_numpy(picture["weights"])
+        layers = (weights, *model.table.lookup(slope))
         chunks = zip(*(layer.split(CHUNK_MAPS) for layer in layers), strict=True)
         expected = torch.cat([TraversabilityMixture(*chunk).mean() for chunk in chunks])
-        return (expected.numpy() - ground["expected"]) ** 2
+        return (expected.numpy() - terrain["expected"]) ** 2
 
     return {
         **{key: maps[key] - std[key] for key in ("expected", "stuck", "right")},
@@ -177,9 +166,9 @@ def slope_table(std: Maps, hg: Maps) -> Rows:
             for maps in (std, hg)
         )
         inside = {
-            name: [hg[name] * of_hg, of_hg]
-            for name in hg
-            if hg[name].shape == of_hg.shape
+            name: [values * of_hg, of_hg]
+            for name, values in hg.items()
+            if values.shape == of_hg.shape
         }
         rows.append(
             {
@@ -201,24 +190,22 @@ def colour_table(recipe: Recipe) -> Rows:
 
     The brightness is the factor on its colour with the least squared difference.
     """
-    rows, colours = (
-        [],
-        np.array([kind.colour for kind in recipe.classes], dtype=np.float64),
-    )
-    for index, (kind, colour) in enumerate(zip(recipe.classes, colours, strict=True)):
+    rows = []
+    colours = np.array([kind.colour for kind in recipe.classes], dtype=np.float64)
+    headings = ("as the next darker", "as the second", "as the third")
+    for index, kind in enumerate(recipe.classes):
+        colour = colours[index]
         row = {
             "class": kind.name.replace("_", " "),
             "colour": ", ".join(map(str, kind.colour)),
         }
-        for darker, heading in enumerate(
-            ("as the next darker", "as the second", "as the third"), 1
-        ):
-            target = colours[index - darker]
-            scale = target @ colour / (colour @ colour)
-            error = np.abs(scale * colour - target).max()
-            row[heading] = (
-                f"{scale:.2f} (off by {error:.0f})" if darker <= index else ""
-            )
+        for steps, heading in enumerate(headings, 1):
+            row[heading] = ""
+            if steps <= index:
+                darker = colours[index - steps]
+                scale = darker @ colour / (colour @ colour)
+                error = np.abs(scale * colour - darker).max()
+                row[heading] = f"{scale:.2f} (off by {error:.0f})"
         rows.append(row)
     return rows
 
@@ -242,16 +229,13 @@ def measure_series(
     for split in ["test/std", *sorted(set(longer.splits) - {"test/std"})]:
         spec = longer.splits[split]
         unfiltered = replace(longer, splits={split: replace(spec, solvable=False)})
-        maps, drawn_first = (
-            generate(variant, split, np.arange(spec.maps))
-            for variant in (longer, unfiltered)
-        )
-        rejected_draws = (maps["elevation_m"] != drawn_first["elevation_m"]).any(
-            axis=(1, 2)
-        )
-        series[spec.scenario] = measure_maps(model, longer, maps) | {
-            "rejected_draws": rejected_draws
-        }
+        indices = np.arange(spec.maps)
+        maps = generate(longer, split, indices)
+        first_draws = generate(unfiltered, split, indices)
+        differs = maps["elevation_m"] != first_draws["elevation_m"]
+        measured = measure_maps(model, longer, maps)
+        measured["rejected_draws"] = differs.any(axis=(1, 2))
+        series[spec.scenario] = measured
     return series
 
 
@@ -263,41 +247,33 @@ def measure_pairs(model: FusedModel, recipe: Recipe) -> dict[str, Maps]:
     pairs: dict[str, Maps] = {}
     for name, entry in PAIRS.items():
         split = {"test/std": {"scenario": name, "maps": PAIRED_MAPS}}
-        scenario_recipe = recipe_from_dict(
-            recipe.to_dict() | {"scenarios": {name: entry}, "splits": split}, name
-        )
-        pairs[name] = measure_maps(
-            model,
-            scenario_recipe,
-            generate(scenario_recipe, "test/std", np.arange(PAIRED_MAPS)),
-        )
+        changes = {"scenarios": {name: entry}, "splits": split}
+        variant = recipe_from_dict(recipe.to_dict() | changes, name)
+        maps = generate(variant, "test/std", np.arange(PAIRED_MAPS))
+        pairs[name] = measure_maps(model, variant, maps)
     return pairs
 
 
 def measure(work: Work, folder: Path) -> dict[str, Rows | Figure]:
     """Return the tables and the figures of the page."""
-    recipe, checkpoint = (
-        load_recipe("shift-v1"),
-        load_checkpoint(find_checkpoint(MODEL)),
-    )
+    recipe = load_recipe("shift-v1")
+    checkpoint = load_checkpoint(find_checkpoint(MODEL))
     model = FusedModel.from_checkpoint(checkpoint)
     steepest = max(checkpoint.part("gp").config["steepest_deg"])
-    series, pairs = measure_series(model, recipe), measure_pairs(model, recipe)
-    series = {
-        name: maps | {"beyond": maps["slope_deg"] > steepest}
-        for name, maps in series.items()
-    }
+    pairs = measure_pairs(model, recipe)
+    series = measure_series(model, recipe)
+    for maps in series.values():
+        maps["beyond"] = maps["slope_deg"] > steepest
     changed = {
         name: changes(model, maps, pairs["std"])
         for name, maps in pairs.items()
         if name != "std"
     }
-    rejected = ({"rejected": maps["rejected_draws"].sum()} for maps in series.values())
+    ground = by_scenario(series, "ground")
+    for row, maps in zip(ground, series.values(), strict=True):
+        row["rejected"] = maps["rejected_draws"].sum()
     return {
-        "ground": [
-            row | more
-            for row, more in zip(by_scenario(series, "ground"), rejected, strict=True)
-        ],
+        "ground": ground,
         "model": by_scenario(series, "model"),
         "calibration": by_scenario(series, "calibration"),
         "pairs": by_scenario(changed, "pairs"),

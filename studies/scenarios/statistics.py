@@ -28,24 +28,22 @@ def estimate(
             averaged over cells.
         statistic: function from means [*, K] to values [*].
     """
-    flat = [
-        c.reshape(len(c), -1) if c.ndim < 3 else c.mean(axis=(1, 2))[:, None]
-        for c in columns
-    ]
-    numbers = np.hstack(flat).astype(np.float64)
-    maps = len(numbers)
-    drawn = (
-        rng.uniform(
-            rng.stream_key(0, "docs", "bootstrap"), np.arange(RESAMPLES), (maps,)
-        )
-        * maps
-    )
-    times = np.stack(
-        [np.bincount(row, minlength=maps) for row in drawn.astype(np.int64)]
-    )
-    return float(statistic(numbers.mean(0))), float(
-        statistic(times @ numbers / maps).std(ddof=1)
-    )
+    numbers = np.hstack([_per_map(column) for column in columns]).astype(np.float64)
+    n_maps = len(numbers)
+    key = rng.stream_key(0, "docs", "bootstrap")
+    uniform = rng.uniform(key, np.arange(RESAMPLES), (n_maps,))
+    indices = (uniform * n_maps).astype(np.int64)
+    # Each row counts how often a resample has each map.
+    counts = np.stack([np.bincount(row, minlength=n_maps) for row in indices])
+    value = statistic(numbers.mean(0))
+    resampled = statistic(counts @ numbers / n_maps)
+    return float(value), float(resampled.std(ddof=1))
+
+
+def _per_map(column: np.ndarray) -> np.ndarray:
+    if column.ndim < 3:
+        return column.reshape(len(column), -1)
+    return column.mean(axis=(1, 2))[:, None]
 
 
 def show(
@@ -55,12 +53,11 @@ def show(
     digits: int = 1,
 ) -> str:
     """Format `value ± standard error`, or only the value if the error is 0."""
-    value, error = (
-        scale * number for number in estimate(columns, STATISTICS[statistic])
-    )
-    return f"{value:.{digits}f}".replace("-", "−") + (
-        f" ± {error:.{digits}f}" if error > 0 else ""
-    )
+    value, error = estimate(columns, STATISTICS[statistic])
+    text = f"{scale * value:.{digits}f}".replace("-", "−")
+    if scale * error > 0:
+        text += f" ± {scale * error:.{digits}f}"
+    return text
 
 
 def first(means: np.ndarray) -> np.ndarray:
@@ -78,7 +75,9 @@ def rms(means: np.ndarray) -> np.ndarray:
 
     With two columns, the mean is over the cells of the mask in the second.
     """
-    return np.sqrt(first(means) if means.shape[-1] == 1 else ratio(means))
+    has_mask = means.shape[-1] > 1
+    mean_square = ratio(means) if has_mask else first(means)
+    return np.sqrt(mean_square)
 
 
 def excess(means: np.ndarray) -> np.ndarray:
@@ -88,17 +87,22 @@ def excess(means: np.ndarray) -> np.ndarray:
 
 def quantile(fraction: float, edges: np.ndarray) -> Statistic:
     """Return the statistic that reads a quantile from a histogram."""
-    return lambda counts: edges[
-        1 + (counts.cumsum(-1) < fraction * counts.sum(-1, keepdims=True)).sum(-1)
-    ]
+
+    def read(counts: np.ndarray) -> np.ndarray:
+        is_below = counts.cumsum(-1) < fraction * counts.sum(-1, keepdims=True)
+        upper_edges: np.ndarray = edges[1 + is_below.sum(-1)]
+        return upper_edges
+
+    return read
 
 
 def mean_iou(confusion: np.ndarray) -> np.ndarray:
     """Return the mean intersection over union, given confusion counts [*, C·C]."""
-    count = round(confusion.shape[-1] ** 0.5)
-    square = confusion.reshape(*confusion.shape[:-1], count, count)
+    n_classes = round(confusion.shape[-1] ** 0.5)
+    square = confusion.reshape(*confusion.shape[:-1], n_classes, n_classes)
     intersection = np.diagonal(square, axis1=-2, axis2=-1)
-    return (intersection / (square.sum(-1) + square.sum(-2) - intersection)).mean(-1)
+    union = square.sum(-1) + square.sum(-2) - intersection
+    return (intersection / union).mean(-1)
 
 
 STATISTICS: dict[str, Statistic] = {

@@ -73,12 +73,11 @@ def outcomes(
         common: probability that a condition uses the noise that all conditions share.
     """
     shape = (*chance.shape, draws)
-    noise = np.broadcast_to(generator.random((shape[0], 1, *shape[2:])), shape)
+    shared = generator.random((shape[0], 1, *shape[2:]))
     independent = generator.random(shape)
-    return (
-        np.where(generator.random(shape) < common, noise, independent)
-        < chance[..., None]
-    )
+    is_shared = generator.random(shape) < common
+    noise = np.where(is_shared, shared, independent)
+    return noise < chance[..., None]
 
 
 def times(
@@ -92,10 +91,9 @@ def times(
         hardness: normal scores of maps, shape [studies, conditions, maps].
     """
     independent = generator.standard_normal(success.shape)
-    arrival = _MEDIAN_S * np.exp(
-        _SPREAD * np.sqrt(0.5) * (hardness[..., None] + independent)
-    )
-    steps = np.rint(np.minimum(arrival, TIME_BUDGET_S - 1) / _STEP_S)
+    score = hardness[..., None] + independent
+    arrival_s = _MEDIAN_S * np.exp(_SPREAD * np.sqrt(0.5) * score)
+    steps = np.rint(np.minimum(arrival_s, TIME_BUDGET_S - 1) / _STEP_S)
     return np.where(success, steps * _STEP_S, TIME_BUDGET_S)
 
 
@@ -118,16 +116,19 @@ def drives(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw success and T_total, both of shape [studies, conditions, maps, draws]."""
     chance = chances(generator, rates, shape, like)
-    success = outcomes(generator, chance, draws, like[1])
-    return success, times(generator, success, hardness(chance, rates, like[0]))
+    within, common = like
+    success = outcomes(generator, chance, draws, common)
+    total_time_s = times(generator, success, hardness(chance, rates, within))
+    return success, total_time_s
 
 
 def true_difference_s(
     generator: np.random.Generator, rates: Sequence[float], like: tuple[float, float]
 ) -> tuple[float, float]:
     """Return the true T_total of the first of two conditions, and first − second."""
-    _, far = drives(generator, rates, (1, 400_000), 1, like)
-    return far[0, 0].mean(), (far[0, 0] - far[0, 1]).mean()
+    _, total_time_s = drives(generator, rates, (1, 400_000), 1, like)
+    first_s, second_s = total_time_s[0]
+    return first_s.mean(), (first_s - second_s).mean()
 
 
 def covers(ends: np.ndarray, truth: float) -> np.ndarray:
@@ -141,15 +142,12 @@ def rate_intervals(success: np.ndarray) -> np.ndarray:
     The number of episodes is divided by the design effect.
     """
     maps, draws = success.shape[1:]
-    member = np.repeat(np.arange(maps), draws)
-    return np.array(
-        [
-            wilson_interval(
-                study.mean(), study.size / design_effect(study.ravel(), member)
-            )
-            for study in success
-        ]
-    )
+    map_index = np.repeat(np.arange(maps), draws)
+    intervals = []
+    for study in success:
+        n_effective = study.size / design_effect(study.ravel(), map_index)
+        intervals.append(wilson_interval(study.mean(), n_effective))
+    return np.array(intervals)
 
 
 def difference_intervals(
@@ -162,9 +160,9 @@ def difference_intervals(
         episodes: episodes per map.
         confidence: nominal coverage of the intervals.
     """
-    return np.stack(
-        success_interval(wins[:, 0] - wins[:, 1], episodes, confidence)[1:], axis=1
-    )
+    differences = wins[:, 0] - wins[:, 1]
+    _, low, high = success_interval(differences, episodes, confidence)
+    return np.stack((low, high), axis=1)
 
 
 def cover_of_success(
@@ -294,17 +292,17 @@ def false_findings(
         success, total_time_s = drives(
             generator, [rate] * 6, (studies, maps), draws, like
         )
+        # Holm's correction rejects any hypothesis only if its first step does.
+        first_level = ALPHA / len(pairs)
         n_significant = np.zeros(2)
         for wins, taken in zip(success.sum(-1), total_time_s.mean(-1), strict=True):
-            by_success = [sign_flip_p(wins[i] - wins[j]) for i, j in pairs]
-            by_time = [
-                signed_rank_p(alike(taken[i] - taken[j], TIME_BUDGET_S))
-                for i, j in pairs
-            ]
-            # Holm's correction rejects any hypothesis only if its first step does.
-            n_significant += [
-                min(p) <= ALPHA / len(pairs) for p in (by_success, by_time)
-            ]
+            p_of_success, p_of_time = [], []
+            for i, j in pairs:
+                p_of_success.append(sign_flip_p(wins[i] - wins[j]))
+                difference_s = alike(taken[i] - taken[j], TIME_BUDGET_S)
+                p_of_time.append(signed_rank_p(difference_s))
+            n_significant[0] += min(p_of_success) <= first_level
+            n_significant[1] += min(p_of_time) <= first_level
         yield n_significant / studies
 
 
@@ -323,9 +321,11 @@ def group_wins(
     chance = chances(generator, rates, shape, like)
     if one_map:
         return outcomes(generator, chance, episodes, like[1]).sum(-1)
-    size, inside = 1 / _MAPS_WITHIN - 1, np.clip(chance, 1e-9, 1 - 1e-9)[..., None]
-    maps = generator.beta(inside * size, (1 - inside) * size, (*chance.shape, episodes))
-    return outcomes(generator, maps, 1, like[1])[..., 0].sum(-1)
+    size = 1 / _MAPS_WITHIN - 1
+    group_chance = np.clip(chance, 1e-9, 1 - 1e-9)[..., None]
+    alpha, beta_ = group_chance * size, (1 - group_chance) * size
+    map_chance = generator.beta(alpha, beta_, (*chance.shape, episodes))
+    return outcomes(generator, map_chance, 1, like[1])[..., 0].sum(-1)
 
 
 def cover_of_groups(
@@ -378,15 +378,13 @@ def unlike(
     Returns:
         Successes, shape [studies, settings, maps].
     """
-    half = settings // 2
-    steady = generator.binomial(draws, 0.9, (studies, half, maps))
-    failing = (
-        generator.random((studies, 1 if same_maps else settings - half, maps)) < 0.1
-    )
-    return np.concatenate(
-        [steady, np.broadcast_to(draws * ~failing, (studies, settings - half, maps))],
-        axis=1,
-    )
+    n_steady = settings // 2
+    n_failing = settings - n_steady
+    steady = generator.binomial(draws, 0.9, (studies, n_steady, maps))
+    n_drawn = 1 if same_maps else n_failing
+    fails = generator.random((studies, n_drawn, maps)) < 0.1
+    failing = np.broadcast_to(draws * ~fails, (studies, n_failing, maps))
+    return np.concatenate([steady, failing], axis=1)
 
 
 def called_worse(wins: np.ndarray, draws: int) -> np.ndarray:
