@@ -60,43 +60,38 @@ class Coverage:
         """Draw the times at which the belief is checked."""
         assert built.learning is not None
         assert built.simulation.field is not None
-        self._built, self._learner, self._field = (
-            built,
-            built.learning.learner,
-            built.simulation.field,
-        )
+        self._problem = built.problem
+        self._learner = built.learning.learner
+        self._field = built.simulation.field
         maps = np.array(unit.maps)
-        replan_steps = round(unit.condition.rules.replan_every_s / built.problem.dt_s)
-        drawn = rng.uniform(rng.stream_key(0, "coverage"), maps, (TIMES,))
-        self._steps = torch.from_numpy(
-            replan_steps * np.ceil(drawn * LATEST_S / built.problem.dt_s / replan_steps)
-        ).long()
-        self._rank = torch.from_numpy(
-            rng.uniform(rng.stream_key(0, "rank"), maps, built.problem.grid.shape)
-        )
+        dt_s = built.problem.dt_s
+        # Checks are at steps at which robots may replan.
+        replan_steps = round(unit.condition.rules.replan_every_s / dt_s)
+        uniform = rng.uniform(rng.stream_key(0, "coverage"), maps, (TIMES,))
+        steps = replan_steps * np.ceil(uniform * LATEST_S / dt_s / replan_steps)
+        rank = rng.uniform(rng.stream_key(0, "rank"), maps, built.problem.grid.shape)
+        self._steps = torch.from_numpy(steps).long()
+        self._rank = torch.from_numpy(rank)
         self.sums = torch.zeros(len(maps), 6, dtype=torch.float64)
 
     def __call__(self, step: int, knowing: Knowing) -> None:
         """Add the scores of robots that are still driving and have a check now."""
         knowledge, members = knowing.known, knowing.members
-        is_asked = (self._steps[members] == step).any(1) & knowledge.footprint.flatten(
-            1
-        ).any(1)
-        cells = (
-            _near(knowledge.footprint, self._built.problem.grid.resolution_m)
-            & ~knowledge.ever_sensed
-        )
-        cells &= is_asked[:, None, None]
+        footprint = knowledge.footprint
+        has_check = (self._steps[members] == step).any(1)
+        is_checked = has_check & footprint.flatten(1).any(1)
+        cells = _near(footprint, self._problem.grid.resolution_m)
+        cells &= ~knowledge.ever_sensed
+        cells &= is_checked[:, None, None]
         if not bool(cells.any()):
             return
-        value, member = (
-            self._field[members][cells][None],
-            members[cells.nonzero()[:, 0]],
-        )
+        value = self._field[members][cells][None]
+        member = members[cells.nonzero()[:, 0]]
+        rank = self._rank[members][cells][None]
         believed = self._learner.distribution(knowledge).at(cells)
         low, high = believed.cdf_limits(value)
-        pit = torch.lerp(low.double(), high.double(), self._rank[members][cells][None])
-        predicted = self._built.problem.distribution.select(members).at(cells)
+        pit = torch.lerp(low.double(), high.double(), rank)
+        predicted = self._problem.distribution.select(members).at(cells)
         scores = (
             torch.ones_like(pit),
             (pit - 0.5).abs() <= 0.45,
