@@ -36,31 +36,29 @@ def power(study: Study, work: Work) -> str:
 
 def _row(test: Mapping[Any, Any], n_tests: int, maps: int) -> dict[str, str]:
     """Return the cells of one of `n_tests` hypotheses, tested on `maps` maps."""
-    error = (
-        (test["high"] - test["low"])
-        / 2
-        / norm.ppf(0.975)
-        * np.sqrt(test["n_maps"] / maps)
-    )
-    places = (ALPHA / n_tests, ALPHA)
-    if_found, if_none = (
-        " to ".join(
-            f"{power_of(test, error, alpha, difference):.2f}" for alpha in places
-        )
-        for difference in (test["difference"], 0.0)
-    )
-    tails = 1 if test["direction"] else 2
-    smallest = error * (norm.ppf(1 - places[0] / tails) + norm.ppf(POWER))
-    has_margin = test["kind"] in ("equivalence", "non-inferiority")
+    half_width = (test["high"] - test["low"]) / 2
+    error = half_width / norm.ppf(0.975) * np.sqrt(test["n_maps"] / maps)
+    # Levels of the first and the last step of Holm's correction.
+    levels = (ALPHA / n_tests, ALPHA)
+
+    def powers(difference: float) -> str:
+        values = (power_of(test, error, alpha, difference) for alpha in levels)
+        return " to ".join(f"{value:.2f}" for value in values)
+
+    low, high = test["low"], test["high"]
+    if_none, detectable = NOTHING, NOTHING
+    if test["kind"] in ("equivalence", "non-inferiority"):
+        if_none = powers(0.0)
+    if test["kind"] == "difference":
+        tails = 1 if test["direction"] else 2
+        smallest = error * (norm.ppf(1 - levels[0] / tails) + norm.ppf(POWER))
+        detectable = f"{smallest:.1f}"
     return {
         "hypothesis": test["claim"],
-        "found on other maps (95 %)": f"{test['difference']:+.2f} ({test['low']:+.1f} "
-        f"to {test['high']:+.1f})",
-        "power, if so": if_found,
-        "power, if no difference": if_none if has_margin else NOTHING,
-        f"smallest difference with a power of {POWER}": f"{smallest:.1f}"
-        if test["kind"] == "difference"
-        else NOTHING,
+        "estimate on development maps (95 %)": f"{test['difference']:+.2f} ({low:+.1f} to {high:+.1f})",
+        "power at this difference": powers(test["difference"]),
+        "power without a difference": if_none,
+        f"smallest detectable difference (power {POWER})": detectable,
     }
 
 
@@ -71,25 +69,24 @@ def power_of(
 
     Args:
         test: row of a hypothesis with `kind`, `direction` and `margin`.
-        error: standard error of the estimate, whose distribution is taken as normal.
+        error: standard error of the estimate, which is assumed to be normal.
         alpha: significance level.
         difference: true difference.
     """
     kind, margin = test["kind"], test["margin"]
+    min_error = max(error, 1e-9)
     if kind == "equivalence":
         ends = (
-            (margin + away) / max(error, 1e-9) - norm.ppf(1 - alpha)
-            for away in (difference, -difference)
+            (margin + distance) / min_error - norm.ppf(1 - alpha)
+            for distance in (difference, -difference)
         )
         return max(0.0, float(sum(norm.cdf(end) for end in ends)) - 1)
     # A test in both directions can only support the side of the true difference.
-    gain = (
-        difference * (-1 if test["direction"] == "lower" else 1)
-        if test["direction"]
-        else abs(difference)
-    )
+    gain, tails = abs(difference), 2
+    if test["direction"]:
+        gain, tails = difference, 1
+        if test["direction"] == "lower":
+            gain = -difference
     smallest = -margin if kind == "non-inferiority" else margin
-    tails = 1 if test["direction"] else 2
-    return float(
-        norm.cdf((gain - smallest) / max(error, 1e-9) - norm.ppf(1 - alpha / tails))
-    )
+    critical = norm.ppf(1 - alpha / tails)
+    return float(norm.cdf((gain - smallest) / min_error - critical))

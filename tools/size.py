@@ -56,10 +56,10 @@ def _docstring_lines(module: ast.Module) -> set[int]:
             continue
         # A statement that is only a string documents the statement above it.
         for statement in node.body:
-            is_text = isinstance(statement, ast.Expr) and isinstance(
-                statement.value, ast.Constant
-            )
-            if is_text and isinstance(statement.value.value, str):
+            if not isinstance(statement, ast.Expr):
+                continue
+            value = statement.value
+            if isinstance(value, ast.Constant) and isinstance(value.value, str):
                 lines.add(statement.lineno)
     return lines
 

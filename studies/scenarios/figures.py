@@ -98,12 +98,10 @@ def draw_tints(work: Work, folder: Path) -> dict[str, Figure]:
     splits = {"test/std": {"scenario": "one", "maps": EXAMPLE + 1}}
     pictures = []
     for title, entry in TINTS.items():
-        recipe = recipe_from_dict(
-            data | {"scenarios": {"one": entry}, "splits": splits}, title
-        )
-        pictures.append(
-            _picture(generate(recipe, "test/std", np.array([EXAMPLE]))["rgb"][0])
-        )
+        changes = {"scenarios": {"one": entry}, "splits": splits}
+        recipe = recipe_from_dict(data | changes, title)
+        maps = generate(recipe, "test/std", np.array([EXAMPLE]))
+        pictures.append(_picture(maps["rgb"][0]))
     figure, places = panel_grid(list(TINTS), len(TINTS), 1.5, 0.25, sharey=True)
     _show_row([panel for (panel,) in places], pictures, recipe.grid.extent_m)
     figure.supxlabel("x [m]")

@@ -98,21 +98,21 @@ def tabulate_pairs(rows: pd.DataFrame, a: str, b: str) -> str:
         b: setting to compare with.
     """
     won = wins(rows)
-    sides = (won.xs(setting, level="setting") for setting in (a, b))
+    won_a, won_b = won.xs(a, level="setting"), won.xs(b, level="setting")
     header = ["points", f"only `{a}`, only `{b}`", "p"]
     has_theirs = (a, b) == PAIRS[0]
     lines = []
-    for density, changed in changes(*sides, ["density"]).items():
+    for density, changed in changes(won_a, won_b, ["density"]).items():
         line = [f"{100 * density:.0f} %", *show_changes(changed, sign_flip_p(changed))]
         if has_theirs and density in PUBLISHED_PAIRS.index:
             gained, lost = PUBLISHED_PAIRS.loc[density]
             theirs = np.repeat([1, -1, 0], [gained, lost, TRIALS - gained - lost])
             line += show_changes(theirs, sign_flip_p(theirs))
         lines.append(line + [NOTHING] * (3 * has_theirs + 4 - len(line)))
-    return markdown(
-        ["vegetation", *header, *(f"theirs: {name}" for name in header if has_theirs)],
-        lines,
-    )
+    columns = ["vegetation", *header]
+    if has_theirs:
+        columns += [f"theirs: {name}" for name in header]
+    return markdown(columns, lines)
 
 
 def tabulate_runs(runs: Mapping[str, pd.DataFrame]) -> str:

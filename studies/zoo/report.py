@@ -6,6 +6,7 @@ much it is varied, 1 for a model as trained; and `loss`.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -91,21 +92,16 @@ def doses_results(
     for first, second in contrasts(sorted(set(models["size"].tolist()))):
         a, b = groups[first], groups[second]
         gain = 100 * (by_map.loc[a].mean(0) - by_map.loc[b].mean(0)).to_numpy()
-        difference = {
-            **_interval("points", gain),
-            "p": mean_flip_p(gain),
-            "loss": loss[a].mean() - loss[b].mean(),
-        }
-        compared.append({"one": first, "other": second, **difference})
-    table = success_table(rows, groups, (models["size"].max(), "temperature", 1.0))
-    table.insert(
-        0, "pinball", models.groupby(GROUP, sort=False)["loss"].mean().to_numpy()
-    )
-    table = (
-        table.rename_axis(["training maps", "what", "dose"])
-        .reset_index()
-        .sort_values("pinball")
-    )
+        row = {"one": first, "other": second, **_interval("points", gain)}
+        row["p"] = mean_flip_p(gain)
+        row["loss"] = loss[a].mean() - loss[b].mean()
+        compared.append(row)
+    centre = models["size"].max(), "temperature", 1.0
+    table = success_table(rows, groups, centre)
+    loss_by_dose = models.groupby(GROUP, sort=False)["loss"].mean()
+    table.insert(0, "pinball", loss_by_dose.to_numpy())
+    table = table.rename_axis(["training maps", "what", "dose"]).reset_index()
+    table = table.sort_values("pinball")
     return {
         "hypothesis": pd.DataFrame([hypothesis]),
         "exploratory": pd.DataFrame(explored),
@@ -174,19 +170,18 @@ def success_table(
     settings, with its interval and p by maps; p has Holm's correction.
     """
     by_map = _success_by_map(rows)
-    centre, lines = by_map.loc[groups[first]].mean(0), {}
+    centre = by_map.loc[groups[first]].mean(0)
+    lines = {}
     for key, labels in groups.items():
-        means = (
-            rows[rows["model"].isin(labels)]
-            .groupby("risk")[["success", "total_time_s"]]
-            .mean()
-        )
+        of_group = rows[rows["model"].isin(labels)]
+        means = of_group.groupby("risk")[["success", "total_time_s"]].mean()
         gain = 100 * (by_map.loc[labels].mean(0) - centre).to_numpy()
-        cells = {}
+        line = {}
         for risk in RISKS:
             success, time_s = means.loc[risk]
-            cells |= {f"success {risk}": 100 * success, f"T_total {risk}": time_s}
-        lines[key] = {**cells, **_interval("gain", gain), "p": mean_flip_p(gain)}
+            line[f"success {risk}"] = 100 * success
+            line[f"T_total {risk}"] = time_s
+        lines[key] = {**line, **_interval("gain", gain), "p": mean_flip_p(gain)}
     table = pd.DataFrame(lines).T
     others = [key != first for key in groups]
     table.loc[others, "p"] = holm(table.loc[others, "p"].to_numpy())
@@ -197,25 +192,24 @@ def success_table(
 def draw_doses(table: pd.DataFrame) -> Figure:
     """Draw success over the loss: one marker per dose, one panel per risk setting."""
     sizes = table["training maps"].astype(str)
-    kind = table["what"].where(
-        table["what"] != "temperature", "temperature, " + sizes + " maps"
-    )
+    is_temperature = table["what"] == "temperature"
+    kind = table["what"].where(~is_temperature, "temperature, " + sizes + " maps")
     by_size = table.sort_values("training maps", ascending=False, kind="stable").index
     looks = line_looks(list(kind[by_size]))
-    figure, places = panel_grid(
-        [risk_name(risk) for risk in RISKS], len(RISKS), 2.3, 0.6, sharey=True
-    )
+    titles = [risk_name(risk) for risk in RISKS]
+    figure, places = panel_grid(titles, len(RISKS), 2.3, 0.6, sharey=True)
     trained = table[table["dose"] == 1]
     for (panel,), risk in zip(places, RISKS, strict=True):
         for name, look in looks.items():
             points = table[kind == name]
-            panel.plot(
-                points["pinball"],
-                points[f"success {risk}"],
-                label=name,
-                **{**look, "ls": "none", "ms": 5},
-            )
-        circled = {"ms": 10, "mfc": "none", "mec": "0.2", "label": "as trained"}
+            style: dict[str, Any] = look | {"ls": "none", "ms": 5, "label": name}
+            panel.plot(points["pinball"], points[f"success {risk}"], **style)
+        circled: dict[str, Any] = {
+            "ms": 10,
+            "mfc": "none",
+            "mec": "0.2",
+            "label": "as trained",
+        }
         panel.plot(trained["pinball"], trained[f"success {risk}"], "o", **circled)
         panel.set_xlabel("pinball loss of the lower fifth")
     places[0][0].set_ylabel("success [%]")
@@ -231,25 +225,22 @@ def quality(table: pd.DataFrame, against: str = "") -> pd.DataFrame:
     shown = [name for name in SHOWN if name in table and table[name].notna().any()]
     wide = table.set_index(["split", "method", "seed"])[shown]
     if against:
-        first = (
-            wide.xs(against, level="method")
-            .reindex(wide.index.droplevel("method"))
-            .set_axis(wide.index)
-        )
-        wide = wide - first
-    return (
-        wide.groupby(level=["split", "method"], sort=False)
-        .agg(_over_seeds)
-        .reset_index()
-    )
+        first = wide.xs(against, level="method")
+        first = first.reindex(wide.index.droplevel("method"))
+        wide = wide - first.set_axis(wide.index)
+    methods = wide.groupby(level=["split", "method"], sort=False)
+    return methods.agg(_over_seeds).reset_index()
 
 
 def _over_seeds(values: pd.Series) -> str:
     """Format a mean over seeds, with several also the half width of its t interval."""
     if values.isna().all():
         return NOTHING
-    half = t.ppf(0.975, max(1, len(values) - 1)) * values.std() / len(values) ** 0.5
-    return f"{values.mean():.4f}" + (f" ±{half:.4f}" if len(values) > 1 else "")
+    text = f"{values.mean():.4f}"
+    if len(values) > 1:
+        half = t.ppf(0.975, len(values) - 1) * values.std() / len(values) ** 0.5
+        text += f" ±{half:.4f}"
+    return text
 
 
 def ranked(
@@ -264,9 +255,8 @@ def ranked(
         groups.setdefault(label.rsplit("-s", maxsplit=1)[0], []).append(label)
     chosen = table[(table["split"] == SPLIT) & ~table["privileged"]]
     scores = chosen.groupby("method")[list(SCORES)].mean()
-    methods = scores.join(success_table(rows, groups, next(iter(groups)))).sort_values(
-        "pinball"
-    )
+    successes = success_table(rows, groups, next(iter(groups)))
+    methods = scores.join(successes).sort_values("pinball")
     success = methods[[f"success {risk}" for risk in RISKS]].mean(axis=1)
     ranks = []
     for name, values in methods[list(SCORES)].items():
