@@ -53,10 +53,9 @@ def drive(unit: Unit, built: Built, steps: int = STEPS) -> dict[str, float]:
     cpu_start_s, start_s = time.process_time(), time.perf_counter()
     episodes, _ = simulate(unit, built, Settings(), stop=lambda step: step == steps)
     cpu_s, elapsed_s = time.process_time() - cpu_start_s, time.perf_counter() - start_s
+    driven_s = built.problem.dt_s * int(episodes.steps.sum())
     return {
-        "ms a second driven": 1e3
-        * cpu_s
-        / (built.problem.dt_s * int(episodes.steps.sum())),
+        "ms a second driven": 1e3 * cpu_s / driven_s,
         "learning": episodes.learning_s / elapsed_s,
         "planning": float(episodes.planning_s.sum()) / elapsed_s,
     }

@@ -38,10 +38,10 @@ SIZES = (64, 128, 256, 512, 1024)
 def problem_of(episodes: int = 20, size: int = 64) -> Problem:
     """Return a problem with random λ, the same for all episodes."""
     generator = torch.Generator().manual_seed(0)
-    ground = 0.35 + 0.6 * torch.rand((1, size, size), generator=generator).expand(
-        episodes, -1, -1
-    )
-    ends_m = torch.full((episodes, 2), 4.0), torch.full((episodes, 2), size / 2 - 4.0)
+    uniform = torch.rand((1, size, size), generator=generator)
+    ground = 0.35 + 0.6 * uniform.expand(episodes, -1, -1)
+    start_m = torch.full((episodes, 2), 4.0)
+    ends_m = start_m, torch.full((episodes, 2), size / 2 - 4.0)
     task = Task(robot=Unicycle(), objective=GoalDistance(), rules=Rules())
     return pose_on(ground, Grid(size, size, 0.5), ends_m, task, 100.0)[0]
 

@@ -71,24 +71,22 @@ def run_trials(
             fields = draw_traction(
                 seed, map_index.repeat(len(densities)), realisation, vegetation
             )
+            key = rng.stream_key(seed, "cai", "planner", map_number, realisation)
             for config, group in settings_by_config.items():
                 traction = torch.from_numpy(fields.repeat(len(group), axis=0)).float()
-                generator = rng.generator(
-                    rng.stream_key(seed, "cai", "planner", map_number, realisation)
+                arrival = drive(
+                    planners[config], problems[config], traction, rng.generator(key)
                 )
-                arrival_s = (
-                    drive(planners[config], problems[config], traction, generator)
-                    .double()
-                    .numpy()
-                )
+                arrival_s = arrival.double().numpy()
+                has_arrived = np.isfinite(arrival_s)
                 labels = pd.MultiIndex.from_product(
                     (densities, group), names=("density", "setting")
                 )
                 yield labels.to_frame(index=False).assign(
                     map=map_number,
                     realisation=realisation,
-                    success=np.isfinite(arrival_s),
-                    time_s=np.where(np.isfinite(arrival_s), arrival_s.round(1), np.nan),
+                    success=has_arrived,
+                    time_s=np.where(has_arrived, arrival_s.round(1), np.nan),
                 )
 
 
