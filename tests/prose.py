@@ -17,7 +17,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 CODE = ("benchnav", "benchmarks", "studies", "tools", "examples")
-PAGES = ("docs", "datasets", "checkpoints", "studies")
+PAGES = ("docs", "datasets", "checkpoints", "studies", "examples")
 ROOT_PAGES = ("README.md", "CONTRIBUTING.md", "STYLE.md")
 
 REFUSED = re.compile(
@@ -28,7 +28,7 @@ REFUSED = re.compile(
 TRIALS = re.compile(r"\btrials?\b", re.IGNORECASE)
 # Statistics and Optuna have trials.
 TRIALS_OF_OTHERS = re.compile(
-    r"Randomization Trials|[Bb]inomial|Bernoulli|McNemar|Optuna"
+    r"Randomization Trials|[Bb]inomial|Bernoulli|McNemar|Wilson|Optuna"
 )
 FIRST_WORDS = re.compile(r"^(Refuses|Tells|What|How)\b")
 EDITORS_LIST = re.compile(
@@ -96,10 +96,17 @@ def _of_code(path: Path) -> Iterator[Sentence]:
             first = node.body[0]
             documented.add(first.lineno)
             yield Sentence(name, first.lineno, _unquoted(docstring), is_docstring=True)
+    parts = {
+        id(part)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.JoinedStr)
+        for part in node.values
+    }
     for node in ast.walk(tree):
         if (
             isinstance(node, ast.Constant | ast.JoinedStr)
             and node.lineno not in documented
+            and id(node) not in parts
         ):
             message = _message(node)
             if len(message.split()) > 2:

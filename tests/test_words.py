@@ -3,71 +3,97 @@
 import re
 from pathlib import Path
 
+import pytest
+
+from tests import prose
+
 ROOT = Path(__file__).parents[1]
+# Words that are refused in code too, in names and in comments of YAML files.
 OLD = re.compile(
     r"luck|yardstick|told[ _]apart|\brungs?\b|ladder|\btwins?\b|slowest|\bfelt\b",
     re.IGNORECASE,
 )
-# Unmistakable parts of sentences that no reader understood.
-RIDDLES = re.compile(
-    r"so many maps show|told apart from it|does not tell from it|is told the truth|of the draws of λ [\d{]|joined "
-    r"start and goal by no ground|shows from|has a way over ground|since which these|may leave 0 out|"
-    r"randomization conditions|independent conditions|none for example|\(a (\w+), a \1\)|noise of λ, and what",
-    re.IGNORECASE,
-)
+FOLDERS = (*prose.CODE, "docs", "tests", "datasets", "checkpoints")
 # The table of renames, its test, and this.
 NAME_THEM = {
     "benchnav/core/settings.py",
     "tests/eval/test_replay.py",
     "tests/test_words.py",
 }
+REFUSED = {
+    '"""Return a mask of cells whose field is drawn anew."""': "anew",
+    '"""Fields that hang together."""': "hang together",
+    '"""Return the label; empty if there is none."""': "is none",
+    '"""Return so many sequences."""': "so many",
+    "# the port is not a number": "not a number",
+    'raise ValueError(f"Expected {name}, as nobody gave it.")': "nobody",
+    '"""Return the mean, as of `mean_std`."""': "as of ",
+    '"""Return the rows of all trials."""': "trials",
+    '"""Refuses a path that exists."""': "Refuses",
+    'def f():\n    """How the cells are correlated."""': "How",
+}
+ACCEPTED = (
+    '"""Read a file as of version 2."""',
+    '"""Return the fraction `is none` of cells."""',
+    '"""Return the exact McNemar test of binomial trials."""',
+    "# Murray (1998), *Design of Trials that nobody told of*",
+    'name = "so many"',
+    '"""Return how cells are correlated."""',
+)
 
 
-def test_riddles_are_gone() -> None:
-    files = [
-        path for folder in ("benchnav", "docs") for path in (ROOT / folder).rglob("*")
-    ]
-    texts = {
-        path.relative_to(ROOT).as_posix(): " ".join(_joined(path).split())
-        for path in files
-        if path.suffix in (".py", ".md", ".html", ".yaml")
-    }
-    assert len(texts) > 250
-    assert not {
-        f"{name}: {riddle[0]}"
-        for name, text in texts.items()
-        if (riddle := RIDDLES.search(text))
-    }
-    assert RIDDLES.search("So many maps show a difference from about 46 points on.")
+def test_sentences_have_no_refused_words() -> None:
+    assert len(list(prose.sentences())) > 10_000
+    assert prose.breaches() == []
 
 
-def _joined(path: Path) -> str:
-    """The text of a file, in which a sentence of several literals is one."""
-    return re.sub(r'"\s*\n\s*f?"', "", path.read_text())
+@pytest.mark.parametrize(("code", "word"), REFUSED.items(), ids=REFUSED.values())
+def test_a_refused_word_in_code_is_found(
+    code: str, word: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (breach,) = breaches_of({"benchnav/some.py": code}, tmp_path, monkeypatch)
+    assert breach.endswith(f"[{word}]")
+
+
+@pytest.mark.parametrize("code", ACCEPTED)
+def test_quotations_and_terms_of_others_are_accepted(
+    code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert not breaches_of({"benchnav/some.py": code}, tmp_path, monkeypatch)
+
+
+def test_a_refused_word_on_a_page_is_found_with_its_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = "# Worlds\n\n```sh\nbenchnav-eval list  # so many\n```\n\nλ is drawn anew.\n"
+    (breach,) = breaches_of({"docs/worlds.md": page}, tmp_path, monkeypatch)
+    assert breach == "docs/worlds.md:7: λ is drawn anew. [anew]"
+
+
+def breaches_of(
+    files: dict[str, str], root: Path, monkeypatch: pytest.MonkeyPatch
+) -> list[str]:
+    """Return the breaches of a repository that has only these files."""
+    for name, text in files.items():
+        path = root / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    monkeypatch.setattr(prose, "ROOT", root)
+    return prose.breaches()
 
 
 def test_old_words_are_gone() -> None:
-    folders = (
-        "benchnav",
-        "benchmarks",
-        "studies",
-        "docs",
-        "examples",
-        "tests",
-        "datasets",
-        "checkpoints",
-    )
     files = [
         path
-        for folder in folders
+        for folder in FOLDERS
         for path in (ROOT / folder).rglob("*")
         if path.suffix in (".py", ".md", ".yaml")
     ]
     assert len(files) > 400
-    found = {
-        f"{path.relative_to(ROOT).as_posix()}: {old[0]}"
-        for path in [*files, ROOT / "README.md"]
-        if path.relative_to(ROOT).as_posix() not in NAME_THEM
-        and (old := OLD.search(path.read_text()))
-    }
-    assert not found
+    old_words = {}
+    for path in [*files, ROOT / "README.md"]:
+        name = path.relative_to(ROOT).as_posix()
+        old_word = OLD.search(path.read_text())
+        if old_word and name not in NAME_THEM:
+            old_words[name] = old_word[0]
+    assert not old_words
