@@ -14,12 +14,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from benchnav.core.distribution import MOST_SCORE, TraversabilityDistribution
+from benchnav.core.distribution import MAX_SCORE, TraversabilityDistribution
 from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
 
-_SMALLEST_STD = 1e-9
-LEAST_SKEW = 1e-3  # below it, a variable counts as normal
+_MIN_STD = 1e-9
+MIN_SKEW = 1e-3  # below it, a variable counts as normal
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class ConditionedDistribution(TraversabilityDistribution):
     def quantile(self, probability: Tensor | float) -> Tensor:
         """Return the quantiles of λ, shape [*B, H, W]."""
         u = torch.as_tensor(probability, dtype=torch.float64, device=self.device)
-        score = torch.special.ndtri(u).clamp(-MOST_SCORE, MOST_SCORE)
+        score = torch.special.ndtri(u).clamp(-MAX_SCORE, MAX_SCORE)
         value = self.from_normal(score.expand(self.shape))
         if not isinstance(probability, Tensor) and 0 < probability < 1:
             return value
@@ -98,7 +98,7 @@ class ConditionedDistribution(TraversabilityDistribution):
         It is NaN where the base has no density.
         """
         value = value.double()
-        std = self.score_std.double().clamp(min=_SMALLEST_STD)
+        std = self.score_std.double().clamp(min=_MIN_STD)
         lower, upper = self._scores(value)
         base = self.base._exact()
         prior = base.to_normal(value)[1]
@@ -117,7 +117,7 @@ class ConditionedDistribution(TraversabilityDistribution):
         """Return Φ⁻¹ of P(λ < value) and of P(λ ≤ value), float64."""
         lower, upper = self.base._exact().to_normal(value)
         mean = self.score_mean.double()
-        std = self.score_std.double().clamp(min=_SMALLEST_STD)
+        std = self.score_std.double().clamp(min=_MIN_STD)
         lower = (lower - mean) / std
         upper = (upper - mean) / std
         if self.score_skew is None:
@@ -137,26 +137,26 @@ def skewed(normal: Tensor, skew: Tensor) -> Tensor:
     """
     sign, mean, std, sigma = _log_normal(skew)
     transformed = sign * ((sign * sigma * normal).exp() - mean) / std
-    return torch.where(skew.abs() < LEAST_SKEW, normal.double(), transformed)
+    return torch.where(skew.abs() < MIN_SKEW, normal.double(), transformed)
 
 
 def unskewed(value: Tensor, skew: Tensor) -> Tensor:
     """Return the inverse of `skewed`; infinite beyond its range."""
     sign, mean, std, sigma = _log_normal(skew)
     normal = sign * (mean + sign * value * std).clamp(min=0).log() / sigma
-    return torch.where(skew.abs() < LEAST_SKEW, value, normal)
+    return torch.where(skew.abs() < MIN_SKEW, value, normal)
 
 
 def _slope(normal: Tensor, skew: Tensor) -> Tensor:
     """Return the derivative of `skewed`."""
     sign, _, std, sigma = _log_normal(skew)
     slope = sigma * (sign * sigma * normal).exp() / std
-    return torch.where(skew.abs() < LEAST_SKEW, 1.0, slope)
+    return torch.where(skew.abs() < MIN_SKEW, 1.0, slope)
 
 
 def _log_normal(skew: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return sign, mean, standard deviation and σ of exp(σ z) with a given skewness."""
-    abs_skew = skew.double().abs().clamp(min=LEAST_SKEW)
+    abs_skew = skew.double().abs().clamp(min=MIN_SKEW)
     # Solve skew² = (w + 2)² (w − 1) for w = exp(σ²).
     a = 1 + abs_skew.square() / 2
     root = (a + (a.square() - 1).sqrt()).pow(1 / 3)

@@ -32,7 +32,7 @@ from benchnav.core.quadrature import N_INTERVALS, edges_between, integral
 _ROUNDS_OF_TIME = 40  # bisections; times span a larger range than λ
 _CELLS_AT_ONCE = 2**13
 _CELLS_ON_A_GPU = 2**18  # on a GPU, few large chunks are faster than many small ones
-MOST_SCORE = 40.0  # standard deviations; beyond, Φ is 0 or 1 in float64
+MAX_SCORE = 40.0  # standard deviations; beyond, Φ is 0 or 1 in float64
 
 
 class TraversabilityDistribution(Batch, ABC):
