@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from benchnav.core.batch import Batch
-from benchnav.planning.sensing import copula as within
-from benchnav.planning.sensing.copula import CopulaState
+from benchnav.planning.sensing import copula_state
+from benchnav.planning.sensing.copula_state import CopulaState
 from benchnav.planning.sensing.sensor import MIN_STD, Measurement
 from benchnav.planning.sensing.sites import Evidence
 from benchnav.planning.sensing.truncated_normal import interval_moments
@@ -72,7 +72,7 @@ def log_density_ratio(given_class: CopulaState, cells: Tensor, value: Tensor) ->
     Returns:
         Log of the ratio, 0 for intervals, shape [N].
     """
-    low, high = within.scores_at(given_class.prior, cells, value)
+    low, high = copula_state.scores_at(given_class.prior, cells, value)
     prior = given_class.prior.at(cells)
     log_prob = prior.log_prob(value[None].double())[0].double()
     log_normal = 0.5 * (low.square() + math.log(2 * math.pi))
@@ -89,7 +89,7 @@ def note(state: ClassesState, sensed: Measurement) -> tuple[ClassesState, Tensor
     per_class = []
     density = state.density.clone()
     for part, given_class in enumerate(state.per_class):
-        noted, is_new = within.note(given_class, sensed)
+        noted, is_new = copula_state.note(given_class, sensed)
         if bool(is_new.any()):
             class_density = density[:, part]
             class_density[is_new] = _new_density(
@@ -111,7 +111,7 @@ def _new_density(
     """
     value = sensed.traversability[is_new]
     std = sensed.std[is_new].double().clamp(min=MIN_STD)
-    low, high = within.scores_at(before.prior, is_new, value)
+    low, high = copula_state.scores_at(before.prior, is_new, value)
     old_low = before.lower[is_new]
     old_std = before.noise_std[is_new]
     is_repeated = (high <= low) & (old_low >= before.upper[is_new])

@@ -41,7 +41,7 @@ from benchnav.core.conditioned import ConditionedDistribution
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import expect
 from benchnav.core.pooled import PooledDistribution
-from benchnav.planning.sensing import copula as within
+from benchnav.planning.sensing import copula_state
 from benchnav.planning.sensing.belief import Belief, CovarianceModel
 from benchnav.planning.sensing.chains import draw_labels
 from benchnav.planning.sensing.class_state import (
@@ -330,8 +330,8 @@ class Classes(Belief[ClassesState]):
             The state, and the mask of cells with a new prediction, bool, [B, H, W].
         """
         first, second, pair, odds = split(prior, state.copula.covariance)
-        new_first, first_differs = within.with_prior(state.per_class[0], first)
-        new_second, second_differs = within.with_prior(state.per_class[1], second)
+        new_first, first_differs = copula_state.with_prior(state.per_class[0], first)
+        new_second, second_differs = copula_state.with_prior(state.per_class[1], second)
         odds_differ = (odds - state.odds).abs() > _SAME_ODDS
         renewed = first_differs | second_differs | odds_differ
         rescored = renewed & new_first.observed
