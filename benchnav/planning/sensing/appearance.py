@@ -50,12 +50,14 @@ class Memory(Batch):
         layers = {}
         for name, layer in terrain.layers.items():
             layers[name] = torch.full_like(layer, torch.nan)
+        seen = torch.zeros_like(unobserved, dtype=torch.bool)
+        noise_level = torch.full_like(unobserved, torch.inf)
         return cls(
-            seen=torch.zeros_like(unobserved, dtype=torch.bool),
+            seen=seen,
             rgb=torch.zeros_like(terrain.rgb),
             elevation_m=unobserved,
             layers=layers,
-            noise_level=torch.full_like(unobserved, torch.inf),
+            noise_level=noise_level,
             grid=terrain.grid,
         )
 
@@ -75,13 +77,14 @@ def remember(memory: Memory, appearance: Appearance) -> Memory:
     noise_level = appearance.noise_level.to(memory.noise_level)
     is_sharper = noise_level < memory.noise_level
     better = seen & (~memory.seen | is_sharper)
+    rgb = torch.where(better[:, None], observation.rgb, memory.rgb)
     elevation_m = torch.where(better, observation.elevation_m, memory.elevation_m)
     layers = {}
     for name, layer in memory.layers.items():
         layers[name] = torch.where(better, observation.layers[name], layer)
     return Memory(
         seen=memory.seen | seen,
-        rgb=torch.where(better[:, None], observation.rgb, memory.rgb),
+        rgb=rgb,
         elevation_m=elevation_m,
         layers=layers,
         noise_level=torch.where(better, noise_level, memory.noise_level),
@@ -109,7 +112,8 @@ def masked(memory: Memory, layer_means: Mapping[str, tuple[float, ...]]) -> Obse
         observed cells, else 0.
     """
     seen = memory.seen
-    mean_colour = torch.tensor(layer_means["rgb"]).round().to(memory.rgb)
+    mean_rgb = torch.tensor(layer_means["rgb"])
+    mean_colour = mean_rgb.round().to(memory.rgb)
     (mean_elevation_m,) = layer_means["elevation_m"]
     (mean_slope_deg,) = layer_means["slope_deg"]
     rgb = torch.where(seen[:, None], memory.rgb, mean_colour[:, None, None])
@@ -118,9 +122,11 @@ def masked(memory: Memory, layer_means: Mapping[str, tuple[float, ...]]) -> Obse
     # does not count as unobserved.
     unseen = (~seen).float()
     near_unseen = torch.nn.functional.max_pool2d(unseen, 3, stride=1, padding=1)
+    no_slope = near_unseen > 0
     heights = elevation_m.cpu().numpy()
-    slopes = quantise(slopes_deg(heights, memory.grid.resolution_m), 10)
-    slope_deg = torch.from_numpy(slopes).to(elevation_m)
+    exact_slopes = slopes_deg(heights, memory.grid.resolution_m)
+    slopes = torch.from_numpy(quantise(exact_slopes, 10)).to(elevation_m)
+    slope_deg = torch.where(no_slope, mean_slope_deg, slopes)
     layers = {}
     for name, layer in memory.layers.items():
         layers[name] = torch.where(seen, layer, torch.nan)
@@ -128,7 +134,7 @@ def masked(memory: Memory, layer_means: Mapping[str, tuple[float, ...]]) -> Obse
     return Observation(
         rgb=rgb,
         elevation_m=elevation_m,
-        slope_deg=torch.where(near_unseen > 0, mean_slope_deg, slope_deg),
+        slope_deg=slope_deg,
         grid=memory.grid,
         layers=layers,
     )

@@ -56,7 +56,7 @@ class Learner:
         measure: risk measure that returns λ̂.
         rules: free space, and the λ assumed for unobserved terrain.
         predict: the model; unused if the sensor shows the whole map.
-        keeps_spread: whether the spread of the belief is stored with λ̂, for policies.
+        keeps_spread: whether the spread of the belief is stored next to λ̂, for policies.
     """
 
     sensor: Sensor
@@ -159,7 +159,7 @@ class Learner:
             knowledge: current knowledge; it is not changed.
             truth: true state in this step.
             robot_state: robot states, shape [B, S].
-            step: number of steps taken, for all episodes or for each, B of them.
+            step: number of steps taken, one for all episodes or one for each.
             observes: mask of episodes that use the appearance sensor, bool, shape [B].
             measures: mask of episodes that use the sensor of λ, bool, shape [B].
 
@@ -346,10 +346,9 @@ class Learner:
         predicted = call(
             Outcome.MODEL_ERROR, lambda: self.predict(terrain, observation)
         )
-        unseen = unseen_ground(
-            statistics, self.rules.unseen, memory.seen.shape, truth.field
-        )
-        return observation, choose(memory.seen, predicted, unseen)
+        seen = memory.seen
+        unseen = unseen_ground(statistics, self.rules.unseen, seen.shape, truth.field)
+        return observation, choose(seen, predicted, unseen)
 
     def _measurement(
         self, sensor: Sensor, truth: Truth, robot_state: Tensor, noise_key: NoiseKey
@@ -357,11 +356,15 @@ class Learner:
         """Return a sensor's measurement after validation."""
 
         def sense() -> Measurement:
-            inputs = truth.terrain, truth.field, robot_state
-            # Sensors of this package do not change their inputs.
+            terrain = truth.terrain
+            field = truth.field
+            state = robot_state
+            # A custom sensor may modify its inputs; those of this package do not.
             if not type(sensor).__module__.startswith("benchnav."):
-                inputs = truth.terrain.clone(), truth.field.clone(), robot_state.clone()
-            measurement = sensor.sense(*inputs, noise_key)
+                terrain = terrain.clone()
+                field = field.clone()
+                state = state.clone()
+            measurement = sensor.sense(terrain, field, state, noise_key)
             _check_measurement(measurement, truth.field)
             expect(
                 sensor is not self.sensor or measurement.appearance is not None,
@@ -381,9 +384,10 @@ def _with_traversability(
     before = knowledge.sensed
     traversability = torch.where(mask, new.traversability, before.traversability)
     std = torch.where(mask, new.std, before.std)
+    sensed = Measurement(traversability=traversability, std=std)
     return replace(
         knowledge,
-        sensed=Measurement(traversability=traversability, std=std),
+        sensed=sensed,
         ever_sensed=knowledge.ever_sensed | mask,
         footprint=knowledge.footprint | mask,
     )
@@ -397,10 +401,11 @@ def _with_appearance(
     new_memory = remember(memory, replace(new, seen=seen))
     # A cell is observed for the first time, or with less noise.
     is_better = new_memory.noise_level != memory.noise_level
+    is_new = is_better.flatten(1).any(1)
     return replace(
         knowledge,
         memory=new_memory,
-        has_news=knowledge.has_news | is_better.flatten(1).any(1),
+        has_news=knowledge.has_news | is_new,
         footprint=knowledge.footprint | seen,
     )
 

@@ -82,9 +82,11 @@ class Near(Sensor):
         # Independent normals for red, green, blue and elevation.
         normals = noise_key.normal("look", seen, (4,))
         noise = normals * distance[seen][:, None]
-        colour = terrain.rgb.movedim(1, -1)[seen] + self.colour_noise * noise[:, :3]
+        colour = terrain.rgb.movedim(1, -1)[seen]
+        noisy_colour = colour + self.colour_noise * noise[:, :3]
+        rounded = noisy_colour.round().clamp(0, 255)
         rgb = torch.zeros_like(terrain.rgb)
-        rgb.movedim(1, -1)[seen] = colour.round().clamp(0, 255).to(rgb.dtype)
+        rgb.movedim(1, -1)[seen] = rounded.to(rgb.dtype)
         heights = terrain.elevation_m[seen]
         noisy_heights = heights + self.elevation_noise * noise[:, 3]
         elevation_m = torch.full_like(terrain.elevation_m, math.nan)
@@ -208,9 +210,8 @@ def _rings(n_rings: int, device: torch.device) -> _Rings:
     number = number[order]
     ring_start = (2 * number - 1).clamp(min=0) ** 2
     index_in_ring = torch.empty(len(steps), len(steps), dtype=torch.int64)
-    index_in_ring[row + n_rings, column + n_rings] = (
-        torch.arange(len(order)) - ring_start
-    )
+    index = torch.arange(len(order)) - ring_start
+    index_in_ring[row + n_rings, column + n_rings] = index
     # The ray crosses the next inner ring at the fraction (number − 1) / number, where
     # one of its two coordinates is an integer.
     scaled = torch.stack((row, column)) * (number - 1)

@@ -89,5 +89,6 @@ def _finite(ends: ndarray) -> ndarray:
 
 def _density(z: ndarray, log_mass: ndarray) -> ndarray:
     """Return φ(z) divided by the probability of the interval."""
-    log_density = -0.5 * np.square(z) - 0.5 * math.log(2 * math.pi)
+    half_log_tau = 0.5 * math.log(2 * math.pi)
+    log_density = -0.5 * np.square(z) - half_log_tau
     return np.exp(log_density - log_mass)
