@@ -76,15 +76,16 @@ def draw_labels(
                 labels, scores, sites, block, inverse, drawn, sweeps
             )
         if turn >= _FIRST_COUNTED:
+            flat = labels.flatten(1)
             flat, scores, p_visited = _draw_observed(
-                labels.flatten(1), scores, sites, inverse, sweeps, block.torus
+                flat, scores, sites, inverse, sweeps, block.torus
             )
             labels = flat.view(shape)
             p_observed = p_observed + p_visited / _COUNTED
             bonded = connected_to_evidence(labels, block.lattice, block.evidence, drawn)
             n_bonded_first = count_bits(labels & bonded)
-            # Cells that no bonds join to evidence have either label with probability ½.
             n_unbonded = CHAINS - count_bits(bonded)
+            # Cells that no bonds join to evidence have either label with probability ½.
             n_first = n_first + n_bonded_first + 0.5 * n_unbonded
         sweeps = sweeps + 1
     labels = labels.flatten(1)
@@ -131,21 +132,26 @@ def _filtered(
         is_new = fresh[:, site, None]
         row = factor[:, site]
         scale = row[:, site, None]
-        mean = (white[:, :, :site] @ row[:, :site, None])[..., 0]
+        variance = scale.square()
+        product = white[:, :, :site] @ row[:, :site, None]
+        mean = product[..., 0]
         site_uniforms = uniforms[:, site - begin]
         first, _, log_density, score = sites.draw(
-            site, mean, scale.square(), labels, site_uniforms
+            site, mean, variance, labels, site_uniforms
         )
         new_white = (score - mean) / scale
-        white[:, :, site] = torch.where(is_new, new_white, white[:, :, site])
-        scores[:, :, site] = torch.where(is_new, score, scores[:, :, site])
+        old_white = white[:, :, site]
+        white[:, :, site] = torch.where(is_new, new_white, old_white)
+        old_score = scores[:, :, site]
+        scores[:, :, site] = torch.where(is_new, score, old_score)
         gain = torch.where(is_new, log_density, 0.0)
         log_weights = log_weights + gain
         labels = _put(labels, sites.cell[:, site], first, is_new)
     # Systematic resampling keeps all chains if their weights are equal.
     starts = _starts().to(labels.device)
     start = starts[sweeps % _STARTS, None]
-    steps = (torch.arange(CHAINS, device=labels.device) + start) / CHAINS
+    index = torch.arange(CHAINS, device=labels.device)
+    steps = (index + start) / CHAINS
     cumulative = torch.softmax(log_weights, 1).cumsum(1)
     chain = torch.searchsorted(cumulative, steps).clamp(max=CHAINS - 1)
     bits = (labels[..., None] >> chain[:, None]) & 1
@@ -175,18 +181,22 @@ def _flip_patch(
     may_flip = may_flip.scatter_reduce(1, cell, flippable, "amax").view_as(labels)
     is_fixed = block.observed & ~may_flip
     barred = (block.pair > 0) & (~block.in_reach | is_fixed)
+    last_cell = cell[:, -1:]
     last_bits = -flippable[:, -1:].long()
-    seed = torch.zeros_like(flat).scatter_(1, cell[:, -1:], last_bits)
-    patch = connected_to_evidence(labels, block.lattice, seed.view_as(labels), drawn)
+    seed = torch.zeros_like(flat)
+    seed = seed.scatter_(1, last_cell, last_bits).view_as(labels)
+    patch = connected_to_evidence(labels, block.lattice, seed, drawn)
     in_patch = unpacked(patch.flatten(1))
-    barred_in_patch = in_patch & barred.flatten(1)[..., None]
-    is_barred = barred_in_patch.any(1)
+    barred_cells = barred.flatten(1)[..., None]
+    is_barred = (in_patch & barred_cells).any(1)
     site_index = cell[..., None].expand(-1, -1, CHAINS)
     sites_in_patch = in_patch.gather(1, site_index)
     flips = (sites_in_patch & flippable[..., None]).transpose(1, 2)
     site_labels = flat.gather(1, cell)
     first = unpacked(site_labels).transpose(1, 2)
-    flipped_scores = torch.where(first, sites.lower[:, 1:], sites.lower[:, :1])
+    first_scores = sites.lower[:, :1]
+    second_scores = sites.lower[:, 1:]
+    flipped_scores = torch.where(first, second_scores, first_scores)
     proposed = torch.where(flips, flipped_scores, scores)
     sign = torch.where(first, 1.0, -1.0)
     density_change = sites.density[:, 1:] - sites.density[:, :1]
@@ -195,12 +205,14 @@ def _flip_patch(
     change = proposed - scores
     quadratic = (change @ inverse) * (proposed + scores)
     log_ratio = log_ratio - 0.5 * quadratic.sum(2)
-    uniforms = _uniforms(sweeps + 1, sites, block.torus, cell.shape[1] - 1)
+    last_site = cell.shape[1] - 1
+    uniforms = _uniforms(sweeps + 1, sites, block.torus, last_site)
     log_uniform = uniforms[:, 0, :, 0].log()
     accepted = ~is_barred & (log_uniform < log_ratio)
     accepted_bits = packed(accepted)[:, None, None]
-    labels = labels ^ (patch & accepted_bits)
-    return labels, torch.where(accepted[..., None], proposed, scores)
+    new_labels = labels ^ (patch & accepted_bits)
+    new_scores = torch.where(accepted[..., None], proposed, scores)
+    return new_labels, new_scores
 
 
 def _draw_observed(
@@ -218,24 +230,29 @@ def _draw_observed(
     """
     scores = scores.clone()
     p_first = torch.zeros_like(sites.std)
-    open_sites = sites.open.any(0).nonzero()[:, 0].flip(0).tolist()
+    is_open_anywhere = sites.open.any(0)
+    open_sites = is_open_anywhere.nonzero()[:, 0].flip(0).tolist()
     begin = open_sites[-1]
     uniforms = _uniforms(sweeps, sites, torus, begin)
     for site in open_sites:
         is_open = sites.open[:, site, None]
         row = inverse[:, site]
         precision = row[:, site, None]
-        residual = (scores @ row[..., None])[..., 0] / precision
-        mean = scores[:, :, site] - residual
+        product = scores @ row[..., None]
+        residual = product[..., 0] / precision
+        old_score = scores[:, :, site]
+        mean = old_score - residual
         # The noise of an interval widens its bounds, whatever term represents it.
-        noise = sites.std[:, site].square() - sites.noise[:, site]
+        exact_noise = sites.std[:, site].square()
+        noise = exact_noise - sites.noise[:, site]
         variance = (1 / precision + noise[:, None]).clamp(min=1e-12)
         site_uniforms = uniforms[:, site - begin]
         first, p_site, _, score = sites.draw(
             site, mean, variance, labels, site_uniforms
         )
-        is_replaced = is_open & ~sites.censored[:, site, None]
-        scores[:, :, site] = torch.where(is_replaced, score, scores[:, :, site])
+        is_censored = sites.censored[:, site, None]
+        is_replaced = is_open & ~is_censored
+        scores[:, :, site] = torch.where(is_replaced, score, old_score)
         p_first[:, site] = p_site.mean(1)
         labels = _put(labels, sites.cell[:, site], first, is_open)
     return labels, scores, p_first
@@ -245,7 +262,8 @@ def _put(labels: Tensor, cell: Tensor, first: Tensor, is_new: Tensor) -> Tensor:
     """Replace the labels of one cell of each episode where they are new, [B, RC]."""
     index = cell[:, None]
     old_word = labels.gather(1, index)
-    word = torch.where(is_new, packed(first)[:, None], old_word)
+    new_word = packed(first)[:, None]
+    word = torch.where(is_new, new_word, old_word)
     return labels.scatter(1, index, word)
 
 
@@ -256,9 +274,10 @@ def _uniforms(passes: Tensor, sites: Sites, torus: int, begin: int) -> Tensor:
     """
     count = passes[:, None]
     uses = count // _PASSES
-    row = (sites.row[:, begin:] + _STEP[0] * uses) % torus
-    column = (sites.column[:, begin:] + _STEP[1] * uses) % torus
-    cell = row * torus + column
+    row_step, column_step = _STEP
+    row = sites.row[:, begin:] + row_step * uses
+    column = sites.column[:, begin:] + column_step * uses
+    cell = (row % torus) * torus + column % torus
     bank = _tosses(torus).to(row.device)
     return bank[count % _PASSES, cell].double()
 

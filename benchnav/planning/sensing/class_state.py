@@ -74,8 +74,10 @@ def log_density_ratio(given_class: CopulaState, cells: Tensor, value: Tensor) ->
     """
     low, high = copula_state.scores_at(given_class.prior, cells, value)
     prior = given_class.prior.at(cells)
-    log_prob = prior.log_prob(value[None].double())[0].double()
-    log_normal = 0.5 * (low.square() + math.log(2 * math.pi))
+    values = value[None].double()
+    log_prob = prior.log_prob(values)[0].double()
+    log_tau = math.log(2 * math.pi)
+    log_normal = 0.5 * (low.square() + log_tau)
     return torch.where(high > low, 0.0, log_prob + log_normal)
 
 
@@ -142,10 +144,12 @@ def moved_cells(before: ClassesState, after: ClassesState) -> Tensor:
 def evidence_of(state: ClassesState) -> Evidence:
     """Return the evidence from which labels are drawn."""
     first, second = state.per_class
+    lower = torch.stack((first.lower, second.lower), 1)
+    upper = torch.stack((first.upper, second.upper), 1)
     return Evidence(
         field=state.copula.field,
-        lower=torch.stack((first.lower, second.lower), 1),
-        upper=torch.stack((first.upper, second.upper), 1),
+        lower=lower,
+        upper=upper,
         noise_std=first.noise_std,
         density=state.density,
         precision=state.copula.precision,
@@ -209,8 +213,9 @@ def moments_of(state: ClassesState) -> tuple[Tensor, Tensor, Tensor]:
         new_mean, new_std = _moments_given(given_class, cells, centre, cavity)
         # The posterior already holds under the more probable class.
         is_chosen = is_first == (part == 0)
-        new_moments = new_mean, new_std, torch.zeros_like(new_std)
-        for values, new_values in zip((means, stds, skews), new_moments, strict=True):
+        new_skew = torch.zeros_like(new_std)
+        updates = (means, new_mean), (stds, new_std), (skews, new_skew)
+        for values, new_values in updates:
             class_values = values[:, part]
             old_values = class_values[cells]
             class_values[cells] = torch.where(is_chosen, old_values, new_values)
@@ -235,13 +240,15 @@ def _moments_given(
     is_number = upper <= lower
     # A number has no interval; its moments are replaced below.
     interval_upper = torch.where(is_number, lower + 1, upper)
-    arguments = centre, total, lower, interval_upper
-    moments = interval_moments(*(values.cpu().numpy() for values in arguments))
+    intervals = centre, total, lower, interval_upper
+    arrays = [values.cpu().numpy() for values in intervals]
+    moments = interval_moments(*arrays)
     noisy_mean, noisy_variance = (
         torch.from_numpy(values).to(lower) for values in moments
     )
     noisy_mean = torch.where(is_number, lower, noisy_mean)
     noisy_variance = torch.where(is_number, 0.0, noisy_variance)
-    variance = cavity - cavity * gain + gain.square() * noisy_variance
+    added_variance = gain.square() * noisy_variance
+    variance = cavity - cavity * gain + added_variance
     mean = centre + gain * (noisy_mean - centre)
     return mean, variance.sqrt()

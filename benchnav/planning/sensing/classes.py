@@ -70,6 +70,7 @@ from benchnav.planning.sensing.sensor import Measurement
 _MAX_STRENGTH = 0.88  # ln(1 + √2) is critical
 _FIRST_SWEEPS = 40  # of cells without measurements, on whole maps
 _MORE_SWEEPS = 10  # of cells whose appearance is observed later
+_MIN_STD = 1e-9  # of a score, as a divisor
 _SAME_ODDS = 0.01  # maximum difference of log odds that counts as none
 
 
@@ -122,10 +123,11 @@ class Classes(Belief[ClassesState]):
         copula = self._copula.init(first, covariance)
         under_second = self._copula.init(second, covariance)
         zeros = torch.zeros_like(copula.mean)
+        density = torch.stack((zeros, zeros), 1)
         state = ClassesState(
             copula=copula,
             per_class=(copula, under_second),
-            density=torch.stack((zeros, zeros), 1),
+            density=density,
             pair=pair,
             odds=odds,
             p_first=zeros + 0.5,
@@ -166,11 +168,9 @@ class Classes(Belief[ClassesState]):
         first_table = copula.table.having(first.prior, cells)
         paired_cells = cells & (updated.pair > 0)
         second_table = second.table.having(second.prior, paired_cells)
-        return replace(
-            updated,
-            copula=replace(copula, table=first_table),
-            per_class=(first, replace(second, table=second_table)),
-        )
+        copula = replace(copula, table=first_table)
+        second = replace(second, table=second_table)
+        return replace(updated, copula=copula, per_class=(first, second))
 
     def _draw_labels(self, state: ClassesState, new: Tensor) -> ClassesState:
         """Return the state with labels drawn near new observations, bool, [B, H, W]."""
@@ -180,12 +180,10 @@ class Classes(Belief[ClassesState]):
         strength = self._strength(state.copula.covariance)
         evidence = evidence_of(state).select(members)
         drawn = draw_labels(evidence, new[members], strength, self.window)
-        return replace(
-            state,
-            p_first=state.p_first.index_copy(0, members, drawn.p_first),
-            labels=state.labels.index_copy(0, members, drawn.labels),
-            sweeps=state.sweeps.index_copy(0, members, drawn.sweeps),
-        )
+        p_first = state.p_first.index_copy(0, members, drawn.p_first)
+        labels = state.labels.index_copy(0, members, drawn.labels)
+        sweeps = state.sweeps.index_copy(0, members, drawn.sweeps)
+        return replace(state, p_first=p_first, labels=labels, sweeps=sweeps)
 
     def distribution(self, state: ClassesState) -> TraversabilityDistribution:
         """Return the average of the distributions under either class.
@@ -214,7 +212,8 @@ class Classes(Belief[ClassesState]):
         if not bool(has_pair.any()):
             return copula_belief
         cells = cells & (state.pair > 0)
-        moments = [values.movedim(1, -1)[cells] for values in moments_of(state)]
+        by_class = [values.movedim(1, -1) for values in moments_of(state)]
+        moments = [values[cells] for values in by_class]
         tables = state.copula.table, state.per_class[1].table
         under_class = []
         for part, given_class in enumerate(state.per_class):
@@ -222,8 +221,8 @@ class Classes(Belief[ClassesState]):
             mean, std, skew = (values[:, part] for values in moments)
             under_class.append(table.below(cells, mean, std, skew))
         under_first, under_second = under_class
-        p_first = state.probability()[cells][:, None].to(under_first)
-        pooled = torch.lerp(under_second, under_first, p_first)
+        p_first = state.probability()[cells].to(under_first)
+        pooled = torch.lerp(under_second, under_first, p_first[:, None])
         below = copula_belief.below.clone()
         below[:, 0, has_pair] = pooled.T.to(below)
         return TabulatedDistribution(below)
@@ -266,20 +265,21 @@ class Classes(Belief[ClassesState]):
         """
         scores = self._copula.sample_scores(state.copula, count, keys)
         means, stds, _ = moments_of(state)
-        score_std = state.copula.std.clamp(min=MIN_PROBABILITY)
+        score_std = state.copula.std.clamp(min=_MIN_STD)
         scales = stds / score_std[:, None]
         p_to_first, p_to_second = _switch_probabilities(state)
         streams = [rng.stream_key(key, "labels") for key in keys]
         indices = np.arange(count)
-        uniforms = np.stack([rng.uniform(stream, indices, (2,)) for stream in streams])
-        drawn = torch.from_numpy(uniforms).to(scores.device)
+        uniforms = [rng.uniform(stream, indices, (2,)) for stream in streams]
+        drawn = torch.from_numpy(np.stack(uniforms)).to(scores.device)
         chains = (drawn[..., 0] * CHAINS).long()
         tosses = drawn[..., 1]
         fields = []
         for index, field_scores in enumerate(scores.unbind(1)):
             chain = chains[:, index, None, None]
             toss = tosses[:, index, None, None]
-            in_first = (state.labels >> chain & 1).bool()
+            bits = state.labels >> chain & 1
+            in_first = bits.bool()
             is_first = torch.where(in_first, toss >= p_to_second, toss < p_to_first)
             is_first = is_first | (state.pair == 0)
             residual = field_scores - state.copula.mean
@@ -308,8 +308,10 @@ class Classes(Belief[ClassesState]):
         lattice = Lattice.of(state.pair[members], strength)
         degree = lattice.degree()
         height, width = fresh.shape[1:]
-        row = torch.arange(height, device=fresh.device)[:, None].expand_as(fresh)
-        column = torch.arange(width, device=fresh.device).expand_as(fresh)
+        rows = torch.arange(height, device=fresh.device)
+        columns = torch.arange(width, device=fresh.device)
+        row = rows[:, None].expand_as(fresh)
+        column = columns.expand_as(fresh)
         free = -fresh.long()
         even = -((row + column) % 2)
         torus = max(height, width)
@@ -338,12 +340,14 @@ class Classes(Belief[ClassesState]):
         density = state.density.clone()
         for part, given_class in enumerate((new_first, new_second)):
             value = given_class.value[rescored]
-            density[:, part][rescored] = log_density_ratio(given_class, rescored, value)
+            log_ratio = log_density_ratio(given_class, rescored, value)
+            density[:, part][rescored] = log_ratio
         fresh = renewed & (pair != state.pair)
         table = state.copula.table.without(first_differs)
+        copula = replace(state.copula, prior=new_first.prior, table=table)
         updated = replace(
             state,
-            copula=replace(state.copula, prior=new_first.prior, table=table),
+            copula=copula,
             per_class=(new_first, new_second),
             density=density,
             pair=torch.where(renewed, pair, state.pair),

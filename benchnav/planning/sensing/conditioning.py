@@ -41,7 +41,8 @@ _MOMENTS = ("mean", "std", "skew")
 MEDIAN_M = 1.5
 """Median of the prior of ℓ, in metres."""
 _LOG_STD = math.log(2)  # of the prior of ℓ
-_LENGTHS_M = tuple(MEDIAN_M * 2 ** (step / 4) for step in range(-8, 9))
+_OCTAVES = [step / 4 for step in range(-8, 9)]
+_LENGTHS_M = tuple(MEDIAN_M * 2**octaves for octaves in _OCTAVES)
 MIN_OBSERVATIONS = 8
 """Minimum number of observations for an estimate of ℓ."""
 
@@ -66,40 +67,44 @@ def condition_maps(
     rows, columns = _around(new, reach)
     nearby = _around(new, reach + math.ceil(_BEYOND * length))
     remaining = np.zeros_like(new)
-    remaining[nearby] = ~np.isnan(maps["value"][nearby])
+    values = maps["value"][nearby]
+    remaining[nearby] = ~np.isnan(values)
     by_lattice = remaining.sum() > window and spacing_of(length) > 1
     limit = remaining.size if by_lattice else _MAX_EXACT
     cells = nearest(remaining, new, limit)
     remaining[cells] = False
     observed = _observed(maps, *cells)
+    block = rows, columns
     if by_lattice:
-        block = np.mgrid[rows.start : rows.stop, columns.start : columns.stop]
-        targets = block[0].ravel(), block[1].ravel()
+        target_rows, target_columns = np.mgrid[block]
+        targets = target_rows.ravel(), target_columns.ravel()
         basis = Lattice.around(field, member, cells)
         precision, shift, moments = condition_and_predict(
             basis, observed, cells, targets
         )
     else:
         precision, shift, moments = _condition_exactly(
-            field, member, observed, cells, (rows, columns)
+            field, member, observed, cells, block
         )
     mean, variance, skew = moments
-    shape = rows.stop - rows.start, columns.stop - columns.start
-    new_moments = np.stack((mean, np.sqrt(variance.clip(0)), skew)).reshape(3, *shape)
-    old_moments = np.stack([maps[name][rows, columns] for name in _MOMENTS])
+    std = np.sqrt(variance.clip(0))
+    old_moments = np.stack([maps[name][block] for name in _MOMENTS])
+    new_moments = np.stack((mean, std, skew)).reshape(old_moments.shape)
     # Observed cells beyond the limit keep their posterior, which includes more
     # observations than this update.
-    unchanged = remaining[rows, columns]
+    unchanged = remaining[block]
     if not observed.interval.any():
         # Conditioning on numbers never increases a standard deviation.
         old_std = old_moments[1]
-        unchanged |= new_moments[1] > old_std + _MIN_CHANGE
-        new_moments[1] = np.minimum(new_moments[1], old_std)
+        new_std = new_moments[1]
+        unchanged |= new_std > old_std + _MIN_CHANGE
+        new_moments[1] = np.minimum(new_std, old_std)
     scales = np.array((1, 1, _MEDIAN_PER_SKEW))[:, None, None]
-    has_moved = abs(new_moments - old_moments) >= _MIN_CHANGE / scales
+    min_change = _MIN_CHANGE / scales
+    has_moved = abs(new_moments - old_moments) >= min_change
     moved = has_moved.any(0) & ~unchanged
-    for name, values in zip(_MOMENTS, new_moments, strict=True):
-        np.copyto(maps[name][rows, columns], values, where=moved)
+    for name, new_values in zip(_MOMENTS, new_moments, strict=True):
+        np.copyto(maps[name][block], new_values, where=moved)
     maps["precision"][cells] = precision
     maps["shift"][cells] = shift
 
@@ -111,23 +116,32 @@ def _condition_exactly(
     cells: Cells,
     block: tuple[slice, slice],
 ) -> tuple[ndarray, ndarray, tuple[ndarray, ndarray, ndarray]]:
-    """Return what `condition_and_predict` does, without a lattice, for a block of cells."""
+    """Condition on observations and predict a block of cells, without a lattice.
+
+    The result is that of `condition_and_predict`.
+    """
     row = torch.from_numpy(cells[0])[:, None]
     column = torch.from_numpy(cells[1])[:, None]
-    inner = field.covariance(member, row - row.T, column - column.T).numpy()
+    row_offsets = row - row.T
+    column_offsets = column - column.T
+    inner = field.covariance(member, row_offsets, column_offsets).numpy()
     solved = condition(inner, observed)
-    block_rows, block_columns = (torch.arange(ends.start, ends.stop) for ends in block)
+    rows, columns = block
+    block_rows = torch.arange(rows.start, rows.stop)
+    block_columns = torch.arange(columns.start, columns.stop)
     row_offsets = (row - block_rows)[..., None]
     column_offsets = (column - block_columns)[:, None]
     across = field.covariance(member, row_offsets, column_offsets)
-    moments = predict(solved, inner, observed, across.flatten(1).numpy())
+    flat_across = across.flatten(1).numpy()
+    moments = predict(solved, inner, observed, flat_across)
     return solved.precision, solved.shift, moments
 
 
 def _around(new: ndarray, reach: int) -> tuple[slice, slice]:
     """Return the rows and columns of a map within some cells of changed ones."""
     slices = []
-    for (first, last), size in zip(bounds(new), new.shape, strict=True):
+    for ends, size in zip(bounds(new), new.shape, strict=True):
+        first, last = ends
         start = max(first - reach, 0)
         stop = min(last + reach + 1, size)
         slices.append(slice(start, stop))
@@ -179,7 +193,12 @@ def _candidates(shape: tuple[int, int], resolution_m: float, nugget: float) -> F
 
 def bounds(new: ndarray) -> list[tuple[int, int]]:
     """Return first and last row, and first and last column, of the cells of a mask."""
-    return [(int(indices.min()), int(indices.max())) for indices in new.nonzero()]
+    ends = []
+    for indices in new.nonzero():
+        first = int(indices.min())
+        last = int(indices.max())
+        ends.append((first, last))
+    return ends
 
 
 def nearest(observed: ndarray, new: ndarray, window: int) -> tuple[ndarray, ndarray]:
@@ -194,8 +213,9 @@ def nearest(observed: ndarray, new: ndarray, window: int) -> tuple[ndarray, ndar
     (top, bottom), (first_column, last_column) = bounds(new)
     down = np.maximum(top - row, row - bottom).clip(0)
     across = np.maximum(first_column - column, column - last_column).clip(0)
+    squared_distance = down**2 + across**2
     is_new = new[row, column]
-    distance = np.where(is_new, -1, down**2 + across**2)
+    distance = np.where(is_new, -1, squared_distance)
     # A stable sort breaks ties in the same order on every machine.
     order = distance.argsort(kind="stable")
     count = max(window, int(new.sum()))

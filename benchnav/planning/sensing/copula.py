@@ -112,13 +112,14 @@ class Copula(Belief[CopulaState]):
         lengths = [length_m / grid.resolution_m] * prior.shape[0]
         zeros = torch.zeros(prior.shape, dtype=torch.float64, device=prior.device)
         unobserved = torch.full_like(zeros, torch.nan)
+        no_observations = zeros[:, 0, 0].long()
         field = Field.of(grid.shape, lengths, prior.device, covariance.nugget)
         return CopulaState(
             prior=prior,
             table=ScoreTable.empty(prior),
             covariance=covariance,
             field=field,
-            estimated_from=zeros[:, 0, 0].long(),
+            estimated_from=no_observations,
             value=unobserved,
             lower=unobserved,
             upper=unobserved,
@@ -158,7 +159,8 @@ class Copula(Belief[CopulaState]):
             noted: state with the observations; it is not changed.
             changed: mask of observations not yet conditioned on, bool, shape [B, H, W].
         """
-        members = changed.flatten(1).any(1).nonzero()[:, 0].tolist()
+        has_changed = changed.flatten(1).any(1)
+        members = has_changed.nonzero()[:, 0].tolist()
         if not members:
             return noted
         # On the host, where such small systems are solved quickest.
@@ -248,14 +250,14 @@ class Copula(Belief[CopulaState]):
         self, state: CopulaState, count: int, keys: Sequence[int]
     ) -> Tensor:
         """Return normal scores of the fields of `sample_fields`, shape [B, M, H, W]."""
-        scores = [
-            self._sample_member(state, member, count, key)
-            for member, key in enumerate(keys)
-        ]
+        scores = []
+        for member, key in enumerate(keys):
+            scores.append(self._sample_member(state, member, count, key))
         mean = state.mean[:, None]
         std = state.std[:, None]
         normal = (torch.stack(scores) - mean) / std.clamp(min=_NO_TERM)
-        return mean + std * skewed(normal, state.skew[:, None])
+        skewed_normal = skewed(normal, state.skew[:, None])
+        return mean + std * skewed_normal
 
     def _sample_member(
         self, state: CopulaState, member: int, count: int, key: int
@@ -277,7 +279,8 @@ class Copula(Belief[CopulaState]):
         white = replace(covariance, correlation_m=0.0, nugget=0.0)
         noise = draw_scores(white, count, [noise_key])[0]
         noise = noise.to(drawn)[:, row, column] / precision.sqrt()
-        residual = shift / precision - drawn[:, row, column] - noise
+        term_mean = shift / precision
+        residual = term_mean - drawn[:, row, column] - noise
         row_offsets = row[:, None] - row
         column_offsets = column[:, None] - column
         inner = state.field.covariance(member, row_offsets, column_offsets)
@@ -289,7 +292,8 @@ class Copula(Belief[CopulaState]):
         row_offsets = row[:, None, None] - rows
         column_offsets = column[:, None, None] - columns
         across = state.field.covariance(member, row_offsets, column_offsets)
-        drawn += (across.flatten(1).T @ weights).T.view_as(drawn)
+        correction = (across.flatten(1).T @ weights).T
+        drawn += correction.view_as(drawn)
         return drawn
 
 

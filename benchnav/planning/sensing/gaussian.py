@@ -162,7 +162,8 @@ class Posterior:
         """
         reduction = _reduction(self.factor, self.root, covariance)
         mean = times(self.weights, covariance)
-        variance = (1 - np.square(reduction).sum(0)).clip(0)
+        explained = np.square(reduction).sum(0)
+        variance = (1 - explained).clip(0)
         return mean, variance, reduction
 
 
@@ -230,7 +231,8 @@ def evidence(covariance: ndarray, observed: Observed, solved: Posterior) -> floa
         solved: the conditioned field, from `condition`.
     """
     mean, variance, _ = solved.moments(covariance)
-    log_determinant = np.log(solved.factor.diagonal().numpy()).sum()
+    diagonal = solved.factor.diagonal().numpy()
+    log_determinant = np.log(diagonal).sum()
     exact_part = 0.5 * (solved.shift * mean).sum() - log_determinant
     censored = observed.interval
     terms = Terms(solved.precision[censored], solved.shift[censored])
@@ -355,10 +357,13 @@ class Terms(NamedTuple):
             centre: mean of the field, shape [N].
         """
         root = np.sqrt(self.precision)
-        reduction = _reduction(_factor(covariance, root), root, covariance)
+        factor = _factor(covariance, root)
+        reduction = _reduction(factor, root, covariance)
         residual_cov = covariance - times(reduction.T, reduction)
-        mean = centre + times(residual_cov, self.shift - self.precision * centre)
-        return mean, residual_cov.diagonal().clip(MIN_VARIANCE)
+        residual_shift = self.shift - self.precision * centre
+        mean = centre + times(residual_cov, residual_shift)
+        variance = residual_cov.diagonal().clip(MIN_VARIANCE)
+        return mean, variance
 
     def cavity(self, mean: ndarray, variance: ndarray) -> tuple[ndarray, ndarray]:
         """Return cavity means and variances."""

@@ -190,9 +190,8 @@ def condition_and_predict(
     precision = np.where(censored, 0.0, 1 / np.square(observed.std))
     shift = precision * np.where(censored, 0.0, observed.lower)
     weights, residual = lattice.coefficients(cells)
-    added, prior_shift = _weighted(
-        weights[:, exact], residual[exact], precision[exact], shift[exact]
-    )
+    of_exact = weights[:, exact], residual[exact]
+    added, prior_shift = _weighted(*of_exact, precision[exact], shift[exact])
     prior_precision = added + torch.eye(len(prior_shift), dtype=added.dtype)
     normals = Normals.of(prior_precision, prior_shift)
     censored_weights = weights[:, censored]
@@ -216,7 +215,8 @@ def condition_and_predict(
         added, added_shift = _weighted(*of_censored, *terms)
         normals = Normals.of(prior_precision + added, prior_shift + added_shift)
     # Terms of the targets that are observed.
-    map_shape = lattice.field.down.shape[1], lattice.field.across.shape[1]
+    field = lattice.field
+    map_shape = field.down.shape[1], field.across.shape[1]
     precision_map = np.zeros(map_shape)
     shift_map = np.zeros(map_shape)
     precision_map[cells] = precision

@@ -93,19 +93,20 @@ class Block:
         """Return the block of all cells in reach of changed ones, and their neighbours."""
         device = changed.device
         ends = [bounds(new) for new in changed.cpu().numpy()]
-        row_ends, column_ends = torch.tensor(ends, device=device).permute(1, 2, 0)
+        by_axis = torch.tensor(ends, device=device).permute(1, 2, 0)
+        row_ends, column_ends = by_axis
         height, width = changed.shape[1:]
         rows = _indices_around(row_ends, height)
         columns = _indices_around(column_ends, width)
-        row = rows[:, :, None].expand(-1, -1, columns.shape[1])
+        n_columns = columns.shape[1]
+        row = rows[:, :, None].expand(-1, -1, n_columns)
         column = columns[:, None].expand_as(row)
         member = torch.arange(len(changed), device=device)[:, None]
         at = member, row.flatten(1), column.flatten(1)
         is_observed = ~evidence.noise_std.isnan()
-        pair, p_first, observed = (
-            values[at].view_as(row)
-            for values in (evidence.pair, evidence.p_first, is_observed)
-        )
+        pair = evidence.pair[at].view_as(row)
+        p_first = evidence.p_first[at].view_as(row)
+        observed = is_observed[at].view_as(row)
         distance = torch.zeros_like(row)
         for index, (first, last) in ((row, row_ends), (column, column_ends)):
             before = first[:, None, None] - index
@@ -222,10 +223,12 @@ class Sites:
         row, column, exists = _nearest_cells(evidence, changed, window)
         at = block.at[0], row, column
         cell, inside = _cells_in_block(row, column, exists, block)
-        neighbours, coupled = _neighbours(cell, block.lattice)
+        neighbours, couplings = _neighbours(cell, block.lattice)
+        coupled = torch.where(inside[..., None], couplings, 0)
 
         def by_class(values: Tensor) -> Tensor:
-            at_sites = values.transpose(0, 1)[:, *at].transpose(0, 1)
+            class_first = values.transpose(0, 1)
+            at_sites = class_first[:, *at].transpose(0, 1)
             return torch.where(exists[:, None], at_sites, 0.0)
 
         lower = by_class(evidence.lower)
@@ -245,10 +248,13 @@ class Sites:
         variance = torch.where(exists, 1 + noise, 1.0)
         covariance.diagonal(dim1=1, dim2=2).copy_(variance)
         labels = unpacked(evidence.labels[at]).transpose(1, 2)
-        scores = torch.where(labels, lower[:, :1], lower[:, 1:])
+        first_scores = lower[:, :1]
+        second_scores = lower[:, 1:]
+        scores = torch.where(labels, first_scores, second_scores)
         term_mean = evidence.shift[at] / precision
         scores = torch.where(censored[:, None], term_mean[:, None], scores)
         is_old = exists & ~fresh
+        old_scores = torch.where(is_old[:, None], scores, 0.0)
         may_change = inside & (evidence.pair[at] > 0)
         unsettled = (evidence.p_first[at] - 0.5).abs() < 0.5 - _SETTLED
         return cls(
@@ -256,7 +262,7 @@ class Sites:
             column=column,
             cell=cell,
             neighbours=neighbours,
-            coupled=torch.where(inside[..., None], coupled, 0),
+            coupled=coupled,
             strength=block.lattice.strength,
             lower=lower,
             upper=upper,
@@ -264,7 +270,7 @@ class Sites:
             std=std,
             noise=noise,
             factor=torch.linalg.cholesky(covariance),
-            scores=torch.where(is_old[:, None], scores, 0.0),
+            scores=old_scores,
             fresh=fresh,
             censored=censored,
             open=fresh | (may_change & unsettled),
@@ -295,8 +301,9 @@ class Sites:
         coupled = self.coupled[:, site]
         neighbour_labels = labels.gather(1, self.neighbours[:, site]) & coupled
         n_first = unpacked(neighbour_labels).sum(1)
-        # Coupled neighbours are −1, so that their sum is minus their number.
-        odds = self.strength * (n_first * 2 + coupled.sum(1)[:, None])
+        # Coupled neighbours are −1, so that the sum is minus their number.
+        minus_n_coupled = coupled.sum(1)[:, None]
+        odds = self.strength * (n_first * 2 + minus_n_coupled)
         lower = self.lower[:, :, site, None]
         upper = self.upper[:, :, site, None]
         density = self.density[:, :, site, None]
@@ -312,11 +319,14 @@ class Sites:
         lower_z = torch.where(mirrored, -high, low)
         upper_z = torch.where(mirrored, -low, high)
         log_upper = torch.special.log_ndtr(upper_z)
-        log_ratio = (torch.special.log_ndtr(lower_z) - log_upper).clamp(max=-1e-300)
+        log_lower = torch.special.log_ndtr(lower_z)
+        log_ratio = (log_lower - log_upper).clamp(max=-1e-300)
         log_mass = log_upper + torch.log(-torch.expm1(log_ratio))
         log_evidence = torch.where(is_number, log_density, log_mass)
-        p_first = torch.sigmoid(odds + log_evidence[:, 0] - log_evidence[:, 1])
-        log_prior = torch.nn.functional.logsigmoid(torch.stack((odds, -odds), 1))
+        first_evidence, second_evidence = log_evidence.unbind(1)
+        p_first = torch.sigmoid(odds + first_evidence - second_evidence)
+        both_odds = torch.stack((odds, -odds), 1)
+        log_prior = torch.nn.functional.logsigmoid(both_odds)
         log_total = (log_evidence + log_prior).logsumexp(1)
         is_first = uniforms[..., 0] < p_first
         # A score within the interval, by inversion of its CDF.
@@ -339,10 +349,12 @@ def _indices_around(ends: tuple[Tensor, Tensor], size: int) -> Tensor:
         size: number of rows or columns of the map.
     """
     first, last = ends
-    length = int((last - first).max()) + 1 + 2 * (_REACH + 1)
-    length = min(length, size)
-    begin = (first - _REACH - 1).clamp(min=0).clamp(max=size - length)
-    return begin[:, None] + torch.arange(length, device=first.device)
+    margin = _REACH + 1
+    extent = int((last - first).max()) + 1
+    length = min(extent + 2 * margin, size)
+    begin = (first - margin).clamp(min=0).clamp(max=size - length)
+    steps = torch.arange(length, device=first.device)
+    return begin[:, None] + steps
 
 
 def _nearest_cells(
@@ -362,11 +374,15 @@ def _nearest_cells(
         rows.append(torch.from_numpy(row))
         columns.append(torch.from_numpy(column))
     is_cell = [row >= 0 for row in rows]
-    row, column, exists = (
-        pad_sequence(values, batch_first=True).flip(1).to(changed.device)
-        for values in (rows, columns, is_cell)
-    )
+    row = _padded(rows).to(changed.device)
+    column = _padded(columns).to(changed.device)
+    exists = _padded(is_cell).to(changed.device)
     return row, column, exists
+
+
+def _padded(sequences: list[Tensor]) -> Tensor:
+    """Return sequences in reverse order as rows of a tensor, padded in front by 0."""
+    return pad_sequence(sequences, batch_first=True).flip(1)
 
 
 def _cells_in_block(
@@ -397,4 +413,5 @@ def _neighbours(cell: Tensor, lattice: Lattice) -> tuple[Tensor, Tensor]:
     steps = torch.tensor((1, -1, width, -width), device=cell.device)
     index = cell[..., None]
     neighbours = (index + steps).clamp(0, last)
-    return neighbours, couplings.gather(1, index.expand(-1, -1, 4))
+    coupled = couplings.gather(1, index.expand(-1, -1, 4))
+    return neighbours, coupled
