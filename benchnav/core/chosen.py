@@ -43,7 +43,9 @@ class ChosenDistribution(TraversabilityDistribution):
         """Return P(λ < value) and P(λ ≤ value), each of shape [*B, H, W]."""
         first = self.first.cdf_limits(value)
         second = self.second.cdf_limits(value)
-        return self._pick(first[0], second[0]), self._pick(first[1], second[1])
+        lower = self._pick(first[0], second[0])
+        upper = self._pick(first[1], second[1])
+        return lower, upper
 
     @property
     def searched(self) -> bool:
@@ -88,7 +90,9 @@ class ChosenDistribution(TraversabilityDistribution):
         """Return the interval of standard normal scores, each of shape [*B, H, W]."""
         first = self.first.to_normal(value)
         second = self.second.to_normal(value)
-        return self._pick(first[0], second[0]), self._pick(first[1], second[1])
+        lower = self._pick(first[0], second[0])
+        upper = self._pick(first[1], second[1])
+        return lower, upper
 
     def _pick(self, first: Tensor, second: Tensor) -> Tensor:
         return torch.where(self.chosen, first, second.to(first.dtype))
@@ -119,10 +123,15 @@ def choose(
     first_weights = torch.where(is_first, like, 0.0).to(like)
     second_weights = torch.where(~is_first, second.weights, 0.0).to(like)
     weights = torch.cat([first_weights, second_weights], -3)
-    means = torch.cat([first.means.to(like), second.means.to(like)], -3)
-    stds = torch.cat([first.stds.to(like), second.stds.to(like)], -3)
+    means = _joined(first.means, second.means, like)
+    stds = _joined(first.stds, second.stds, like)
     group = None
     if first.group is not None:
         n_second = second.weights.shape[-3]
         group = (*first.group, *[NO_CLASS] * n_second)
     return TraversabilityMixture(weights, means, stds, group)
+
+
+def _joined(first: Tensor, second: Tensor, like: Tensor) -> Tensor:
+    """Return the components of both mixtures, with the dtype and device of `like`."""
+    return torch.cat([first.to(like), second.to(like)], -3)

@@ -80,7 +80,8 @@ class ConditionedDistribution(TraversabilityDistribution):
         # No finite score reaches the ends of the range.
         end_level = (u >= 1).double().expand(self.shape)
         ends = self.base.quantile(end_level).to(self.dtype)
-        is_end = ((u <= 0) | (u >= 1)) & (self.score_std > 0)
+        is_extreme = (u <= 0) | (u >= 1)
+        is_end = is_extreme & (self.score_std > 0)
         return torch.where(is_end, ends, value)
 
     def from_normal(self, normal: Tensor) -> Tensor:

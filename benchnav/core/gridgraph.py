@@ -36,12 +36,13 @@ def neighbour_pairs(height: int, width: int) -> tuple[ndarray, ndarray, ndarray]
     indices = np.arange(height * width).reshape(height, width)
     padded = np.pad(indices, 1, constant_values=NO_CELL)
     # The 3×3 cells around each cell.
-    windows = np.lib.stride_tricks.sliding_window_view(padded, (3, 3)).reshape(-1, 9)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (3, 3))
+    neighbours = windows.reshape(-1, 9)
     row_offset, column_offset = np.indices((3, 3)) - 1
     lengths = np.hypot(row_offset, column_offset).ravel()
-    is_edge = (windows != NO_CELL) & (lengths > 0)
+    is_edge = (neighbours != NO_CELL) & (lengths > 0)
     target, offset = np.nonzero(is_edge)
-    source = windows[target, offset]
+    source = neighbours[target, offset]
     return source, target, lengths[offset]
 
 
@@ -88,18 +89,16 @@ def cost_to_go(
     # The search starts at the goals, so edges are reversed: rows are their targets.
     source, target, _ = neighbour_pairs(height, width)
     columns = source.astype(np.int32)
-    row_starts = np.searchsorted(target, np.arange(n_cells + 1)).astype(np.int32)
+    row_indices = np.arange(n_cells + 1)
+    row_starts = np.searchsorted(target, row_indices).astype(np.int32)
     matrix = np.empty(len(source)), columns, row_starts
     graph = csr_array(matrix, shape=(n_cells, n_cells))
     cost = np.empty((batch, n_cells))
     next_cell = np.empty((batch, n_cells), np.int64)
     # A finite limit excludes infinite edges.
+    limit = np.finfo(np.float64).max
     search = partial(
-        dijkstra,
-        graph,
-        min_only=True,
-        return_predecessors=True,
-        limit=np.finfo(np.float64).max,
+        dijkstra, graph, min_only=True, return_predecessors=True, limit=limit
     )
     maps = zip(edge_costs, goals.reshape(batch, n_cells), strict=True)
     for index, (map_costs, map_goals) in enumerate(maps):

@@ -73,7 +73,9 @@ class TraversabilityMixture(TraversabilityDistribution):
 
     def __post_init__(self) -> None:
         """Validate the shapes."""
-        weights, means, stds = self.weights.shape, self.means.shape, self.stds.shape
+        weights = self.weights.shape
+        means = self.means.shape
+        stds = self.stds.shape
         is_same = weights == means == stds
         if not is_same or len(weights) < 3:
             raise ConfigError(
@@ -112,7 +114,8 @@ class TraversabilityMixture(TraversabilityDistribution):
         They differ only at 0 and 1.
         """
         value = self._as_tensor(value)
-        inside = self._unclipped_cdf(value.clamp(max=_BELOW_1)).to(self.dtype)
+        at = value.clamp(max=_BELOW_1)
+        inside = self._unclipped_cdf(at).to(self.dtype)
         lower = torch.where(value > 1, 1.0, inside)
         lower = torch.where(value <= 0, 0.0, lower)
         upper = torch.where(value >= 1, 1.0, inside)
@@ -235,7 +238,9 @@ class TraversabilityMixture(TraversabilityDistribution):
             λ in [0, 1], shape [*B, H, W].
         """
         if self.weights.shape[-3] == 1:
-            unclipped = self.means.squeeze(-3) + self.stds.squeeze(-3) * normal
+            mean = self.means.squeeze(-3)
+            std = self.stds.squeeze(-3)
+            unclipped = mean + std * normal
             return unclipped.clamp(0, 1)
         return self._in_cells(value_at_risk, normal_cdf(normal.double()))
 
@@ -336,7 +341,8 @@ class TraversabilityMixture(TraversabilityDistribution):
         group = tuple(no_class if index < 0 else index for index in self.group)
         grouped = replace(self, group=group)
         best = grouped.class_probabilities(no_class + 1).argmax(-3, keepdim=True)
-        is_best = torch.tensor(group, device=best.device).view(-1, 1, 1) == best
+        component_class = torch.tensor(group, device=best.device)
+        is_best = component_class.view(-1, 1, 1) == best
         if len(set(group)) == len(group):  # a single component per class
             index = is_best.int().argmax(-3, keepdim=True)
             means = torch.gather(self.means, -3, index)
@@ -359,10 +365,8 @@ class TraversabilityMixture(TraversabilityDistribution):
         Returns:
             Values of shape [*B, H, W], in the dtype of the parameters.
         """
-        parameters = [
-            values.movedim(-3, 0).flatten(1)
-            for values in (self.weights, self.means, self.stds)
-        ]
+        all_parameters = (self.weights, self.means, self.stds)
+        parameters = [values.movedim(-3, 0).flatten(1) for values in all_parameters]
         is_cpu = self.weights.device.type == "cpu"
         numbers = _NUMBERS_AT_ONCE if is_cpu else _NUMBERS_ON_A_GPU
         size = max(1, numbers // len(parameters[0]))
@@ -406,7 +410,8 @@ class TraversabilityMixture(TraversabilityDistribution):
     def _unclipped_cdf(self, value: Tensor) -> Tensor:
         weights, means, stds = self._parameters()
         z = (_with_components(value) - means) / stds
-        return (weights * normal_cdf(z)).sum(-3).clamp(0, 1)
+        probability = (weights * normal_cdf(z)).sum(-3)
+        return probability.clamp(0, 1)
 
 
 def _with_components(value: Tensor) -> Tensor:

@@ -53,11 +53,11 @@ def edges_between(low: Tensor, high: Tensor | float) -> Tensor:
         low: first edge, shape [b, h, w].
         high: last edge, a number or shape [b, h, w].
     """
-    steps = torch.linspace(
-        0, 1, N_INTERVALS + 1, dtype=torch.float64, device=low.device
-    )
+    n_edges = N_INTERVALS + 1
+    steps = torch.linspace(0, 1, n_edges, dtype=torch.float64, device=low.device)
+    fraction = steps.view(-1, 1, 1, 1)
     last = torch.as_tensor(high).to(low)
-    return torch.lerp(low, last, steps.view(-1, 1, 1, 1))
+    return torch.lerp(low, last, fraction)
 
 
 def integral(
@@ -88,12 +88,14 @@ def integral(
     if is_inexact.any():
         inexact = distribution.at(is_inexact)._in_members()
         function = partial(curve, _stacked(inexact))
+        # The inexact cells become a map of one row.
         edges, first, last = (
             values[..., is_inexact][..., None, None, :]
             for values in (edges, first, last)
         )
-        again, _ = _trapezia(function, edges, first, last, rounds * _MORE_ROUNDS)
-        total[is_inexact] = again.flatten()
+        more_rounds = rounds * _MORE_ROUNDS
+        refined, _ = _trapezia(function, edges, first, last, more_rounds)
+        total[is_inexact] = refined.flatten()
     return total
 
 
@@ -170,7 +172,9 @@ def _trapezia(
     # At a jump, the correction is a twelfth of the rise.
     abs_rise = rise.abs().clamp(min=1e-300)
     errors = 12 * width * correction.square() / abs_rise
-    return areas.flatten(0, 1).sum(0), errors.flatten(0, 1).sum(0)
+    total = areas.flatten(0, 1).sum(0)
+    total_error = errors.flatten(0, 1).sum(0)
+    return total, total_error
 
 
 def _limited(excess: Tensor, rise: Tensor) -> Tensor:

@@ -54,8 +54,9 @@ class QuantileDistribution(TraversabilityDistribution):
         levels = self.levels
         steps = [upper - lower for lower, upper in pairwise(levels)]
         spans = bool(levels) and levels[0] == 0 and levels[-1] == 1
+        is_ascending = bool(steps) and min(steps) > 0
         expect(
-            len(levels) >= _MIN_LEVELS and spans and min(steps) > 0,
+            len(levels) >= _MIN_LEVELS and spans and is_ascending,
             f"`levels` that ascend from 0 to 1, {_MIN_LEVELS} or more, got "
             f"{len(levels)}. Use `benchnav.core.quantiles.LEVELS`.",
         )
@@ -67,10 +68,11 @@ class QuantileDistribution(TraversabilityDistribution):
             f"`levels` at most {_TAIL_STEP} apart up to {_TAIL}, where risk is, got "
             f"{max_step:.3g}. Add levels there.",
         )
-        if self.values.ndim < 3 or self.values.shape[-3] != len(levels):
+        shape = self.values.shape
+        if len(shape) < 3 or shape[-3] != len(levels):
             raise ConfigError(
                 f"Expected `values` of shape [*B, {len(levels)}, H, W], one map a "
-                f"level, got {list(self.values.shape)}."
+                f"level, got {list(shape)}."
             )
 
     @property
@@ -113,7 +115,8 @@ class QuantileDistribution(TraversabilityDistribution):
         u = u.expand(self.shape).unsqueeze(-1).contiguous()
         knots = self._knots()
         levels = self._levels()
-        upper = torch.searchsorted(levels, u).clamp(1, len(levels) - 1)
+        last = len(levels) - 1
+        upper = torch.searchsorted(levels, u).clamp(1, last)
         lower = upper - 1
         low_level = levels[lower]
         fraction = (u - low_level) / (levels[upper] - low_level)
