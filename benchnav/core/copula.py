@@ -47,10 +47,10 @@ def correlated_normal(
         Standard normals, float64, shape [B, H, W].
     """
     height, width = shape
-    white = rng.normal(key, indices, (2 * height, 2 * width))
+    torus = 2 * height, 2 * width
+    white = rng.normal(key, indices, torus)
     if correlation_cells == 0:
         return white[:, :height, :width].copy()
-    torus = white.shape[1:]
     if kernel == "matern32":
         transfer = _matern32(*torus, correlation_cells)
     else:

@@ -370,9 +370,9 @@ def _nearest_cells(
     rows = []
     columns = []
     for observed, new in zip(is_observed, is_new, strict=True):
-        row, column = nearest(observed, new, window)
-        rows.append(torch.from_numpy(row))
-        columns.append(torch.from_numpy(column))
+        cells = nearest(observed, new, window)
+        rows.append(torch.from_numpy(cells[0]))
+        columns.append(torch.from_numpy(cells[1]))
     is_cell = [row >= 0 for row in rows]
     row = _padded(rows).to(changed.device)
     column = _padded(columns).to(changed.device)
