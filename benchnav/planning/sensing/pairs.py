@@ -91,9 +91,9 @@ def split(
         pair = torch.where(is_of_pair, index, pair)
         odds = torch.where(is_of_pair, (first / second).log(), odds)
         for part, probability in enumerate((first, second)):
-            # The class has all of the pair's weight, the pair's other class no weight.
-            second_id = ids[1 - part]
-            others = torch.where(group == second_id, 0.0, 1.0)
+            # The class has all of the pair's weight; the other class has no weight.
+            excluded_id = ids[1 - part]
+            others = torch.where(group == excluded_id, 0.0, 1.0)
             gain = (pair_weight / probability)[:, None]
             scale = torch.where(group == ids[part], gain, others)
             scales[part] = torch.where(is_of_pair[:, None], scale, scales[part])

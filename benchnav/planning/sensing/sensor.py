@@ -260,7 +260,7 @@ class Probe(Sensor):
         in_rows = dy.abs() <= self.radius_m
         in_square = in_columns & in_rows
         # Distances are computed only for the few cells that may be near. For all cells
-        # they would take as long as the remaining measurement.
+        # they would take as long as all other steps of a measurement.
         member, row, column = in_square.nonzero(as_tuple=True)
         distance = torch.hypot(dx[member, 0, column], dy[member, row, 0])
         return in_square.index_put((member, row, column), distance <= self.radius_m)

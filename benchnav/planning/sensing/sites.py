@@ -18,7 +18,7 @@ from benchnav.planning.sensing.gaussian import Field
 from benchnav.planning.sensing.labels import Lattice, Noise, noise, unpacked
 
 _REACH = 12  # cells
-# An observed cell is not drawn again if its less likely label is less probable.
+# An observed cell is not drawn again if its less likely label has a lower probability.
 _SETTLED = 0.005
 MIN_CHANGE = 0.01
 """Minimum change of the probability of an unobserved cell."""
