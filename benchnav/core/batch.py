@@ -29,13 +29,14 @@ class Batch:
         Args:
             members: indices of the elements, int64, shape [M].
         """
-        # A nested batch may override `select`.
-        return _mapped(
-            self,
-            lambda values: values[members],
-            lambda inner: inner.select(members),
-            (),
-        )
+
+        def rows_of(values: Tensor) -> Tensor:
+            return values[members]
+
+        def select_nested(batch: Any) -> Any:
+            return batch.select(members)  # which a nested batch may override
+
+        return _mapped(self, rows_of, select_nested, ())
 
     def put(self, members: Tensor, others: Self) -> Self:
         """Return a batch with some elements replaced.
@@ -44,9 +45,11 @@ class Batch:
             members: indices of the elements to replace, int64, shape [M].
             others: the M new elements.
         """
-        return map_tensors(
-            self, lambda old, new: old.index_copy(0, members, new), others
-        )
+
+        def put_rows(old: Tensor, new: Tensor) -> Tensor:
+            return old.index_copy(0, members, new)
+
+        return map_tensors(self, put_rows, others)
 
     def clone(self) -> Self:
         """Return a copy that shares no tensor."""
@@ -60,51 +63,55 @@ class Batch:
 def map_tensors(value: Value, change: Callable[..., Tensor], *others: Value) -> Value:
     """Apply a function to each tensor of a dataclass.
 
-    This includes nested batches, tuples of batches and mappings; other fields stay.
+    This includes nested batches, tuples of batches and mappings. Other fields are
+    unchanged.
 
     Args:
         value: the dataclass.
         change: function of a tensor and of the corresponding tensors of `others`.
         others: dataclasses of the same type.
     """
-    return _mapped(
-        value, change, lambda first, *rest: map_tensors(first, change, *rest), others
-    )
+
+    def map_nested(batch: Any, *other_batches: Any) -> Any:
+        return map_tensors(batch, change, *other_batches)
+
+    return _mapped(value, change, map_nested, others)
 
 
 def _mapped(
     value: Value,
     change: Callable[..., Tensor],
-    inner: Callable[..., Any],
+    change_nested: Callable[..., Any],
     others: Sequence[Any],
 ) -> Value:
-    """Apply `change` to each tensor and `inner` to each nested batch."""
+    """Apply `change` to each tensor and `change_nested` to each nested batch."""
     batch: Any = value
     changes = {}
     for field in fields(batch):
-        name = field.name
-        rest = [getattr(other, name) for other in others]
-        changes[name] = _changed(getattr(batch, name), change, inner, rest)
+        values = [getattr(dataclass, field.name) for dataclass in (batch, *others)]
+        changes[field.name] = _changed(values, change, change_nested)
     return cast(Value, replace(batch, **changes))
 
 
 def _changed(
-    first: Any,
+    values: Sequence[Any],
     change: Callable[..., Tensor],
-    inner: Callable[..., Any],
-    rest: Sequence[Any],
+    change_nested: Callable[..., Any],
 ) -> Any:
+    """Return the new value of a field; `values` has that of each dataclass."""
+    first = values[0]
     if isinstance(first, Tensor):
-        return change(first, *rest)
+        return change(*values)
     if isinstance(first, Batch):
-        return inner(first, *rest)
+        return change_nested(*values)
     if isinstance(first, tuple) and first and isinstance(first[0], Batch):
-        return tuple(inner(*batches) for batches in zip(first, *rest, strict=True))
+        return tuple(change_nested(*batches) for batches in zip(*values, strict=True))
     if isinstance(first, Mapping):
-        return {
-            key: _changed(value, change, inner, [mapping[key] for mapping in rest])
-            for key, value in first.items()
-        }
+        new_mapping = {}
+        for key in first:
+            items = [mapping[key] for mapping in values]
+            new_mapping[key] = _changed(items, change, change_nested)
+        return new_mapping
     return first
 
 
@@ -124,6 +131,23 @@ def put_if_alike(value: Value, members: Tensor, others: Value) -> Value:
     if type(value) is not type(others) or shapes != other_shapes:
         return others
     return value.put(members, others.select(members))
+
+
+def have_same_structure(first: Any, second: Any) -> bool:
+    """Return whether two values are equal except for the numbers in tensors."""
+    if isinstance(first, Tensor) and isinstance(second, Tensor):
+        return first.shape == second.shape
+    if isinstance(first, tuple) and isinstance(second, tuple):
+        return len(first) == len(second) and all(
+            map(have_same_structure, first, second)
+        )
+    if isinstance(first, Batch) and type(first) is type(second):
+        names = [field.name for field in fields(cast(Any, first))]
+        return all(
+            have_same_structure(getattr(first, name), getattr(second, name))
+            for name in names
+        )
+    return bool(first == second)
 
 
 def first_tensor(value: Batch) -> Tensor:
@@ -157,8 +181,8 @@ def find_tensor_fault(
     """Return a message if a value is not the expected tensor, or empty text.
 
     Args:
-        what: the value in the message.
-        values: the value.
+        what: name of the value in the message.
+        values: value to check.
         dtype: expected dtype.
         shape: expected shape.
         device: expected device.
@@ -167,4 +191,6 @@ def find_tensor_fault(
     got = type(values).__name__
     if isinstance(values, Tensor):
         got = f"{values.dtype} of shape {list(values.shape)} on {values.device}"
-    return "" if got == expected else f"Expected {what} as {expected}, got {got}."
+    if got == expected:
+        return ""
+    return f"Expected {what} as {expected}, got {got}."

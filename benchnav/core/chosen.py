@@ -31,17 +31,21 @@ class ChosenDistribution(TraversabilityDistribution):
 
     @property
     def shape(self) -> torch.Size:
-        """[*B, H, W]."""
+        """Shape of the maps, [*B, H, W]."""
         return self.chosen.shape
 
     def cdf(self, value: Tensor | float) -> Tensor:
         """Return P(λ ≤ value), shape [*B, H, W]."""
-        return self._pick(self.first.cdf(value), self.second.cdf(value))
+        first = self.first.cdf(value)
+        return self._pick(first, self.second.cdf(value))
 
     def cdf_limits(self, value: Tensor | float) -> tuple[Tensor, Tensor]:
         """Return P(λ < value) and P(λ ≤ value), each of shape [*B, H, W]."""
-        limits = self.first.cdf_limits(value)
-        return self._pick_both(limits, self.second.cdf_limits(value))
+        first = self.first.cdf_limits(value)
+        second = self.second.cdf_limits(value)
+        lower = self._pick(first[0], second[0])
+        upper = self._pick(first[1], second[1])
+        return lower, upper
 
     @property
     def searched(self) -> bool:
@@ -50,8 +54,8 @@ class ChosenDistribution(TraversabilityDistribution):
 
     def quantile(self, probability: Tensor | float) -> Tensor:
         """Return the quantiles of λ, shape [*B, H, W]."""
-        quantiles = self.first.quantile(probability)
-        return self._pick(quantiles, self.second.quantile(probability))
+        first = self.first.quantile(probability)
+        return self._pick(first, self.second.quantile(probability))
 
     def mean(self) -> Tensor:
         """Return E[λ], shape [*B, H, W]."""
@@ -59,39 +63,39 @@ class ChosenDistribution(TraversabilityDistribution):
 
     def cvar(self, level: float) -> Tensor:
         """Return the conditional value at risk, shape [*B, H, W]."""
-        return self._pick(self.first.cvar(level), self.second.cvar(level))
+        first = self.first.cvar(level)
+        return self._pick(first, self.second.cvar(level))
 
     def expected_time(self, floor: float) -> Tensor:
         """Return E[1 / max(λ, floor)], shape [*B, H, W]."""
-        times = self.first.expected_time(floor)
-        return self._pick(times, self.second.expected_time(floor))
+        first = self.first.expected_time(floor)
+        return self._pick(first, self.second.expected_time(floor))
 
     def time_cvar(self, level: float, floor: float) -> Tensor:
         """Return the CVaR of the time 1 / max(λ, floor), shape [*B, H, W]."""
-        times = self.first.time_cvar(level, floor)
-        return self._pick(times, self.second.time_cvar(level, floor))
+        first = self.first.time_cvar(level, floor)
+        return self._pick(first, self.second.time_cvar(level, floor))
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Return log density on (0, 1) and log mass at 0 and 1, shape [*B, H, W]."""
-        return self._pick(self.first.log_prob(value), self.second.log_prob(value))
+        first = self.first.log_prob(value)
+        return self._pick(first, self.second.log_prob(value))
 
     def from_normal(self, normal: Tensor) -> Tensor:
         """Return λ of standard normal scores, shape [*B, H, W]."""
-        traversability = self.first.from_normal(normal)
-        return self._pick(traversability, self.second.from_normal(normal))
+        first = self.first.from_normal(normal)
+        return self._pick(first, self.second.from_normal(normal))
 
     def to_normal(self, value: Tensor | float) -> tuple[Tensor, Tensor]:
         """Return the interval of standard normal scores, each of shape [*B, H, W]."""
-        interval = self.first.to_normal(value)
-        return self._pick_both(interval, self.second.to_normal(value))
+        first = self.first.to_normal(value)
+        second = self.second.to_normal(value)
+        lower = self._pick(first[0], second[0])
+        upper = self._pick(first[1], second[1])
+        return lower, upper
 
     def _pick(self, first: Tensor, second: Tensor) -> Tensor:
         return torch.where(self.chosen, first, second.to(first.dtype))
-
-    def _pick_both(
-        self, first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor]
-    ) -> tuple[Tensor, Tensor]:
-        return self._pick(first[0], second[0]), self._pick(first[1], second[1])
 
 
 def choose(
@@ -102,7 +106,7 @@ def choose(
     """Return the first distribution in chosen cells, the second in all others.
 
     Args:
-        chosen: bool, shape [*B, H, W].
+        chosen: mask of the cells of the first, bool, shape [*B, H, W].
         first: distribution of shape [*B, H, W].
         second: distribution of shape [*B, H, W].
 
@@ -110,18 +114,24 @@ def choose(
         A mixture if both are mixtures, in which components of the second have no class;
         otherwise a `ChosenDistribution`.
     """
-    if not isinstance(first, TraversabilityMixture) or not isinstance(
-        second, TraversabilityMixture
-    ):
+    if not isinstance(first, TraversabilityMixture):
+        return ChosenDistribution(first, second, chosen)
+    if not isinstance(second, TraversabilityMixture):
         return ChosenDistribution(first, second, chosen)
     like = first.weights
     is_first = chosen.unsqueeze(-3)
     first_weights = torch.where(is_first, like, 0.0).to(like)
     second_weights = torch.where(~is_first, second.weights, 0.0).to(like)
     weights = torch.cat([first_weights, second_weights], -3)
-    means = torch.cat([first.means.to(like), second.means.to(like)], -3)
-    stds = torch.cat([first.stds.to(like), second.stds.to(like)], -3)
+    means = _joined(first.means, second.means, like)
+    stds = _joined(first.stds, second.stds, like)
     group = None
     if first.group is not None:
-        group = (*first.group, *[NO_CLASS] * second.weights.shape[-3])
+        n_second = second.weights.shape[-3]
+        group = (*first.group, *[NO_CLASS] * n_second)
     return TraversabilityMixture(weights, means, stds, group)
+
+
+def _joined(first: Tensor, second: Tensor, like: Tensor) -> Tensor:
+    """Return the components of both mixtures, with the dtype and device of `like`."""
+    return torch.cat([first.to(like), second.to(like)], -3)

@@ -1,10 +1,10 @@
 """A distribution that is conditioned on a posterior of its normal score.
 
-A λ field is a transform of correlated standard normals z, λ = Q(Φ(z)). If observations
-give z a posterior N(μ, σ²), λ has the quantile function Q(Φ(μ + σ Φ⁻¹(u))) and the CDF
-Φ((Φ⁻¹(F(x)) − μ) / σ). If the posterior is skewed, as next to interval-censored
-observations, σ multiplies a shifted log-normal variable of that skewness instead of a
-normal one.
+A λ field is a transform of correlated standard normals z, λ = Q(Φ(z)). If the posterior
+of z is N(μ, σ²), λ has the quantile function Q(Φ(μ + σ Φ⁻¹(u))) and the CDF
+Φ((Φ⁻¹(F(x)) − μ) / σ). If the posterior is skewed, as near interval-censored
+observations, σ multiplies a shifted log-normal variable of the same skewness instead of
+a normal variable.
 Letters in shapes: H×W cells; *B any leading dimensions.
 """
 
@@ -14,12 +14,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from benchnav.core.distribution import MOST_SCORE, TraversabilityDistribution
+from benchnav.core.distribution import MAX_SCORE, TraversabilityDistribution
 from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
 
-_SMALLEST_STD = 1e-9
-LEAST_SKEW = 1e-3  # below it, a variable counts as normal
+_MIN_STD = 1e-9
+MIN_SKEW = 1e-3  # below it, a variable counts as normal
 
 
 @dataclass(frozen=True)
@@ -29,8 +29,8 @@ class ConditionedDistribution(TraversabilityDistribution):
     Args:
         base: prior distribution of shape [*B, H, W].
         score_mean: posterior mean μ, shape [*B, H, W].
-        score_std: posterior standard deviation σ ≥ 0, shape [*B, H, W]; where it is 0,
-            λ is Q(Φ(μ)).
+        score_std: posterior standard deviation σ ≥ 0, shape [*B, H, W]; if it is 0, λ
+            is Q(Φ(μ)).
         score_skew: posterior skewness, shape [*B, H, W]; if None, 0.
 
     Raises:
@@ -55,30 +55,34 @@ class ConditionedDistribution(TraversabilityDistribution):
 
     @property
     def shape(self) -> torch.Size:
-        """[*B, H, W]."""
+        """Shape of the maps, [*B, H, W]."""
         return self.base.shape
 
     def cdf(self, value: Tensor | float) -> Tensor:
         """Return P(λ ≤ value), shape [*B, H, W]."""
-        return torch.special.ndtr(self._scores(value)[1]).to(self.dtype)
+        _, upper = self._scores(value)
+        return torch.special.ndtr(upper).to(self.dtype)
 
     def cdf_limits(self, value: Tensor | float) -> tuple[Tensor, Tensor]:
         """Return P(λ < value) and P(λ ≤ value), each of shape [*B, H, W]."""
         lower, upper = self._scores(value)
-        below = torch.special.ndtr(lower).to(self.dtype)
-        return below, torch.special.ndtr(upper).to(self.dtype)
+        below = torch.special.ndtr(lower)
+        at_most = torch.special.ndtr(upper)
+        return below.to(self.dtype), at_most.to(self.dtype)
 
     def quantile(self, probability: Tensor | float) -> Tensor:
         """Return the quantiles of λ, shape [*B, H, W]."""
         u = torch.as_tensor(probability, dtype=torch.float64, device=self.device)
-        score = torch.special.ndtri(u).clamp(-MOST_SCORE, MOST_SCORE)
+        score = torch.special.ndtri(u).clamp(-MAX_SCORE, MAX_SCORE)
         value = self.from_normal(score.expand(self.shape))
         if not isinstance(probability, Tensor) and 0 < probability < 1:
             return value
         # No finite score reaches the ends of the range.
-        ends = self.base.quantile((u >= 1).double().expand(self.shape))
-        is_end = ((u <= 0) | (u >= 1)) & (self.score_std > 0)
-        return torch.where(is_end, ends.to(self.dtype), value)
+        end_level = (u >= 1).double().expand(self.shape)
+        ends = self.base.quantile(end_level).to(self.dtype)
+        is_extreme = (u <= 0) | (u >= 1)
+        is_end = is_extreme & (self.score_std > 0)
+        return torch.where(is_end, ends, value)
 
     def from_normal(self, normal: Tensor) -> Tensor:
         """Return λ of standard normal scores, shape [*B, H, W]."""
@@ -98,7 +102,7 @@ class ConditionedDistribution(TraversabilityDistribution):
         It is NaN where the base has no density.
         """
         value = value.double()
-        std = self.score_std.double().clamp(min=_SMALLEST_STD)
+        std = self.score_std.double().clamp(min=_MIN_STD)
         lower, upper = self._scores(value)
         base = self.base._exact()
         prior = base.to_normal(value)[1]
@@ -110,14 +114,16 @@ class ConditionedDistribution(TraversabilityDistribution):
             inside = torch.where(upper.isinf(), -math.inf, inside - log_slope)
         tail = torch.where(value <= 0, upper, -lower)
         is_end = (value <= 0) | (value >= 1)
-        total = torch.where(is_end, torch.special.log_ndtr(tail), inside)
-        return torch.where((value < 0) | (value > 1), -math.inf, total).to(self.dtype)
+        log_mass = torch.special.log_ndtr(tail)
+        total = torch.where(is_end, log_mass, inside)
+        is_outside = (value < 0) | (value > 1)
+        return torch.where(is_outside, -math.inf, total).to(self.dtype)
 
     def _scores(self, value: Tensor | float) -> tuple[Tensor, Tensor]:
         """Return Φ⁻¹ of P(λ < value) and of P(λ ≤ value), float64."""
         lower, upper = self.base._exact().to_normal(value)
         mean = self.score_mean.double()
-        std = self.score_std.double().clamp(min=_SMALLEST_STD)
+        std = self.score_std.double().clamp(min=_MIN_STD)
         lower = (lower - mean) / std
         upper = (upper - mean) / std
         if self.score_skew is None:
@@ -136,33 +142,42 @@ def skewed(normal: Tensor, skew: Tensor) -> Tensor:
         Values of mean 0 and variance 1, float64.
     """
     sign, mean, std, sigma = _log_normal(skew)
-    transformed = sign * ((sign * sigma * normal).exp() - mean) / std
-    return torch.where(skew.abs() < LEAST_SKEW, normal.double(), transformed)
+    log_normal = (sign * sigma * normal).exp()
+    transformed = sign * (log_normal - mean) / std
+    return torch.where(skew.abs() < MIN_SKEW, normal.double(), transformed)
 
 
 def unskewed(value: Tensor, skew: Tensor) -> Tensor:
     """Return the inverse of `skewed`; infinite beyond its range."""
     sign, mean, std, sigma = _log_normal(skew)
-    normal = sign * (mean + sign * value * std).clamp(min=0).log() / sigma
-    return torch.where(skew.abs() < LEAST_SKEW, value, normal)
+    log_normal = (mean + sign * value * std).clamp(min=0)
+    normal = sign * log_normal.log() / sigma
+    return torch.where(skew.abs() < MIN_SKEW, value, normal)
 
 
 def _slope(normal: Tensor, skew: Tensor) -> Tensor:
     """Return the derivative of `skewed`."""
     sign, _, std, sigma = _log_normal(skew)
-    slope = sigma * (sign * sigma * normal).exp() / std
-    return torch.where(skew.abs() < LEAST_SKEW, 1.0, slope)
+    log_normal = (sign * sigma * normal).exp()
+    slope = sigma * log_normal / std
+    return torch.where(skew.abs() < MIN_SKEW, 1.0, slope)
 
 
 def _log_normal(skew: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return sign, mean, standard deviation and σ of exp(σ z) with a given skewness."""
-    abs_skew = skew.double().abs().clamp(min=LEAST_SKEW)
+    """Return sign, mean, standard deviation and σ of exp(σ z) with a given skewness.
+
+    The sign is that of the skewness; exp(σ z) has the absolute value.
+    """
+    abs_skew = skew.double().abs().clamp(min=MIN_SKEW)
     # Solve skew² = (w + 2)² (w − 1) for w = exp(σ²).
     a = 1 + abs_skew.square() / 2
     root = (a + (a.square() - 1).sqrt()).pow(1 / 3)
     w = root + 1 / root - 1
     sign = torch.where(skew < 0, -1.0, 1.0).double()
-    return sign, w.sqrt(), (w * (w - 1)).sqrt(), w.log().sqrt()
+    mean = w.sqrt()
+    std = (w * (w - 1)).sqrt()
+    sigma = w.log().sqrt()
+    return sign, mean, std, sigma
 
 
 def conditioned(
@@ -176,8 +191,8 @@ def conditioned(
         std: posterior standard deviation σ ≥ 0 of the score, shape [*B, H, W].
 
     Returns:
-        If the base is a mixture of a single component, the exact mixture
-        clip(m + s (μ + σ z)); otherwise a `ConditionedDistribution`.
+        The exact mixture clip(m + s (μ + σ z)) if the base is a mixture of a single
+        component, else a `ConditionedDistribution`.
     """
     if not isinstance(base, TraversabilityMixture) or base.weights.shape[-3] > 1:
         return ConditionedDistribution(base, mean, std)

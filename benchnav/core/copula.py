@@ -7,8 +7,8 @@ filter the same white noise. The quantile function of each cell transforms its s
 λ, so that marginals are exact: a Gaussian copula (Nelsen 2006, "An introduction to
 copulas").
 
-Batched NumPy in float64, the same on every machine. Letters in shapes: B fields; H×W
-cells.
+Computations are in float64 with NumPy, batched, and the same on every machine. Letters
+in shapes: B fields; H×W cells.
 """
 
 import numpy as np
@@ -36,9 +36,9 @@ def correlated_normal(
         key: stream key.
         indices: indices of the stream's elements, shape [B].
         shape: (H, W).
-        correlation_cells: correlation length ℓ in cells, up to `LONGEST_CORRELATION` of
-            the map; cells at distance d have the correlation exp(−d²/2ℓ²), and at ℓ = 0
-            they are independent.
+        correlation_cells: correlation length ℓ in cells, at most `LONGEST_CORRELATION`
+            times the map's shorter side. Cells at distance d have the correlation
+            exp(−d²/2ℓ²); if ℓ is 0, they are independent.
         kernel: one of `KERNELS`. The correlation of `matern32` is
             (1 + a d/ℓ) exp(−a d/ℓ) with a = 1.358, so that it is exp(−1/2) at distance
             ℓ, like that of the Gaussian.
@@ -47,17 +47,20 @@ def correlated_normal(
         Standard normals, float64, shape [B, H, W].
     """
     height, width = shape
-    white = rng.normal(key, indices, (2 * height, 2 * width))
+    torus = 2 * height, 2 * width
+    white = rng.normal(key, indices, torus)
     if correlation_cells == 0:
         return white[:, :height, :width].copy()
     if kernel == "matern32":
-        transfer = _matern32(2 * height, 2 * width, correlation_cells)
+        transfer = _matern32(*torus, correlation_cells)
     else:
-        along_rows = _gaussian(2 * height, correlation_cells)
-        weights = np.outer(along_rows, _gaussian(2 * width, correlation_cells))
+        down = _gaussian(2 * height, correlation_cells)
+        across = _gaussian(2 * width, correlation_cells)
+        weights = np.outer(down, across)
         weights /= np.sqrt((weights**2).sum())
         transfer = np.fft.rfft2(weights)
-    field = np.fft.irfft2(np.fft.rfft2(white) * transfer, s=white.shape[1:])
+    spectrum = np.fft.rfft2(white) * transfer
+    field = np.fft.irfft2(spectrum, s=torus)
     return field[:, :height, :width].copy()
 
 
@@ -65,7 +68,8 @@ def correlations(size: int, correlation_cells: float) -> ndarray:
     """Return the correlations along one axis of `correlated_normal`, Gaussian kernel.
 
     The correlation of two cells is the product over both axes. For ℓ ≥ 2 cells it is
-    exp(−d²/2ℓ²) within 10⁻³; for smaller ℓ it is that of the discrete kernel.
+    exp(−d²/2ℓ²) within 10⁻³. For smaller ℓ it is the autocorrelation of the discrete
+    kernel.
 
     Args:
         size: number of cells along the axis.
@@ -76,7 +80,8 @@ def correlations(size: int, correlation_cells: float) -> ndarray:
     """
     if correlation_cells == 0:
         return np.eye(1, size)[0]
-    power = np.abs(np.fft.rfft(_gaussian(2 * size, correlation_cells))) ** 2
+    kernel = _gaussian(2 * size, correlation_cells)
+    power = np.abs(np.fft.rfft(kernel)) ** 2
     covariances = np.fft.irfft(power, n=2 * size)[:size]
     return covariances / covariances[0]
 
@@ -85,17 +90,20 @@ def _matern32(height: int, width: int, correlation_cells: float) -> ndarray:
     """Return the transfer function: the square root of the correlation's spectrum."""
     distances = np.hypot(_ring(height)[:, None], _ring(width))
     scaled = _MATERN32 * distances / correlation_cells
+    correlation = (1 + scaled) * np.exp(-scaled)
     # The correlation has a kink at half the period, so that its spectrum may be
     # slightly negative.
-    power = np.fft.rfft2((1 + scaled) * np.exp(-scaled)).real.clip(min=0)
+    power = np.fft.rfft2(correlation).real.clip(min=0)
     return np.sqrt(power)
 
 
 def _gaussian(size: int, correlation_cells: float) -> ndarray:
     """Return exp(−d²/ℓ²) for the distances d of `_ring`, shape [size]."""
-    return np.exp(-((_ring(size) / correlation_cells) ** 2))
+    scaled = _ring(size) / correlation_cells
+    return np.exp(-(scaled**2))
 
 
 def _ring(size: int) -> ndarray:
     """Return distances in cells from the first cell of a ring, shape [size]."""
-    return np.minimum(np.arange(size), size - np.arange(size))
+    index = np.arange(size)
+    return np.minimum(index, size - index)

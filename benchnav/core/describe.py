@@ -31,7 +31,7 @@ def describe(kind: str, instance: Any) -> Part:
             argument of `registry.read_part`.
 
     Returns:
-        The part that creates the object again. If there is none, a part by a name in
+        The part that creates the object again. If no part does, a part by a name in
         this process only, see `registry.is_object`.
 
     Raises:

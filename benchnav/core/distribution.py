@@ -19,20 +19,26 @@ Letters in shapes: H×W cells; *B any leading dimensions; b×h×w cells of a chu
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import fields
-from typing import Any, Self, cast
+from functools import partial
+from typing import Self
 
 import torch
 from torch import Tensor
 
-from benchnav.core.batch import Batch, first_tensor, map_tensors, tensors_of
+from benchnav.core.batch import (
+    Batch,
+    first_tensor,
+    have_same_structure,
+    map_tensors,
+    tensors_of,
+)
 from benchnav.core.errors import ConfigError, expect
 from benchnav.core.quadrature import N_INTERVALS, edges_between, integral
 
 _ROUNDS_OF_TIME = 40  # bisections; times span a larger range than λ
 _CELLS_AT_ONCE = 2**13
 _CELLS_ON_A_GPU = 2**18  # on a GPU, few large chunks are faster than many small ones
-MOST_SCORE = 40.0  # standard deviations; beyond, Φ is 0 or 1 in float64
+MAX_SCORE = 40.0  # standard deviations; beyond, Φ is 0 or 1 in float64
 
 
 class TraversabilityDistribution(Batch, ABC):
@@ -47,7 +53,7 @@ class TraversabilityDistribution(Batch, ABC):
     @property
     @abstractmethod
     def shape(self) -> torch.Size:
-        """[*B, H, W]."""
+        """Shape of the maps, [*B, H, W]."""
 
     @property
     def dtype(self) -> torch.dtype:
@@ -97,7 +103,8 @@ class TraversabilityDistribution(Batch, ABC):
         """
         exact = torch.float64 if self.dtype == torch.float64 else torch.float32
         at = torch.as_tensor(value, dtype=exact, device=self.device)
-        below = torch.nextafter(at, torch.full_like(at, -math.inf))
+        minus_infinity = torch.full_like(at, -math.inf)
+        below = torch.nextafter(at, minus_infinity)
         return self.cdf(below), self.cdf(at)
 
     def mean(self) -> Tensor:
@@ -106,8 +113,9 @@ class TraversabilityDistribution(Batch, ABC):
         def compute(chunk: Self) -> Tensor:
             zeros = torch.zeros(chunk.shape, dtype=torch.float64, device=chunk.device)
             edges = edges_between(zeros, 1.0)
-            ends = chunk.cdf(0.0), chunk.cdf_limits(1.0)[0]
-            return 1 - integral(chunk, lambda cdf, x: cdf(x), edges, *ends)
+            first = chunk.cdf(0.0)
+            last = chunk.cdf_limits(1.0)[0]
+            return 1 - integral(chunk, lambda cdf, x: cdf(x), edges, first, last)
 
         return self._in_chunks(compute)
 
@@ -135,16 +143,21 @@ class TraversabilityDistribution(Batch, ABC):
             Traversability, shape [*B, H, W].
         """
         tail = tail_of(level)
+        if tail == 1:
+            return self.mean()
 
         def compute(chunk: Self) -> Tensor:
             value = chunk.quantile(tail).double()
             edges = edges_between(torch.zeros_like(value), value)
+            first = (chunk.cdf(0.0) / tail).clamp(max=1)
             # F / tail is 1 at the VaR, even if F jumps beyond the tail there.
-            ends = (chunk.cdf(0.0) / tail).clamp(max=1), torch.ones_like(value)
-            shortfall = integral(chunk, lambda cdf, x: cdf(x) / tail, edges, *ends)
+            last = torch.ones_like(value)
+            shortfall = integral(
+                chunk, lambda cdf, x: cdf(x) / tail, edges, first, last
+            )
             return (value - shortfall).clamp(min=0)
 
-        return self.mean() if tail == 1 else self._in_chunks(compute)
+        return self._in_chunks(compute)
 
     def expected_time(self, floor: float) -> Tensor:
         """Return E[1 / max(λ, floor)], the expected time relative to that at λ = 1.
@@ -175,19 +188,17 @@ class TraversabilityDistribution(Batch, ABC):
         def in_tail(probabilities: Tensor) -> Tensor:
             return (probabilities / tail).clamp(max=1)
 
+        def cdf_of_time(cdf: Callable[[Tensor], Tensor], time: Tensor) -> Tensor:
+            return in_tail(cdf(1 / time))
+
         def compute(chunk: Self) -> Tensor:
             exponents = torch.linspace(
                 0, 1, N_INTERVALS + 1, dtype=torch.float64, device=chunk.device
             )
             times = (floor**-exponents).view(-1, 1, 1, 1).expand(-1, *chunk.shape)
-            return 1 + integral(
-                chunk,
-                lambda cdf, time: in_tail(cdf(1 / time)),
-                times,
-                in_tail(chunk.cdf_limits(1.0)[0]),
-                in_tail(chunk.cdf(floor)),
-                rounds=_ROUNDS_OF_TIME,
-            )
+            first = in_tail(chunk.cdf_limits(1.0)[0])
+            last = in_tail(chunk.cdf(floor))
+            return 1 + integral(chunk, cdf_of_time, times, first, last, _ROUNDS_OF_TIME)
 
         return self._in_chunks(compute)
 
@@ -197,14 +208,17 @@ class TraversabilityDistribution(Batch, ABC):
         Args:
             value: traversability in [0, 1].
         """
-        return (1 - self._exact().cdf_limits(value)[0].double()).to(self.dtype)
+        below = self._exact().cdf_limits(value)[0].double()
+        return (1 - below).to(self.dtype)
 
     def spread(self) -> Tensor:
         """Return half the distance of the 16 % and 84 % quantiles, shape [*B, H, W].
 
         For a normal distribution it is σ.
         """
-        return (self.quantile(0.84) - self.quantile(0.16)) / 2
+        high = self.quantile(0.84)
+        low = self.quantile(0.16)
+        return (high - low) / 2
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Return log density on (0, 1) and log probability mass at 0 and at 1.
@@ -213,7 +227,7 @@ class TraversabilityDistribution(Batch, ABC):
             value: observed traversability, shape [*B, H, W].
 
         Returns:
-            Values of shape [*B, H, W], NaN where there is no density; here, everywhere.
+            Values of shape [*B, H, W]; NaN without a density, as in the base class.
         """
         return torch.full(self.shape, math.nan, dtype=self.dtype, device=self.device)
 
@@ -230,11 +244,15 @@ class TraversabilityDistribution(Batch, ABC):
         def compute(chunk: Self, observed: Tensor) -> Tensor:
             below, at = chunk.cdf_limits(observed)
             edges = edges_between(torch.zeros_like(observed), observed)
-            ends = chunk.cdf(0.0).square(), below.square()
-            lower = integral(chunk, lambda cdf, x: cdf(x).square(), edges, *ends)
+            first = chunk.cdf(0.0).square()
+            last = below.square()
+            lower = integral(chunk, lambda cdf, x: cdf(x).square(), edges, first, last)
             edges = edges_between(observed, 1.0)
-            ends = (1 - at).square(), (1 - chunk.cdf_limits(1.0)[0]).square()
-            upper = integral(chunk, lambda cdf, x: (1 - cdf(x)).square(), edges, *ends)
+            first = (1 - at).square()
+            last = (1 - chunk.cdf_limits(1.0)[0]).square()
+            upper = integral(
+                chunk, lambda cdf, x: (1 - cdf(x)).square(), edges, first, last
+            )
             return lower + upper
 
         scores = self._in_chunks(compute, observed.double().clamp(0, 1))
@@ -252,7 +270,8 @@ class TraversabilityDistribution(Batch, ABC):
         Returns:
             λ in [0, 1], shape [*B, H, W].
         """
-        return self.quantile(torch.special.ndtr(normal.double())).to(self.dtype)
+        rank = torch.special.ndtr(normal.double())
+        return self.quantile(rank).to(self.dtype)
 
     def to_normal(self, value: Tensor | float) -> tuple[Tensor, Tensor]:
         """Return the interval of standard normal scores that `from_normal` maps to λ.
@@ -263,12 +282,13 @@ class TraversabilityDistribution(Batch, ABC):
             value: traversability, a number or shape [*B, H, W].
 
         Returns:
-            Both ends, each of shape [*B, H, W]: equal where F is continuous, infinite
-            where an atom is at 0 or 1.
+            Both ends, each of shape [*B, H, W]. They are equal if F is continuous at
+            the value, and infinite at atoms at 0 and 1.
         """
         lower, upper = self._exact().cdf_limits(value)
-        lower_score = torch.special.ndtri(lower.double()).to(self.dtype)
-        return lower_score, torch.special.ndtri(upper.double()).to(self.dtype)
+        lower_score = torch.special.ndtri(lower.double())
+        upper_score = torch.special.ndtri(upper.double())
+        return lower_score.to(self.dtype), upper_score.to(self.dtype)
 
     def at(self, cells: Tensor) -> Self:
         """Return the distribution of N selected cells as a map of one row, [1, N].
@@ -280,25 +300,27 @@ class TraversabilityDistribution(Batch, ABC):
         member, row, column = flat.nonzero(as_tuple=True)
 
         def select(values: Tensor) -> Tensor:
-            return values.movedim(0, -3)[..., member, row, column].unsqueeze(-2)
+            maps = values.movedim(0, -3)
+            return maps[..., member, row, column].unsqueeze(-2)
 
         return map_tensors(self._in_members(), select)
 
     def differs(
-        self, other: "TraversabilityDistribution", tolerance: float = 0.0
+        self, distribution: "TraversabilityDistribution", tolerance: float = 0.0
     ) -> Tensor:
         """Return a mask of cells whose parameters differ, bool, shape [*B, H, W].
 
         Args:
-            other: distribution of the same shape; if it is of another kind, all cells
-                differ.
-            tolerance: tolerance of the parameters.
+            distribution: distribution of the same shape. If its class or its
+                components differ, all cells differ.
+            tolerance: maximum difference of equal parameters.
         """
         n_batch = len(self.shape) - 2
         changed = torch.zeros(self.shape, dtype=torch.bool, device=self.device)
-        if not _are_alike(self, other):
+        if not have_same_structure(self, distribution):
             return ~changed
-        for first, second in zip(tensors_of(self), tensors_of(other), strict=True):
+        pairs = zip(tensors_of(self), tensors_of(distribution), strict=True)
+        for first, second in pairs:
             exceeds = (first - second).abs() > tolerance
             if exceeds.ndim > len(self.shape):  # has a component dimension
                 exceeds = exceeds.flatten(n_batch, -3).any(n_batch)
@@ -306,22 +328,25 @@ class TraversabilityDistribution(Batch, ABC):
         return changed
 
     def replaced(
-        self, cells: Tensor, other: "TraversabilityDistribution"
+        self, cells: Tensor, replacement: "TraversabilityDistribution"
     ) -> "TraversabilityDistribution":
         """Return the distribution with selected cells of another.
 
         Args:
-            cells: mask of the cells, bool, shape [*B, H, W].
-            other: distribution with parameters of the same shapes.
+            cells: mask of the cells to replace, bool, shape [*B, H, W].
+            replacement: distribution with parameters of the same shapes.
         """
         n_batch = len(self.shape) - 2
 
+        batch_shape = cells.shape[:n_batch]
+        map_shape = cells.shape[n_batch:]
+
         def put(old: Tensor, new: Tensor) -> Tensor:
             components = [1] * (old.ndim - cells.ndim)
-            batch, map_shape = cells.shape[:n_batch], cells.shape[n_batch:]
-            return torch.where(cells.view(*batch, *components, *map_shape), new, old)
+            mask = cells.view(*batch_shape, *components, *map_shape)
+            return torch.where(mask, new, old)
 
-        result: TraversabilityDistribution = map_tensors(self, put, other)
+        result: TraversabilityDistribution = map_tensors(self, put, replacement)
         return result
 
     def class_probabilities(self, count: int) -> Tensor:
@@ -351,24 +376,28 @@ class TraversabilityDistribution(Batch, ABC):
 
     def _exact(self) -> Self:
         """Return the distribution in float64."""
-        return map_tensors(
-            self,
-            lambda values: values.double() if values.is_floating_point() else values,
-        )
+
+        def exact(values: Tensor) -> Tensor:
+            return values.double() if values.is_floating_point() else values
+
+        return map_tensors(self, exact)
 
     def _in_members(self) -> Self:
         """Return the distribution with a single leading dimension."""
         n_batch = len(self.shape) - 2
-        return map_tensors(
-            self, lambda values: values.reshape(-1, *values.shape[n_batch:])
-        )
+
+        def flatten(values: Tensor) -> Tensor:
+            return values.reshape(-1, *values.shape[n_batch:])
+
+        return map_tensors(self, flatten)
 
     def _in_chunks(self, compute: Callable[..., Tensor], *layers: Tensor) -> Tensor:
         """Apply a function in chunks of cells, to limit memory.
 
         Args:
             compute: function of a distribution of shape [b, h, w] in float64 and layers
-                of that shape; returns values of that shape, each of its cell only.
+                of that shape. It returns values of that shape, and the value of a cell
+                depends only on this cell.
             layers: further arguments, each of shape [*B, H, W].
 
         Returns:
@@ -389,25 +418,15 @@ class TraversabilityDistribution(Batch, ABC):
                 rows = []
                 for top in range(0, height, n_rows):
                     band = slice(top, top + n_rows)
-                    chunk = map_tensors(maps, lambda values, b=band: values[..., b, :])
+                    chunk = map_tensors(maps, partial(_rows_of, band=band))
                     chunk_layers = [layer[members, band] for layer in flat_layers]
                     rows.append(compute(chunk, *chunk_layers))
                 results.append(torch.cat(rows, dim=1))
             return torch.cat(results).view(self.shape).to(self.dtype)
 
 
-def _are_alike(first: Any, second: Any) -> bool:
-    """Return whether two predictions are equal except for values of tensors."""
-    if isinstance(first, Tensor) and isinstance(second, Tensor):
-        return first.shape == second.shape
-    if isinstance(first, tuple) and isinstance(second, tuple):
-        return len(first) == len(second) and all(map(_are_alike, first, second))
-    if isinstance(first, Batch) and type(first) is type(second):
-        return all(
-            _are_alike(getattr(first, field.name), getattr(second, field.name))
-            for field in fields(cast(Any, first))
-        )
-    return bool(first == second)
+def _rows_of(values: Tensor, band: slice) -> Tensor:
+    return values[..., band, :]
 
 
 def tail_of(level: float) -> float:

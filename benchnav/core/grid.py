@@ -1,8 +1,9 @@
 """Grid of a map: conversion between positions and cells.
 
 Maps are indexed [row = y, column = x]. Cell (i, j) is centred at
-((j + ½)·res, (i + ½)·res). A position belongs to the cell that contains it. Space
-outside the map is not free. Letters in shapes: B maps, H×W cells.
+((j + ½)·res, (i + ½)·res). A position belongs to the cell that contains it. Positions
+outside the map are not free. Letters in shapes: B maps, H×W cells, *S any dimensions
+of positions, M edges.
 
 PyTorch is imported within functions, because generating and listing datasets does not
 need it.
@@ -51,7 +52,7 @@ class Grid:
         )
         expect(
             0 < self.resolution_m < float("inf"),
-            f"`resolution_m` > 0, got {self.resolution_m}.",
+            f"`resolution_m` > 0 and finite, got {self.resolution_m}.",
         )
 
     @property
@@ -62,7 +63,9 @@ class Grid:
     @property
     def extent_m(self) -> tuple[float, float]:
         """Lengths of the map along x and y in metres."""
-        return self.width * self.resolution_m, self.height * self.resolution_m
+        along_x = self.width * self.resolution_m
+        along_y = self.height * self.resolution_m
+        return along_x, along_y
 
     def maps_in(self, cells: int) -> int:
         """Return how many maps fit into a number of cells, at least 1."""
@@ -71,7 +74,9 @@ class Grid:
     def contains(self, x_m: "Tensor", y_m: "Tensor") -> "Tensor":
         """Return a mask of the positions on the map, bool, shape of `x_m`."""
         extent_x, extent_y = self.extent_m
-        return (x_m >= 0) & (x_m < extent_x) & (y_m >= 0) & (y_m < extent_y)
+        in_x = (x_m >= 0) & (x_m < extent_x)
+        in_y = (y_m >= 0) & (y_m < extent_y)
+        return in_x & in_y
 
     def cell_of(self, x_m: "Tensor", y_m: "Tensor") -> "tuple[Tensor, Tensor]":
         """Return the cell of each position; off the map, the nearest border cell.
@@ -97,7 +102,7 @@ class Grid:
         """Return maps padded by one cell on each side and flattened, for `lookup`.
 
         Args:
-            maps: shape [*B, H, W].
+            maps: maps of any dtype, shape [*B, H, W].
             outside: value off the map.
 
         Returns:
@@ -124,16 +129,19 @@ class Grid:
         row = (y_m / self.resolution_m).floor() + 1
         column = (x_m / self.resolution_m).floor() + 1
         # `clamp(0, …)` would keep NaN. A comparison with NaN is false and yields 0.
-        row = torch.where(row > 0, row, 0).clamp(max=self.height + 1).long()
-        column = torch.where(column > 0, column, 0).clamp(max=self.width + 1).long()
-        index = (row * (self.width + 2) + column).reshape(len(padded), -1)
-        return torch.gather(padded, 1, index).reshape(x_m.shape)
+        row = torch.where(row > 0, row, 0)
+        row = row.clamp(max=self.height + 1).long()
+        column = torch.where(column > 0, column, 0)
+        column = column.clamp(max=self.width + 1).long()
+        index = row * (self.width + 2) + column
+        values = torch.gather(padded, 1, index.reshape(len(padded), -1))
+        return values.reshape(x_m.shape)
 
 
 def is_azimuth(layer: str) -> bool:
-    """Return whether a layer, by its name, contains directions.
+    """Return whether the name of a layer says that it contains directions.
 
-    They are in degrees from +x towards +y and rotate with the map.
+    Directions are in degrees from +x towards +y and rotate with the map.
     """
     return layer.endswith("_azimuth_deg")
 
@@ -149,9 +157,11 @@ def outline(region: np.ndarray, resolution_m: float) -> np.ndarray:
         Both ends (x, y) of each edge in metres, float32, shape [M, 2, 2].
     """
     padded = np.pad(region, 1)
-    rows, columns = np.nonzero(np.diff(padded[:, 1:-1], axis=0))
+    changes_down = np.diff(padded[:, 1:-1], axis=0)
+    rows, columns = np.nonzero(changes_down)
     along_x = np.stack((columns, rows, columns + 1, rows), axis=1)
-    rows, columns = np.nonzero(np.diff(padded[1:-1], axis=1))
+    changes_across = np.diff(padded[1:-1], axis=1)
+    rows, columns = np.nonzero(changes_across)
     along_y = np.stack((columns, rows, columns, rows + 1), axis=1)
     edges = np.concatenate((along_x, along_y)).reshape(-1, 2, 2)
     return (edges * resolution_m).astype(np.float32)

@@ -1,10 +1,10 @@
 """The 8-connected graph of a map's cells, with exact shortest paths for batches.
 
 A diagonal step between two free cells is closed if both cells next to it are not free,
-since they touch at the corner that the step would cross. Cells that are connected by
-steps are therefore connected over shared edges. Each map has its own compiled Dijkstra
-search: a single search of the batch takes twice as long, since its heap exceeds the
-processor's cache.
+since these touch at the corner that the step would cross. Cells that are connected by
+steps are therefore also connected across shared edges. Each map has its own compiled
+Dijkstra search: a single search of the batch takes twice as long, since its heap
+exceeds the processor's cache.
 Letters in shapes: B maps; H×W cells, with flat index row·W + column; E edges.
 """
 
@@ -36,10 +36,14 @@ def neighbour_pairs(height: int, width: int) -> tuple[ndarray, ndarray, ndarray]
     indices = np.arange(height * width).reshape(height, width)
     padded = np.pad(indices, 1, constant_values=NO_CELL)
     # The 3×3 cells around each cell.
-    windows = np.lib.stride_tricks.sliding_window_view(padded, (3, 3)).reshape(-1, 9)
-    lengths = np.hypot(*(np.indices((3, 3)) - 1)).ravel()
-    target, offset = np.nonzero((windows != NO_CELL) & (lengths > 0))
-    return windows[target, offset], target, lengths[offset]
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (3, 3))
+    neighbours = windows.reshape(-1, 9)
+    row_offset, column_offset = np.indices((3, 3)) - 1
+    lengths = np.hypot(row_offset, column_offset).ravel()
+    is_edge = (neighbours != NO_CELL) & (lengths > 0)
+    target, offset = np.nonzero(is_edge)
+    source = neighbours[target, offset]
+    return source, target, lengths[offset]
 
 
 def squeezes(
@@ -48,7 +52,7 @@ def squeezes(
     """Return a mask of diagonal steps between free cells past two non-free cells.
 
     Args:
-        free_of: function from flat indices to whether the cells are free, bool.
+        free_of: function that returns whether the cells of flat indices are free, bool.
         source: flat index of the cell that each step leaves, an array or a tensor.
         target: flat index of the cell that it enters, at most one row and one column
             away, of the same shape.
@@ -59,8 +63,8 @@ def squeezes(
     """
     first_corner = source // width * width + target % width
     second_corner = target // width * width + source % width
-    is_free = free_of(source) & free_of(target)
-    return is_free & ~free_of(first_corner) & ~free_of(second_corner)
+    ends_free = free_of(source) & free_of(target)
+    return ends_free & ~free_of(first_corner) & ~free_of(second_corner)
 
 
 def cost_to_go(
@@ -80,27 +84,29 @@ def cost_to_go(
         without a path, int64, shape [B, H·W].
     """
     batch = len(goals)
-    n_cells = shape[0] * shape[1]
+    height, width = shape
+    n_cells = height * width
     # The search starts at the goals, so edges are reversed: rows are their targets.
-    source, target, _ = neighbour_pairs(*shape)
+    source, target, _ = neighbour_pairs(height, width)
     columns = source.astype(np.int32)
-    rows = np.searchsorted(target, np.arange(n_cells + 1)).astype(np.int32)
-    graph = csr_array((np.empty(len(source)), columns, rows), shape=(n_cells, n_cells))
+    row_indices = np.arange(n_cells + 1)
+    row_starts = np.searchsorted(target, row_indices).astype(np.int32)
+    matrix = np.empty(len(source)), columns, row_starts
+    graph = csr_array(matrix, shape=(n_cells, n_cells))
     cost = np.empty((batch, n_cells))
     next_cell = np.empty((batch, n_cells), np.int64)
     # A finite limit excludes infinite edges.
+    limit = np.finfo(np.float64).max
     search = partial(
-        dijkstra,
-        graph,
-        min_only=True,
-        return_predecessors=True,
-        limit=np.finfo(np.float64).max,
+        dijkstra, graph, min_only=True, return_predecessors=True, limit=limit
     )
     maps = zip(edge_costs, goals.reshape(batch, n_cells), strict=True)
-    for b, (map_costs, map_goals) in enumerate(maps):
+    for index, (map_costs, map_goals) in enumerate(maps):
         graph.data = map_costs
-        cost[b], next_cell[b], _ = search(indices=np.flatnonzero(map_goals))
-    return cost.reshape(batch, *shape), np.where(next_cell >= 0, next_cell, NO_CELL)
+        goal_cells = np.flatnonzero(map_goals)
+        cost[index], next_cell[index], _ = search(indices=goal_cells)
+    next_cell = np.where(next_cell >= 0, next_cell, NO_CELL)
+    return cost.reshape(batch, height, width), next_cell
 
 
 def travel_time_costs(
@@ -109,13 +115,15 @@ def travel_time_costs(
     resolution_m: float,
     closed_corners: bool = True,
 ) -> ndarray:
-    """Return the time of each edge at a commanded 1 m/s, half of it in either cell.
+    """Return the travel time of each edge at a commanded 1 m/s.
+
+    Half of an edge is in either cell.
 
     Args:
         traversability: λ in [0, 1], shape [B, H, W].
         free: mask of free cells, bool, shape [B, H, W].
         resolution_m: edge length of a cell in metres.
-        closed_corners: whether `squeezes` are closed, as since version 1.2.
+        closed_corners: whether `squeezes` are closed, the rule since version 1.2.
 
     Returns:
         Seconds, infinite for closed edges and edges of non-free cells, float64, shape
@@ -124,11 +132,14 @@ def travel_time_costs(
     batch, height, width = traversability.shape
     source, target, length = neighbour_pairs(height, width)
     is_free = free.reshape(batch, -1)
+    speed = traversability.reshape(batch, -1)
     pace = np.full((batch, height * width), np.inf)
-    np.divide(1.0, traversability.reshape(batch, -1), out=pace, where=is_free)
-    both_paces = np.take(pace, source, axis=1) + np.take(pace, target, axis=1)
-    costs = 0.5 * length * resolution_m * both_paces
+    np.divide(1.0, speed, out=pace, where=is_free)
+    source_pace = np.take(pace, source, axis=1)
+    target_pace = np.take(pace, target, axis=1)
+    costs = 0.5 * length * resolution_m * (source_pace + target_pace)
     if closed_corners:
         free_of = partial(np.take, is_free, axis=1)
-        costs[squeezes(free_of, source, target, width)] = np.inf
+        is_closed = squeezes(free_of, source, target, width)
+        costs[is_closed] = np.inf
     return costs

@@ -21,7 +21,6 @@ Letters in shapes: K components; H×W cells; N cells; *B any leading dimensions.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -35,6 +34,7 @@ from benchnav.core.cvar import (
 )
 from benchnav.core.distribution import TraversabilityDistribution, check_floor, tail_of
 from benchnav.core.errors import ConfigError
+from benchnav.core.mixture_density import component_log_prob
 from benchnav.core.mixture_integrals import (
     MIN_STD,
     component_integral,
@@ -43,8 +43,8 @@ from benchnav.core.mixture_integrals import (
     squared_integral,
 )
 
-_UNDER_1 = 1 - 2**-53  # the largest float64 below 1
-_DEEP_TAIL = 1e-6  # below it, F must be exact relative to itself
+_BELOW_1 = 1 - 2**-53  # the largest float64 below 1
+_DEEP_TAIL = 1e-6  # for smaller tails, the relative error of F must be small
 _NUMBERS_AT_ONCE = 2**16  # of each parameter: half a MiB in float64
 _NUMBERS_ON_A_GPU = 2**24  # on a GPU, few large chunks are faster than many small ones
 
@@ -55,12 +55,11 @@ class TraversabilityMixture(TraversabilityDistribution):
 
     Args:
         weights: probability of each component, summing to 1 over K up to rounding (they
-            are normalised), shape [*B, K, H, W].
+            are normalised in computations), shape [*B, K, H, W].
         means: component means before clipping, shape [*B, K, H, W].
         stds: component standard deviations before clipping, ≥ 0, shape [*B, K, H, W].
-        group: index of the terrain class of each of K components, −1 for components
-            without a class, such as those of unobserved cells; None if there are no
-            classes.
+        group: index of the terrain class of each of K components; −1 for components
+            without a class, as in unobserved cells; None if no component has a class.
 
     Raises:
         ConfigError: If the shapes differ or have fewer than three dimensions, or
@@ -74,22 +73,25 @@ class TraversabilityMixture(TraversabilityDistribution):
 
     def __post_init__(self) -> None:
         """Validate the shapes."""
-        is_same = self.weights.shape == self.means.shape == self.stds.shape
-        if not is_same or self.weights.ndim < 3:
+        weights = self.weights.shape
+        means = self.means.shape
+        stds = self.stds.shape
+        is_same = weights == means == stds
+        if not is_same or len(weights) < 3:
             raise ConfigError(
                 "Expected `weights`, `means` and `stds` of one shape [*B, K, H, W], "
-                f"got {list(self.weights.shape)}, {list(self.means.shape)} and "
-                f"{list(self.stds.shape)}."
+                f"got {list(weights)}, {list(means)} and {list(stds)}."
             )
-        if self.group is not None and len(self.group) != self.weights.shape[-3]:
+        n_components = weights[-3]
+        if self.group is not None and len(self.group) != n_components:
             raise ConfigError(
-                "Expected `group` to name the class of each of "
-                f"{self.weights.shape[-3]} components, got {len(self.group)}."
+                f"Expected `group` to name the class of each of {n_components} "
+                f"components, got {len(self.group)}."
             )
 
     @property
     def shape(self) -> torch.Size:
-        """[*B, H, W]."""
+        """Shape of the maps, [*B, H, W]."""
         return self.weights.select(-3, 0).shape
 
     def cdf(self, value: Tensor | float) -> Tensor:
@@ -101,21 +103,24 @@ class TraversabilityMixture(TraversabilityDistribution):
         Returns:
             Probability, shape [*B, H, W].
         """
-        value = torch.as_tensor(value, dtype=torch.float64, device=self.weights.device)
+        value = self._as_tensor(value)
         inside = self._unclipped_cdf(value)
         upper = torch.where(value >= 1, 1.0, inside)
-        return torch.where(value < 0, 0.0, upper).to(self.weights.dtype)
+        return torch.where(value < 0, 0.0, upper).to(self.dtype)
 
     def cdf_limits(self, value: Tensor | float) -> tuple[Tensor, Tensor]:
         """Return P(λ < value) and P(λ ≤ value), each of shape [*B, H, W].
 
         They differ only at 0 and 1.
         """
-        value = torch.as_tensor(value, dtype=torch.float64, device=self.weights.device)
-        inside = self._unclipped_cdf(value.clamp(max=_UNDER_1)).to(self.weights.dtype)
+        value = self._as_tensor(value)
+        at = value.clamp(max=_BELOW_1)
+        inside = self._unclipped_cdf(at).to(self.dtype)
         lower = torch.where(value > 1, 1.0, inside)
+        lower = torch.where(value <= 0, 0.0, lower)
         upper = torch.where(value >= 1, 1.0, inside)
-        return torch.where(value <= 0, 0.0, lower), torch.where(value < 0, 0.0, upper)
+        upper = torch.where(value < 0, 0.0, upper)
+        return lower, upper
 
     @property
     def searched(self) -> bool:
@@ -124,10 +129,9 @@ class TraversabilityMixture(TraversabilityDistribution):
 
     def quantile(self, probability: Tensor | float) -> Tensor:
         """Return the quantiles of λ, exact at 0 and 1, shape [*B, H, W]."""
-        device = self.weights.device
-        u = torch.as_tensor(probability, dtype=torch.float64, device=device)
-        u = u.expand(self.shape)
-        return torch.where(u <= 0, 0.0, self._in_cells(value_at_risk, u, deep=True))
+        u = self._as_tensor(probability).expand(self.shape)
+        quantiles = self._in_cells(value_at_risk, u, deep=True)
+        return torch.where(u <= 0, 0.0, quantiles)
 
     def mean(self) -> Tensor:
         """Return E[λ], shape [*B, H, W]."""
@@ -169,9 +173,8 @@ class TraversabilityMixture(TraversabilityDistribution):
         """
         if value <= 0:
             return torch.ones_like(self.weights.select(-3, 0))
-        device = self.weights.device
-        at = torch.tensor(value, dtype=torch.float64, device=device)
-        return (1 - self._unclipped_cdf(at)).to(self.weights.dtype)
+        below = self._unclipped_cdf(self._as_tensor(value))
+        return (1 - below).to(self.dtype)
 
     def expected_time(self, floor: float) -> Tensor:
         """Return E[1 / max(λ, floor)], the expected time relative to that at λ = 1.
@@ -215,10 +218,12 @@ class TraversabilityMixture(TraversabilityDistribution):
             Scores of shape [*B, H, W]; 0 is perfect.
         """
         at = observed.double()
-        above = self._integrated_cdf(torch.ones_like(at)) - self._integrated_cdf(at)
+        up_to_1 = self._integrated_cdf(torch.ones_like(at))
+        above = up_to_1 - self._integrated_cdf(at)
         parameters = (self.weights, self.means, self.stds)
         squared = squared_integral(*(values.movedim(-3, 0) for values in parameters))
-        return (squared - 2 * above + 1 - at).clamp(min=0).to(observed.dtype)
+        score = squared - 2 * above + 1 - at
+        return score.clamp(min=0).to(observed.dtype)
 
     def from_normal(self, normal: Tensor) -> Tensor:
         """Return λ of standard normal scores, clip(F⁻¹(Φ(z)), 0, 1).
@@ -233,14 +238,17 @@ class TraversabilityMixture(TraversabilityDistribution):
             λ in [0, 1], shape [*B, H, W].
         """
         if self.weights.shape[-3] == 1:
-            return (self.means.squeeze(-3) + self.stds.squeeze(-3) * normal).clamp(0, 1)
+            mean = self.means.squeeze(-3)
+            std = self.stds.squeeze(-3)
+            unclipped = mean + std * normal
+            return unclipped.clamp(0, 1)
         return self._in_cells(value_at_risk, normal_cdf(normal.double()))
 
     def to_normal(self, value: Tensor | float) -> tuple[Tensor, Tensor]:
         """Return the interval of standard normal scores that `from_normal` maps to λ.
 
-        Its ends are equal and finite in (0, 1), however improbable λ is. The interval
-        extends from −∞ at 0, and to ∞ at 1.
+        Its ends are equal and finite for λ in (0, 1), however improbable λ is. The
+        interval extends from −∞ for λ = 0, and to ∞ for λ = 1.
 
         Args:
             value: traversability, a number or shape [*B, H, W].
@@ -248,17 +256,19 @@ class TraversabilityMixture(TraversabilityDistribution):
         Returns:
             Both ends, each of shape [*B, H, W].
         """
-        value = torch.as_tensor(value, dtype=torch.float64, device=self.weights.device)
+        value = self._as_tensor(value)
         weights, means, stds = self._parameters()
-        z = ((value.unsqueeze(-3) if value.ndim else value) - means) / stds
+        z = (_with_components(value) - means) / stds
         if z.shape[-3] == 1:
             score = z.squeeze(-3)
         else:
             # The smaller of F and 1 − F has no rounding errors in either tail.
             tail = normal_cdf(-z.abs())
             is_low = z < 0
-            below = (weights * torch.where(is_low, tail, 1 - tail)).sum(-3)
-            above = (weights * torch.where(~is_low, tail, 1 - tail)).sum(-3)
+            component_below = torch.where(is_low, tail, 1 - tail)
+            component_above = torch.where(~is_low, tail, 1 - tail)
+            below = (weights * component_below).sum(-3)
+            above = (weights * component_above).sum(-3)
             tiny = torch.finfo(torch.float64).tiny
             smaller = torch.minimum(below, above).clamp(min=tiny)
             sign = torch.where(below <= above, 1.0, -1.0)
@@ -267,7 +277,7 @@ class TraversabilityMixture(TraversabilityDistribution):
         lower = torch.where(value <= 0, -math.inf, lower)
         upper = torch.where(value >= 1, math.inf, score)
         upper = torch.where(value < 0, -math.inf, upper)
-        return lower.to(self.weights.dtype), upper.to(self.weights.dtype)
+        return lower.to(self.dtype), upper.to(self.dtype)
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Return log density on (0, 1), log mass at 0 and at 1, and −∞ elsewhere.
@@ -286,13 +296,13 @@ class TraversabilityMixture(TraversabilityDistribution):
         is_end = (value <= 0) | (value >= 1)
         total = torch.where(is_end, total.clamp(max=0), total)
         is_outside = (value < 0) | (value > 1)
-        return torch.where(is_outside, -math.inf, total).to(self.weights.dtype)
+        return torch.where(is_outside, -math.inf, total).to(self.dtype)
 
     def class_probabilities(self, count: int) -> Tensor:
         """Return the probability of each of `count` terrain classes.
 
-        It is the sum of the weights of its components. Without `group` the components
-        are the classes.
+        The probability of a class is the sum of the weights of its components. Without
+        `group`, each component is a class.
 
         Returns:
             Probabilities of shape [*B, count, H, W]; the weights themselves if each
@@ -304,40 +314,40 @@ class TraversabilityMixture(TraversabilityDistribution):
         # The last index collects components without a class.
         total = weights.new_zeros(count + 1, *weights.shape[1:])
         indices = [count if index < 0 else index for index in self.group]
-        total.index_add_(0, torch.tensor(indices, device=weights.device), weights)
+        class_index = torch.tensor(indices, device=weights.device)
+        total.index_add_(0, class_index, weights)
         return total[:count].movedim(0, -3)
 
     def most_likely(self) -> "TraversabilityMixture":
         """Return the mixture given the most likely terrain class of each cell.
 
-        It has all components of the class. This is the single-class option of the
-        paper.
+        It contains all components of that class. This is the single-class option of
+        the paper.
 
         Raises:
             ConfigError: If the components have no classes.
         """
         if self.weights.shape[-3] == 1:
-            return TraversabilityMixture(
-                torch.ones_like(self.means), self.means, self.stds, (0,)
-            )
+            return _single_component(self.means, self.stds)
         if self.group is None:
             raise ConfigError(
                 "Expected components that belong to terrain classes for the "
                 "single-class option, got a mixture without `group`. Take another risk "
-                "measure, or give the mixture its `group`."
+                "measure, or set `group`."
             )
-        # Components without a class form one of their own: in unobserved cells there
-        # are no others.
+        # Components without a class count as a class of their own, since unobserved
+        # cells have no others.
         no_class = max(self.group) + 1
         group = tuple(no_class if index < 0 else index for index in self.group)
         grouped = replace(self, group=group)
         best = grouped.class_probabilities(no_class + 1).argmax(-3, keepdim=True)
-        is_best = torch.tensor(group, device=best.device).view(-1, 1, 1) == best
+        component_class = torch.tensor(group, device=best.device)
+        is_best = component_class.view(-1, 1, 1) == best
         if len(set(group)) == len(group):  # a single component per class
             index = is_best.int().argmax(-3, keepdim=True)
             means = torch.gather(self.means, -3, index)
             stds = torch.gather(self.stds, -3, index)
-            return TraversabilityMixture(torch.ones_like(means), means, stds, (0,))
+            return _single_component(means, stds)
         weights = torch.where(is_best, self.weights, 0.0)
         return replace(self, weights=weights / weights.sum(-3, keepdim=True))
 
@@ -347,18 +357,16 @@ class TraversabilityMixture(TraversabilityDistribution):
         """Apply a function in chunks of cells that fit in the processor's cache.
 
         Args:
-            compute: function of `Cells` and layers of N cells; returns numbers of shape
-                [N], each of its cell only.
+            compute: function of `Cells` and layers of N cells. It returns values of
+                shape [N], and the value of a cell depends only on this cell.
             layers: further arguments, each of shape [*B, H, W].
             deep: option of `Cells`.
 
         Returns:
             Values of shape [*B, H, W], in the dtype of the parameters.
         """
-        parameters = [
-            values.movedim(-3, 0).flatten(1)
-            for values in (self.weights, self.means, self.stds)
-        ]
+        all_parameters = (self.weights, self.means, self.stds)
+        parameters = [values.movedim(-3, 0).flatten(1) for values in all_parameters]
         is_cpu = self.weights.device.type == "cpu"
         numbers = _NUMBERS_AT_ONCE if is_cpu else _NUMBERS_ON_A_GPU
         size = max(1, numbers // len(parameters[0]))
@@ -367,26 +375,31 @@ class TraversabilityMixture(TraversabilityDistribution):
         results = []
         for weights, means, stds, *others in zip(*chunks, strict=True):
             weights = weights.double()
+            normalised = weights / added(weights)
             scales = math.sqrt(0.5) / stds.double().clamp(min=MIN_STD)
-            cells = Cells(weights / added(weights), means.double(), scales, deep)
+            cells = Cells(normalised, means.double(), scales, deep)
             results.append(compute(cells, *others))
-        shape = self.weights.select(-3, 0).shape
-        return torch.cat(results).view(shape).to(self.weights.dtype)
+        return torch.cat(results).view(self.shape).to(self.dtype)
 
     def _in_tail(
         self, compute: Callable[[Cells, Tensor], Tensor], tail: float
     ) -> Tensor:
         """Apply a function of cells and of the tail's probability."""
-        return self._in_cells(
-            lambda cells: compute(cells, torch.full_like(cells.means[0], tail)),
-            deep=tail < _DEEP_TAIL,
-        )
+
+        def compute_tail(cells: Cells) -> Tensor:
+            probability = torch.full_like(cells.means[0], tail)
+            return compute(cells, probability)
+
+        return self._in_cells(compute_tail, deep=tail < _DEEP_TAIL)
+
+    def _as_tensor(self, value: Tensor | float) -> Tensor:
+        return torch.as_tensor(value, dtype=torch.float64, device=self.device)
 
     def _parameters(self) -> tuple[Tensor, Tensor, Tensor]:
         weights = self.weights.double()
-        weights = weights / weights.sum(-3, keepdim=True)
+        normalised = weights / weights.sum(-3, keepdim=True)
         stds = self.stds.double().clamp(min=MIN_STD)
-        return weights, self.means.double(), stds
+        return normalised, self.means.double(), stds
 
     def _integrated_cdf(self, value: Tensor) -> Tensor:
         """Return ∫_{−∞}^value F before clipping, float64, shape [*B, H, W]."""
@@ -396,44 +409,15 @@ class TraversabilityMixture(TraversabilityDistribution):
 
     def _unclipped_cdf(self, value: Tensor) -> Tensor:
         weights, means, stds = self._parameters()
-        at = value.unsqueeze(-3) if value.ndim else value
-        return (weights * normal_cdf((at - means) / stds)).sum(-3).clamp(0, 1)
+        z = (_with_components(value) - means) / stds
+        probability = (weights * normal_cdf(z)).sum(-3)
+        return probability.clamp(0, 1)
 
 
-class LogNormalCDF(torch.autograd.Function):
-    """log Φ(z) with the gradient φ/Φ as √(2/π) / erfcx(−z/√2).
-
-    The gradient of `torch.special.log_ndtr` subtracts two squares: in float32 its error
-    is 5 % at z = −10³, and it is invalid from −10⁴ on. Narrow components far from the
-    observation reach such z.
-    """
-
-    @staticmethod
-    def forward(context: Any, z: Tensor) -> Tensor:
-        """Return log Φ(z), of the shape of `z`."""
-        context.save_for_backward(z)
-        return torch.special.log_ndtr(z)
-
-    @staticmethod
-    def backward(context: Any, *gradients: Tensor) -> Tensor:
-        """Return the gradient with respect to z."""
-        (z,) = context.saved_tensors
-        scaled = gradients[0] * math.sqrt(2 / math.pi)
-        return scaled / torch.special.erfcx(-z / math.sqrt(2))
+def _with_components(value: Tensor) -> Tensor:
+    """Return a value with a dimension for the components, or a number unchanged."""
+    return value.unsqueeze(-3) if value.ndim else value
 
 
-def component_log_prob(means: Tensor, stds: Tensor, value: Tensor) -> Tensor:
-    """Return log density in (0, 1), and log mass at 0 and 1, of each component.
-
-    Args:
-        means: means before clipping, shape [*B, K, H, W].
-        stds: standard deviations before clipping, > 0, shape [*B, K, H, W].
-        value: λ, shape [*B, 1, H, W].
-
-    Returns:
-        Values of shape [*B, K, H, W].
-    """
-    z = (value - means) / stds
-    density = -0.5 * z**2 - stds.log() - 0.5 * math.log(2 * math.pi)
-    mass = LogNormalCDF.apply(torch.where(value <= 0, -means, means - 1) / stds)
-    return torch.where((value <= 0) | (value >= 1), mass, density)
+def _single_component(means: Tensor, stds: Tensor) -> TraversabilityMixture:
+    return TraversabilityMixture(torch.ones_like(means), means, stds, (0,))

@@ -22,27 +22,29 @@ _NARROW_STD = 0.03
 _NARROW_NODES = 32
 
 
-def expected_time(cells: Cells, floor: float, most: Tensor | float) -> Tensor:
-    """Return 1 / most + ∫ F / x² from `floor` to `most`, to within 1e-8, shape [N].
+def expected_time(cells: Cells, floor: float, upper: Tensor | float) -> Tensor:
+    """Return 1 / upper + ∫ F / x² from `floor` to `upper`, to within 1e-8, shape [N].
 
     Args:
         cells: mixtures of N cells.
         floor: lower limit, in (0, 1].
-        most: upper limit, a number or shape [N].
+        upper: upper limit, a number or shape [N].
     """
-    nodes = 28 + 8 * math.ceil(math.log(max(0.05 / floor, 1), 5))
+    n_nodes = 28 + 8 * math.ceil(math.log(max(0.05 / floor, 1), 5))
     # Outside [low, high] the CDF of a component is 0 or 1, and the integral of 1 / x²
     # has a closed form.
     reach = _REACH * math.sqrt(0.5) / cells.scales
-    low = (cells.means - reach).clamp(min=floor).clamp(max=most)
-    high = (cells.means + reach).clamp(min=floor).clamp(max=most)
+    low = (cells.means - reach).clamp(min=floor).clamp(max=upper)
+    high = (cells.means + reach).clamp(min=floor).clamp(max=upper)
     start = low.log()
     span = high.log() - start
-    time = 1 / most + (1 / high - 1 / most)
-    for node, weight in _legendre(nodes):
+    time = 1 / upper + (1 / high - 1 / upper)
+    for node, weight in _legendre(n_nodes):
         value = (start + span * node).exp_()
-        below = torch.erf((value - cells.means).mul_(cells.scales)).add_(1)
-        time.addcmul_(span * (0.5 * weight), below.div_(value))
+        z = (value - cells.means).mul_(cells.scales)
+        below = torch.erf(z).add_(1)
+        step = span * (0.5 * weight)
+        time.addcmul_(step, below.div_(value))
     return added(cells.weights * time).clamp(min=1)
 
 
@@ -50,8 +52,8 @@ def squared_integral(weights: Tensor, means: Tensor, stds: Tensor) -> Tensor:
     """Return ∫₀¹ F² of mixtures, float64, shape [*B, H, W].
 
     For components that are not narrow, F² is smooth, and Gauss-Legendre quadrature in
-    the dtype of the parameters suffices. A narrow component j adds its products with
-    all others k, integrated by parts:
+    the dtype of the parameters suffices. For a narrow component j, the products with
+    all others k are integrated by parts:
 
         ∫₀¹ Φ_j Φ_k dx = G_k(1) Φ_j(1) − ∫₀¹ G_k φ_j dx,    G_k(x) = ∫₀ˣ Φ_k,
 
@@ -70,18 +72,24 @@ def squared_integral(weights: Tensor, means: Tensor, stds: Tensor) -> Tensor:
     squared = torch.zeros_like(weights[0])
     total = wide.sum(0)
     for node, weight in _legendre(_CRPS_NODES):
-        weighted = torch.erf_((node - means) * narrowness).mul_(wide)
-        squared += weight * (0.5 * (total + weighted.sum(0))) ** 2
+        z = (node - means) * narrowness
+        weighted = torch.erf_(z).mul_(wide)
+        cdf = 0.5 * (total + weighted.sum(0))
+        squared += weight * cdf**2
     squared = squared.double()
     components = torch.arange(len(stds), device=stds.device)
     components = components.view(-1, *[1] * squared.ndim)
-    for index in narrow.flatten(1).any(1).nonzero().flatten().tolist():
+    narrow_indices = narrow.flatten(1).any(1).nonzero().flatten()
+    for index in narrow_indices.tolist():
         std = stds[index]
-        is_wider = ~narrow | (stds > std) | ((stds == std) & (components > index))
+        weight_of_j = weights[index]
+        # Of equally narrow components, the one with the smaller index counts as j.
+        is_later = (stds == std) & (components > index)
+        is_wider = ~narrow | (stds > std) | is_later
         factor = torch.where(is_wider, 2 * weights, 0).double()
-        factor[index] = weights[index]
+        factor[index] = weight_of_j
         product = _product_integral(means[index], std, means, stds, factor)
-        squared += torch.where(narrow[index], weights[index] * product, 0)
+        squared += torch.where(narrow[index], weight_of_j * product, 0)
     return squared
 
 
@@ -89,13 +97,16 @@ def component_integral(value: Tensor, means: Tensor, stds: Tensor) -> Tensor:
     """Return ∫_{−∞}^value of normal CDFs, float64, of shapes that broadcast."""
     stds = stds.double().clamp(min=MIN_STD)
     z = (value.double() - means.double()) / stds
-    density = torch.exp(-0.5 * z**2) / math.sqrt(2 * math.pi)
-    return stds * (z * torch.special.ndtr(z) + density)
+    return stds * (z * torch.special.ndtr(z) + _normal_density(z))
 
 
 def normal_cdf(z: Tensor) -> Tensor:
     """Return Φ(z), several times faster than `torch.special.ndtr`."""
     return 0.5 * torch.erfc(z * -math.sqrt(0.5))
+
+
+def _normal_density(z: Tensor) -> Tensor:
+    return torch.exp(-0.5 * z**2) / math.sqrt(2 * math.pi)
 
 
 def _product_integral(
@@ -105,10 +116,10 @@ def _product_integral(
 
     Args:
         mean: mean of a component, shape [*B, H, W].
-        std: its standard deviation, shape [*B, H, W].
+        std: standard deviation of the component, shape [*B, H, W].
         means: means of K components that are not narrower, shape [K, *B, H, W].
-        stds: their standard deviations, shape [K, *B, H, W].
-        factor: factor of each, shape [K, *B, H, W].
+        stds: standard deviations of the K components, shape [K, *B, H, W].
+        factor: factors of the K components, shape [K, *B, H, W].
 
     Returns:
         Integrals, float64, shape [*B, H, W].
@@ -118,17 +129,19 @@ def _product_integral(
     below = component_integral(torch.zeros_like(mean), means, stds)
 
     def integral(value: Tensor) -> Tensor:
-        return (factor * (component_integral(value, means, stds) - below)).sum(0)
+        from_0 = component_integral(value, means, stds) - below
+        return (factor * from_0).sum(0)
 
     low = (0.0 - mean) / std
     high = (1.0 - mean) / std
     total = integral(torch.ones_like(mean)) * normal_cdf(high)
     low = low.clamp(-_REACH, _REACH)
     high = high.clamp(-_REACH, _REACH)
+    width = high - low
     for node, weight in _legendre(_NARROW_NODES):
-        z = low + (high - low) * node
-        density = torch.exp(-0.5 * z**2) / math.sqrt(2 * math.pi)
-        total = total - weight * (high - low) * density * integral(mean + std * z)
+        z = low + width * node
+        term = weight * width * _normal_density(z) * integral(mean + std * z)
+        total = total - term
     return total
 
 
@@ -136,5 +149,6 @@ def _product_integral(
 def _legendre(count: int) -> list[tuple[float, float]]:
     """Return nodes and weights of Gauss-Legendre quadrature on [0, 1]."""
     nodes, weights = np.polynomial.legendre.leggauss(count)
-    scaled = 0.5 + 0.5 * nodes
-    return list(zip(scaled.tolist(), (0.5 * weights).tolist(), strict=True))
+    scaled_nodes = (0.5 + 0.5 * nodes).tolist()
+    scaled_weights = (0.5 * weights).tolist()
+    return list(zip(scaled_nodes, scaled_weights, strict=True))

@@ -1,10 +1,10 @@
 """Integrals of monotone functions of a CDF, cell by cell.
 
-A trapezium over an interval is off by at most half of its length times the change over
-it, whatever atoms and gaps it contains. The intervals with the largest error bound are
-bisected repeatedly, in each cell separately and a fixed number of times. Where the
+The error of a trapezium over an interval is at most half of its length times the change
+of the function over it, whatever atoms and gaps it contains. In each cell, the
+intervals with the largest error bound are bisected, a fixed number of times. Where the
 function is smooth, a parabola replaces the chord. Cells whose parabolas still have a
-large correction, as with many atoms, are computed again with more bisections.
+large correction, for example with many atoms, are computed again with more bisections.
 
 Letters in shapes: b×h×w cells of a chunk; M nodes; S intervals.
 """
@@ -21,8 +21,8 @@ _AT_ONCE = 4  # intervals of a cell that are bisected together
 _ROUNDS = 24
 _MORE_ROUNDS = 3  # factor for cells whose error estimate exceeds `_MAX_ERROR`
 _MAX_ERROR = 3e-5
-# Fraction of the change over an interval that its error bound includes, since a jump
-# may be hidden, in addition to the correction by the parabola.
+# An error bound includes the correction by the parabola and, since an interval may hide
+# a jump, this fraction of the change over the interval.
 _JUMP_FRACTION = 0.1
 # Ratio of the change over an interval to the maximum correction of a monotone parabola.
 _MAX_CORRECTION = 3
@@ -53,10 +53,11 @@ def edges_between(low: Tensor, high: Tensor | float) -> Tensor:
         low: first edge, shape [b, h, w].
         high: last edge, a number or shape [b, h, w].
     """
-    steps = torch.linspace(
-        0, 1, N_INTERVALS + 1, dtype=torch.float64, device=low.device
-    )
-    return torch.lerp(low, torch.as_tensor(high).to(low), steps.view(-1, 1, 1, 1))
+    n_edges = N_INTERVALS + 1
+    steps = torch.linspace(0, 1, n_edges, dtype=torch.float64, device=low.device)
+    fraction = steps.view(-1, 1, 1, 1)
+    last = torch.as_tensor(high).to(low)
+    return torch.lerp(low, last, fraction)
 
 
 def integral(
@@ -87,12 +88,14 @@ def integral(
     if is_inexact.any():
         inexact = distribution.at(is_inexact)._in_members()
         function = partial(curve, _stacked(inexact))
+        # The inexact cells become a map of one row.
         edges, first, last = (
             values[..., is_inexact][..., None, None, :]
             for values in (edges, first, last)
         )
-        again, _ = _trapezia(function, edges, first, last, rounds * _MORE_ROUNDS)
-        total[is_inexact] = again.flatten()
+        more_rounds = rounds * _MORE_ROUNDS
+        refined, _ = _trapezia(function, edges, first, last, more_rounds)
+        total[is_inexact] = refined.flatten()
     return total
 
 
@@ -101,7 +104,7 @@ def _stacked(
 ) -> Callable[[Tensor], Tensor]:
     """Return the CDF as a function of M values per cell, [M, b, h, w] to [M, b, h, w].
 
-    A single call for all values is as fast as a call for each.
+    The distribution is repeated M times, so that a single call computes all values.
     """
     cache: dict[int, _Distribution] = {}
 
@@ -110,7 +113,8 @@ def _stacked(
         if count not in cache:
             indices = torch.arange(distribution.shape[0], device=distribution.device)
             cache[count] = distribution.select(indices.repeat(count))
-        return cache[count].cdf(values.flatten(0, 1)).view_as(values)
+        probabilities = cache[count].cdf(values.flatten(0, 1))
+        return probabilities.view_as(values)
 
     return cdf
 
@@ -126,28 +130,31 @@ def _trapezia(
 
     The error is estimated from intervals with a jump.
     """
-    values = torch.cat((first[None], function(edges[1:-1]), last[None]))
+    inner_values = function(edges[1:-1])
+    values = torch.cat((first[None], inner_values, last[None]))
     # A lane bisects one of its intervals per round and passes one half to the next
     # lane, so that all lanes have intervals to bisect.
     n_filled = N_INTERVALS // _AT_ONCE
-    shape = (n_filled + rounds, _AT_ONCE, *first.shape)
+    lane_shape = _AT_ONCE, *first.shape
+    shape = (n_filled + rounds, *lane_shape)
     intervals = [values.new_empty(shape) for _ in range(6)]
     begin, width, value, rise, correction, bound = intervals
     correction[:n_filled] = 0
     initial = (edges[:-1], edges.diff(dim=0), values[:-1], values.diff(dim=0))
     for layer, part in zip(intervals, initial, strict=False):
-        layer[:n_filled] = part.view(n_filled, *shape[1:])
+        layer[:n_filled] = part.view(n_filled, *lane_shape)
     bound[:n_filled] = (rise * width)[:n_filled].abs()
     for new in range(n_filled, len(begin)):
         # `max` is several times faster than `argmax`.
         worst = bound[:new].max(0, keepdim=True).indices
-        x, old_width, left, step = (
+        x, old_width, old_value, old_rise = (
             layer.gather(0, worst)[0] for layer in intervals[:4]
         )
         half = old_width / 2
-        middle = function(x + half)
-        left_rise = middle - left
-        right_rise = left + step - middle
+        centre = x + half
+        middle = function(centre)
+        left_rise = middle - old_value
+        right_rise = old_value + old_rise - middle
         # Mean of the parabola through the three points minus the chord of either half.
         mean_excess = (left_rise - right_rise) / 12
         left_correction = _limited(mean_excess, left_rise)
@@ -157,20 +164,25 @@ def _trapezia(
         replaced = (half, left_rise, left_correction, left_bound)
         for layer, part in zip((width, rise, correction, bound), replaced, strict=True):
             layer.scatter_(0, worst, part[None])
-        added = (x + half, half, middle, right_rise, right_correction, right_bound)
+        added = (centre, half, middle, right_rise, right_correction, right_bound)
         for layer, part in zip(intervals, added, strict=True):
             layer[new] = part.roll(1, 0)
-    total = width * (value + rise / 2 + correction)
+    mean_value = value + rise / 2 + correction
+    areas = width * mean_value
     # At a jump, the correction is a twelfth of the rise.
-    errors = 12 * width * correction.square() / rise.abs().clamp(min=1e-300)
-    return total.flatten(0, 1).sum(0), errors.flatten(0, 1).sum(0)
+    abs_rise = rise.abs().clamp(min=1e-300)
+    errors = 12 * width * correction.square() / abs_rise
+    total = areas.flatten(0, 1).sum(0)
+    total_error = errors.flatten(0, 1).sum(0)
+    return total, total_error
 
 
 def _limited(excess: Tensor, rise: Tensor) -> Tensor:
-    """Return a correction within that of a monotone parabola."""
+    """Return a correction, limited to that of a monotone parabola."""
     limit = rise.abs() / _MAX_CORRECTION
     return excess.minimum(limit).maximum(-limit)
 
 
 def _bound(width: Tensor, correction: Tensor, rise: Tensor) -> Tensor:
-    return width * (correction.abs() + _JUMP_FRACTION * rise.abs())
+    jump = _JUMP_FRACTION * rise.abs()
+    return width * (correction.abs() + jump)

@@ -1,8 +1,8 @@
 """Distributions by their quantiles, as in quantile regression, with exact integrals.
 
-The quantile function is linear between levels u_i, at which it is x_i. Where it is
-constant, λ has an atom. Mean, VaR and CVaR are weighted sums of the x_i; expected time
-and CRPS are sums over intervals.
+The quantile function has the values x_i at levels u_i and is linear in between. If it
+is constant over an interval, λ has an atom. Mean, VaR and CVaR are weighted sums of the
+x_i; expected time and CRPS are sums over intervals.
 Letters in shapes: Q levels; H×W cells; *B any leading dimensions.
 """
 
@@ -19,7 +19,8 @@ from benchnav.core.distribution import TraversabilityDistribution, check_floor, 
 from benchnav.core.errors import ConfigError, expect
 
 _MIN_LEVELS = 64
-_TAIL, _TAIL_STEP = 0.1, 0.01  # maximum step of levels below `_TAIL`
+_TAIL = 0.1
+_TAIL_STEP = 0.01  # maximum step of levels below `_TAIL`
 
 LEVELS: tuple[float, ...] = (
     *(0.0, 0.001, 0.002, 0.003, 0.005, 0.0075),
@@ -27,7 +28,7 @@ LEVELS: tuple[float, ...] = (
     *(round(0.1 + 0.02 * step, 2) for step in range(45)),
     *(0.99, 0.995, 1.0),
 )
-"""Default levels of models: 72, of which a third are at most 0.1, in the lower tail."""
+"""Default levels of models: 72, a third of them in the lower tail, up to 0.1."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +38,8 @@ class QuantileDistribution(TraversabilityDistribution):
     Args:
         values: λ at the levels, ascending and in [0, 1], shape [*B, Q, H, W]. Equal
             values at several levels are an atom.
-        levels: at least 64 levels, ascending from 0, the minimum of λ, to 1, the
-            maximum, and at most 0.01 apart up to 0.1.
+        levels: at least 64 levels, ascending from 0 (the minimum of λ) to 1 (the
+            maximum), and at most 0.01 apart up to 0.1.
 
     Raises:
         ConfigError: If the levels or the shape are invalid.
@@ -53,31 +54,30 @@ class QuantileDistribution(TraversabilityDistribution):
         levels = self.levels
         steps = [upper - lower for lower, upper in pairwise(levels)]
         spans = bool(levels) and levels[0] == 0 and levels[-1] == 1
+        is_ascending = bool(steps) and min(steps) > 0
         expect(
-            len(levels) >= _MIN_LEVELS and spans and min(steps) > 0,
+            len(levels) >= _MIN_LEVELS and spans and is_ascending,
             f"`levels` that ascend from 0 to 1, {_MIN_LEVELS} or more, got "
             f"{len(levels)}. Use `benchnav.core.quantiles.LEVELS`.",
         )
-        tail_steps = [
-            step
-            for step, lower in zip(steps, levels, strict=False)
-            if lower < _TAIL - 1e-9
-        ]
-        max_step = max(tail_steps)
+        # Steps that start in the tail; rounding must not add the step from 0.1.
+        n_tail_steps = bisect_left(levels, _TAIL - 1e-9)
+        max_step = max(steps[:n_tail_steps])
         expect(
             max_step <= _TAIL_STEP + 1e-9,
             f"`levels` at most {_TAIL_STEP} apart up to {_TAIL}, where risk is, got "
-            f"{max_step:.3g}. Take more there.",
+            f"{max_step:.3g}. Add levels there.",
         )
-        if self.values.ndim < 3 or self.values.shape[-3] != len(levels):
+        shape = self.values.shape
+        if len(shape) < 3 or shape[-3] != len(levels):
             raise ConfigError(
                 f"Expected `values` of shape [*B, {len(levels)}, H, W], one map a "
-                f"level, got {list(self.values.shape)}."
+                f"level, got {list(shape)}."
             )
 
     @property
     def shape(self) -> torch.Size:
-        """[*B, H, W]."""
+        """Shape of the maps, [*B, H, W]."""
         return self.values.select(-3, 0).shape
 
     def cdf(self, value: Tensor | float) -> Tensor:
@@ -92,13 +92,15 @@ class QuantileDistribution(TraversabilityDistribution):
         levels = self._levels()
 
         def cdf_at(right: bool) -> Tensor:
-            after = torch.searchsorted(knots, at.contiguous(), right=right)
-            upper = after.clamp(max=len(levels) - 1)
-            lower = (after - 1).clamp(min=0)
-            fraction = _fraction(at, knots.gather(-1, lower), knots.gather(-1, upper))
+            index = torch.searchsorted(knots, at.contiguous(), right=right)
+            upper = index.clamp(max=len(levels) - 1)
+            lower = (index - 1).clamp(min=0)
+            low = knots.gather(-1, lower)
+            high = knots.gather(-1, upper)
+            fraction = _fraction(at, low, high)
             probability = torch.lerp(levels[lower], levels[upper], fraction)
-            probability = torch.where(after == len(levels), 1.0, probability)
-            probability = torch.where(after == 0, 0.0, probability)
+            probability = torch.where(index == len(levels), 1.0, probability)
+            probability = torch.where(index == 0, 0.0, probability)
             probability = torch.where(at.isnan(), torch.nan, probability)
             return probability.squeeze(-1).to(self.dtype)
 
@@ -107,25 +109,30 @@ class QuantileDistribution(TraversabilityDistribution):
     def quantile(self, probability: Tensor | float) -> Tensor:
         """Return the quantiles of λ, shape [*B, H, W]."""
         if not isinstance(probability, Tensor):
-            return self._quantile_at(min(max(float(probability), 0.0), 1.0))
+            clamped = min(max(float(probability), 0.0), 1.0)
+            return self._quantile_at(clamped)
         u = probability.to(torch.float64).clamp(0, 1)
+        u = u.expand(self.shape).unsqueeze(-1).contiguous()
         knots = self._knots()
         levels = self._levels()
-        at = u.expand(self.shape).unsqueeze(-1).contiguous()
-        upper = torch.searchsorted(levels, at).clamp(1, len(levels) - 1)
+        last = len(levels) - 1
+        upper = torch.searchsorted(levels, u).clamp(1, last)
         lower = upper - 1
-        fraction = (at - levels[lower]) / (levels[upper] - levels[lower])
+        low_level = levels[lower]
+        fraction = (u - low_level) / (levels[upper] - low_level)
         low = knots.gather(-1, lower)
         high = knots.gather(-1, upper)
-        return torch.lerp(low, high, fraction).squeeze(-1).to(self.dtype)
+        quantiles = torch.lerp(low, high, fraction)
+        return quantiles.squeeze(-1).to(self.dtype)
 
     def _quantile_at(self, probability: float) -> Tensor:
         index = bisect_left(self.levels, probability)
         upper = min(max(index, 1), len(self.levels) - 1)
-        before, after = self.levels[upper - 1 : upper + 1]
-        low = self.values.select(-3, upper - 1).double()
+        lower = upper - 1
+        low = self.values.select(-3, lower).double()
         high = self.values.select(-3, upper).double()
-        fraction = (probability - before) / (after - before)
+        low_level = self.levels[lower]
+        fraction = (probability - low_level) / (self.levels[upper] - low_level)
         return torch.lerp(low, high, fraction).to(self.dtype)
 
     def mean(self) -> Tensor:
@@ -141,19 +148,21 @@ class QuantileDistribution(TraversabilityDistribution):
         tail = tail_of(level)
         check_floor(floor)
         low, high, width = self._intervals()
-        in_tail = ((tail - self._levels()[:-1]) / width).clamp(0, 1)
+        before = self._levels()[:-1]
+        in_tail = ((tail - before) / width).clamp(0, 1)
         high = torch.lerp(low, high, in_tail)
         width = width * in_tail / tail
         slow = low.clamp(min=floor)
         fast = high.clamp(min=floor)
-        # Fraction of an interval [a, b] that is below the floor; over the remainder,
-        # the mean of 1 / λ is log(b / a) / (b − a).
+        # Below the floor, 1 / λ counts as 1 / floor. Over the remainder [a, b] of an
+        # interval, the mean of 1 / λ is log(b / a) / (b − a).
         below_floor = _fraction(floor, low, high)
         below_floor = torch.where(high <= floor, 1.0, below_floor)
         growth = (fast - slow) / slow
         exact = growth.log1p() / growth.clamp(min=1e-4)
         ratio = torch.where(growth > 1e-4, exact, 1 - growth / 2)
-        time = below_floor / floor + (1 - below_floor) * ratio / slow
+        time_above = (1 - below_floor) * ratio / slow
+        time = below_floor / floor + time_above
         return (width * time).sum(-1).to(self.dtype)
 
     def crps(self, observed: Tensor) -> Tensor:
@@ -165,12 +174,16 @@ class QuantileDistribution(TraversabilityDistribution):
         split = at.clamp(low, high)
         gap = torch.where(high > low, high - low, 1.0)
         f = before + width * ((split - low) / gap)  # F at the split
+        # Integrals of squares of linear functions, times 3.
         below = (split - low) * (before * before + before * f + f * f)
         g = 1 - f
         last = 1 - levels[1:]
         above = (high - split) * (g * g + g * last + last * last)
-        outside = (at - high[..., -1:]).clamp(min=0) + (low[..., :1] - at).clamp(min=0)
-        return ((below + above).sum(-1) / 3 + outside.squeeze(-1)).to(observed.dtype)
+        inside = (below + above).sum(-1) / 3
+        over_maximum = (at - high[..., -1:]).clamp(min=0)
+        under_minimum = (low[..., :1] - at).clamp(min=0)
+        outside = over_maximum + under_minimum
+        return (inside + outside.squeeze(-1)).to(observed.dtype)
 
     def _levels(self) -> Tensor:
         return torch.tensor(self.levels, dtype=torch.float64, device=self.device)
@@ -182,7 +195,9 @@ class QuantileDistribution(TraversabilityDistribution):
     def _intervals(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return both ends [*B, H, W, Q − 1] and probabilities [Q − 1] of intervals."""
         knots = self._knots()
-        return knots[..., :-1], knots[..., 1:], self._levels().diff()
+        low = knots[..., :-1]
+        high = knots[..., 1:]
+        return low, high, self._levels().diff()
 
     def _tail_mean(self, tail: float) -> Tensor:
         """Return the mean of the quantile function over [0, tail], shape [*B, H, W].
@@ -194,7 +209,8 @@ class QuantileDistribution(TraversabilityDistribution):
         ends = np.clip(levels, 0, tail)
         low = ends[:-1]
         high = ends[1:]
-        rising = ((high - start) ** 2 - (low - start) ** 2) / (2 * np.diff(levels))
+        squares = (high - start) ** 2 - (low - start) ** 2
+        rising = squares / (2 * np.diff(levels))
         weights = np.zeros_like(levels)
         weights[1:] += rising
         weights[:-1] += (high - low) - rising
@@ -205,7 +221,8 @@ class QuantileDistribution(TraversabilityDistribution):
 
 def _fraction(value: Tensor | float, low: Tensor, high: Tensor) -> Tensor:
     """Return the fraction of [low, high] below a value, in [0, 1]."""
-    return ((value - low) / torch.where(high > low, high - low, 1.0)).clamp(0, 1)
+    width = torch.where(high > low, high - low, 1.0)
+    return ((value - low) / width).clamp(0, 1)
 
 
 def quantiles_at(
@@ -213,7 +230,9 @@ def quantiles_at(
     reads: Sequence[float],
     levels: tuple[float, ...] = LEVELS,
 ) -> QuantileDistribution:
-    """Return a distribution whose quantiles at `levels` are others' at `reads`.
+    """Return a distribution whose levels are relabelled quantiles of another.
+
+    Its quantile at `levels[i]` is that of `distribution` at `reads[i]`.
 
     Args:
         distribution: distribution of shape [*B, H, W].

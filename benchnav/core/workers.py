@@ -208,7 +208,7 @@ def connected(scheduler: str) -> Iterator[Any]:
     address = urlparse(scheduler)
     try:
         has_host = address.hostname and address.port
-    except ValueError:  # the port is not a number
+    except ValueError:  # the port is not numeric
         has_host = False
     if not has_host or address.scheme not in ("tcp", "tls"):
         raise ConfigError(f"Expected `scheduler` tcp://HOST:PORT, got {scheduler!r}.")

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from joblib import Parallel, delayed
 
-from benchnav.core import registry
+from benchnav.core import part_lookup, registry
 from benchnav.core.errors import ConfigError
 from benchnav.core.registry import (
     Part,
@@ -162,7 +162,7 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 @pytest.fixture(autouse=True)
 def _unregistered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(registry, "_REGISTERED", {})
+    monkeypatch.setattr(part_lookup, "_REGISTERED", {})
 
 
 def refusal(call: Callable[[], object]) -> str:
@@ -213,7 +213,7 @@ def test_a_name_that_two_packages_have_is_refused(package: Path) -> None:
     (other / "entry_points.txt").write_text(
         "[benchnav.planners]\nplugged = other:Planner\n"
     )
-    registry._points_on.cache_clear()
+    part_lookup._points_on.cache_clear()
     message = refusal(lambda: find("planner", "plugged"))
     assert "plugged.parts:Planner" in message
     assert "other:Planner" in message
@@ -554,7 +554,7 @@ def test_an_option_given_twice_is_refused() -> None:
         ("mpi", "Did you mean 'mppi'?"),
         ("optimal_bound", "It is now 'near_optimal'."),
         ("mine", "Did you mean './mine.py:Name'?"),
-        ("./mine.py", "Say which class or function of it: ./mine.py:Name."),
+        ("./mine.py", "Name a class or function in the file: ./mine.py:Name."),
         ("mine:Planner", "Did you mean './mine.py:Planner'?"),
         (
             "./mien.py:Planner",

@@ -195,7 +195,7 @@ def test_a_part_of_a_module_is_its_package_and_what_that_imports(
 
 def test_files_that_a_part_lists_are_in_its_digest(part: Path) -> None:
     part.write_text("class Planner:\n    files = ('weights.bin', 'tables')\n")
-    assert "got 'weights.bin', which is not there" in refusal(lambda: digest(part))
+    assert "got 'weights.bin', which does not exist" in refusal(lambda: digest(part))
     (part.parent / "weights.bin").write_bytes(b"1")
     (part.parent / "tables").mkdir()
     seen = {digest(part)}
@@ -253,7 +253,7 @@ def test_a_folder_that_holds_the_working_folder_is_refused(
     asked = Part(
         part=f"{part}:Planner", label="", kind="planner", options={"weights": folder}
     )
-    assert f"got {folder!r}, which holds the working folder" in refusal(
+    assert f"got {folder!r}, which contains the working folder" in refusal(
         lambda: option_files(asked)
     )
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from benchnav.core import registry
+from benchnav.core import part_lookup, registry
 from benchnav.core.errors import ConfigError
 from benchnav.core.tables import to_terminal
 from benchnav.eval import catalogue
@@ -54,7 +54,7 @@ class Mine:
 
 @pytest.fixture(autouse=True)
 def _registered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(registry, "_REGISTERED", {})
+    monkeypatch.setattr(part_lookup, "_REGISTERED", {})
     registry.register("planner", "mine", Mine)
 
 

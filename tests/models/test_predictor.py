@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from benchnav.core import registry
+from benchnav.core import part_lookup, registry
 from benchnav.core.errors import CheckpointError, ConfigError
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Observation, Terrain
@@ -203,7 +203,7 @@ def _own_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_registered_model_is_found_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(registry, "_REGISTERED", {})
+    monkeypatch.setattr(part_lookup, "_REGISTERED", {})
     registry.register("model", "mine", Spy)
     assert isinstance(load_model("mine"), Spy)
     registry.register("model", "made", lambda mean=0.5: Measured(mean))
@@ -277,7 +277,7 @@ def test_a_model_whose_training_was_interrupted_is_told_with_the_command_to_go_o
             "./mine_of_tests.py:Nothing",
             "to be a subclass of benchnav.models.TraversabilityModel, got Nothing. Write class Nothing(Tr",
         ),
-        ("./mine_of_tests.py", "Say which class or function of it"),
+        ("./mine_of_tests.py", "Name a class or function in the file"),
         ("oracle:3", "it has no options"),
         ("checkpoints/papr-v1", "Did you mean 'paper-v1'?"),
         ("papr-v1", "Did you mean 'paper-v1'?"),

@@ -15,7 +15,8 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from benchnav.core.mixture import TraversabilityMixture, component_log_prob
+from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.mixture_density import component_log_prob
 from benchnav.models.config import MDNConfig
 from benchnav.models.nets.inputs import Maps
 from benchnav.models.nets.joined import JoinedModel

@@ -17,7 +17,8 @@ import torch
 from torch import Tensor
 
 from benchnav.core.errors import expect
-from benchnav.core.mixture import TraversabilityMixture, component_log_prob
+from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.mixture_density import component_log_prob
 from benchnav.models.config import JoinedConfig
 from benchnav.models.nets.joined import JoinedModel
 from benchnav.models.nets.mdn import first_width, to_std

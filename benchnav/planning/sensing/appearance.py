@@ -21,7 +21,7 @@ from benchnav.planning.sensing.sensor import Appearance
 
 @dataclass(frozen=True, kw_only=True)
 class Memory(Batch):
-    """Least noisy observation of each cell; undefined for unobserved cells.
+    """Least noisy observation of each cell; values of unobserved cells are undefined.
 
     Args:
         seen: mask of observed cells, bool, shape [B, H, W].
@@ -47,21 +47,26 @@ class Memory(Batch):
             terrain: B maps; only their shapes, dtypes and layer names are used.
         """
         unobserved = torch.full_like(terrain.elevation_m, torch.nan)
+        layers = {}
+        for name, layer in terrain.layers.items():
+            layers[name] = torch.full_like(layer, torch.nan)
+        seen = torch.zeros_like(unobserved, dtype=torch.bool)
+        noise_level = torch.full_like(unobserved, torch.inf)
         return cls(
-            seen=torch.zeros_like(unobserved, dtype=torch.bool),
+            seen=seen,
             rgb=torch.zeros_like(terrain.rgb),
             elevation_m=unobserved,
-            layers={
-                name: torch.full_like(layer, torch.nan)
-                for name, layer in terrain.layers.items()
-            },
-            noise_level=torch.full_like(unobserved, torch.inf),
+            layers=layers,
+            noise_level=noise_level,
             grid=terrain.grid,
         )
 
 
 def remember(memory: Memory, appearance: Appearance) -> Memory:
-    """Add observations; each cell keeps the least noisy, of equal ones the earlier.
+    """Add observations to a memory.
+
+    Each cell keeps its least noisy observation, and the earlier one if two are equally
+    noisy.
 
     Args:
         memory: memory of B episodes.
@@ -70,60 +75,66 @@ def remember(memory: Memory, appearance: Appearance) -> Memory:
     seen = appearance.seen
     observation = appearance.observation
     noise_level = appearance.noise_level.to(memory.noise_level)
-    better = seen & (~memory.seen | (noise_level < memory.noise_level))
+    is_sharper = noise_level < memory.noise_level
+    better = seen & (~memory.seen | is_sharper)
+    rgb = torch.where(better[:, None], observation.rgb, memory.rgb)
+    elevation_m = torch.where(better, observation.elevation_m, memory.elevation_m)
+    layers = {}
+    for name, layer in memory.layers.items():
+        layers[name] = torch.where(better, observation.layers[name], layer)
     return Memory(
         seen=memory.seen | seen,
-        rgb=torch.where(better[:, None], observation.rgb, memory.rgb),
-        elevation_m=torch.where(better, observation.elevation_m, memory.elevation_m),
-        layers={
-            name: torch.where(better, observation.layers[name], layer)
-            for name, layer in memory.layers.items()
-        },
+        rgb=rgb,
+        elevation_m=elevation_m,
+        layers=layers,
         noise_level=torch.where(better, noise_level, memory.noise_level),
         grid=memory.grid,
     )
 
 
 def masked(memory: Memory, layer_means: Mapping[str, tuple[float, ...]]) -> Observation:
-    """Return the observed part of the map, for a model.
+    """Return the observed part of the map as the input of a model.
 
     Slopes are computed from the observed elevation as in recipes: by Horn's method,
-    continued linearly at the map's borders. Hence cells observed without noise equal
-    those of the terrain's own observation bit for bit. Border cells of imported terrain
-    are an exception: their slopes include terrain beyond the map.
+    with linear extrapolation at the map's borders. Hence cells observed without noise
+    equal those of the terrain's own observation bit for bit. Border cells of imported
+    terrain are an exception: their slopes include terrain beyond the map.
 
     Args:
         memory: memory of B episodes.
-        layer_means: means of the training maps by layer, as in `GroundStatistics`: of
-            `rgb`, `elevation_m` and `slope_deg`.
+        layer_means: means of `rgb`, `elevation_m` and `slope_deg` over the training
+            maps, as in `GroundStatistics`.
 
     Returns:
         Colour (rounded) and elevation are the training mean in unobserved cells. Slope
-        is the training mean where the cell or a neighbour on the map is unobserved.
-        Layers are NaN in unobserved cells. The layer `seen` is 1 in observed cells,
-        else 0.
+        is the training mean if the cell or one of its neighbours on the map is
+        unobserved. Layers are NaN in unobserved cells. The layer `seen` is 1 in
+        observed cells, else 0.
     """
     seen = memory.seen
-    colour = torch.tensor(layer_means["rgb"]).round().to(memory.rgb)
+    mean_rgb = torch.tensor(layer_means["rgb"])
+    mean_colour = mean_rgb.round().to(memory.rgb)
     (mean_elevation_m,) = layer_means["elevation_m"]
     (mean_slope_deg,) = layer_means["slope_deg"]
+    rgb = torch.where(seen[:, None], memory.rgb, mean_colour[:, None, None])
     elevation_m = torch.where(seen, memory.elevation_m, mean_elevation_m)
-    # A slope needs the cell and its neighbours on the map; cells beyond the map do not
-    # count as unobserved.
+    # A slope needs the cell and its neighbours on the map. The padding of the pooling
+    # does not count as unobserved.
     unseen = (~seen).float()
-    no_slope = torch.nn.functional.max_pool2d(unseen, 3, stride=1, padding=1) > 0
-    slopes = quantise(
-        slopes_deg(elevation_m.cpu().numpy(), memory.grid.resolution_m), 10
-    )
-    slope_deg = torch.from_numpy(slopes).to(elevation_m)
-    layers = {
-        name: torch.where(seen, layer, torch.nan)
-        for name, layer in memory.layers.items()
-    }
+    near_unseen = torch.nn.functional.max_pool2d(unseen, 3, stride=1, padding=1)
+    no_slope = near_unseen > 0
+    heights = elevation_m.cpu().numpy()
+    exact_slopes = slopes_deg(heights, memory.grid.resolution_m)
+    slopes = torch.from_numpy(quantise(exact_slopes, 10)).to(elevation_m)
+    slope_deg = torch.where(no_slope, mean_slope_deg, slopes)
+    layers = {}
+    for name, layer in memory.layers.items():
+        layers[name] = torch.where(seen, layer, torch.nan)
+    layers[SEEN] = seen.to(torch.float32)
     return Observation(
-        rgb=torch.where(seen[:, None], memory.rgb, colour[:, None, None]),
+        rgb=rgb,
         elevation_m=elevation_m,
-        slope_deg=torch.where(no_slope, mean_slope_deg, slope_deg),
+        slope_deg=slope_deg,
         grid=memory.grid,
-        layers={**layers, SEEN: seen.to(torch.float32)},
+        layers=layers,
     )

@@ -1,9 +1,8 @@
-"""Beliefs about λ: the base class, the covariance model of the λ field, and the static
-belief.
+"""Beliefs about λ: base class, covariance model of the λ field, and static belief.
 
 A belief starts from a model's prediction and the covariance model, is updated with
-measurements, and returns the distribution of λ in each cell. It is pure: all that it
-has learnt is in a state that its methods receive and return.
+measurements, and returns the distribution of λ in each cell. It is pure: its methods
+receive and return a state, which contains all information from measurements.
 Letters in shapes: B episodes, H×W cells, M drawn fields.
 """
 
@@ -37,12 +36,12 @@ class CovarianceModel:
 
     Args:
         grid: size and resolution of the maps.
-        correlation_m: ℓ in metres: normal scores at distance d have the correlation
-            exp(−d²/2ℓ²); 0 for independent cells.
+        correlation_m: ℓ in metres; normal scores at distance d have the correlation
+            exp(−d²/2ℓ²). If it is 0, cells are independent.
         nugget: fraction of the variance of a cell's normal score that is independent of
             all other cells, in [0, 1). It is 0 if the prediction is each cell's true
             distribution. A model's errors reduce the correlation between neighbours.
-        statistics: statistics of the training maps; None if nothing needs them.
+        statistics: statistics of the training maps; None if no part needs them.
         class_names: names of the prediction's classes, in the order of their ids; empty
             if it has no classes.
     """
@@ -68,12 +67,11 @@ class CovarianceModel:
 
 
 class Belief(Specified, ABC, Generic[State]):
-    """Base class of beliefs, parts of kind `belief`: distributions of λ from
-    measurements.
+    """Base class of beliefs (parts of kind `belief`), which infer λ from measurements.
 
     Attributes:
-        learns: whether measured λ changes the belief; if not, the belief receives only
-            new predictions.
+        learns: whether measured λ changes the belief. If False, the belief receives
+            only new predictions.
         needs_statistics: whether `CovarianceModel.statistics` is required.
     """
 
@@ -122,12 +120,10 @@ class Belief(Specified, ABC, Generic[State]):
     def changed(self, before: State, after: State) -> Tensor:
         """Return a mask of cells whose belief changed, bool, shape [B, H, W].
 
-        By default all cells.
+        The base class returns all cells.
         """
-        distribution = self.distribution(after)
-        return torch.ones(
-            distribution.shape, dtype=torch.bool, device=distribution.device
-        )
+        belief = self.distribution(after)
+        return torch.ones(belief.shape, dtype=torch.bool, device=belief.device)
 
     @abstractmethod
     def sample_fields(self, state: State, count: int, keys: Sequence[int]) -> Tensor:
@@ -136,8 +132,8 @@ class Belief(Specified, ABC, Generic[State]):
         Args:
             state: belief state.
             count: M.
-            keys: a stream key of each episode, B of them, so that its fields do not
-                depend on the other episodes.
+            keys: a stream key for each of B episodes, so that its fields do not depend
+                on the other episodes.
 
         Returns:
             λ in [0, 1], shape [B, M, H, W].
@@ -151,7 +147,7 @@ class Belief(Specified, ABC, Generic[State]):
         Args:
             state: belief state.
             count: M.
-            keys: a stream key of each episode.
+            keys: a stream key for each of B episodes.
             cells: mask of the requested cells, bool, shape [B, H, W].
         """
         return self.sample_fields(state, count, keys)
@@ -177,8 +173,8 @@ class Fields:
 
     Args:
         belief: the belief.
-        state: its state, of B episodes.
-        names: index of each episode by which its fields are drawn, B of them.
+        state: state of the belief, of B episodes.
+        names: index of each of B episodes, which determines its random stream.
     """
 
     belief: Belief[Any]
@@ -200,13 +196,14 @@ class Fields:
 
     def select(self, members: Tensor) -> "Fields":
         """Return some episodes, by index, int64."""
+        state = self.belief.select(self.state, members)
         names = tuple(self.names[index] for index in members.tolist())
-        return Fields(self.belief, self.belief.select(self.state, members), names)
+        return Fields(self.belief, state, names)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Predicted(Batch):
-    """A prediction and its covariance model; the whole state of the static belief.
+    """A prediction and its covariance model: the state of the static belief.
 
     Args:
         prior: the model's prediction, shape [B, H, W].
@@ -219,8 +216,8 @@ class Predicted(Batch):
     def fields(self, scores: Tensor, cells: Tensor | None = None) -> Tensor:
         """Return λ of normal scores under the prediction, shape [B, M, H, W].
 
-        Where quantiles are slow, λ is linear in the score between the values of
-        `score_table`, which are exact.
+        If the quantile function is slow, λ is exact at the values of `score_table` and
+        linear in the score in between.
 
         Args:
             scores: normal scores, shape [B, M, H, W].
@@ -233,7 +230,8 @@ class Predicted(Batch):
         for member, rows in enumerate(self._rows):
             mask: Any = ... if cells is None else cells[member]
             cell_scores = scores[member][:, mask].movedim(0, -1)
-            fields[member][:, mask] = value_at(rows[mask], cell_scores).movedim(-1, 0)
+            cell_values = value_at(rows[mask], cell_scores)
+            fields[member][:, mask] = cell_values.movedim(-1, 0)
         return fields.to(self.prior.dtype)
 
     @cached_property
@@ -242,11 +240,12 @@ class Predicted(Batch):
 
         None if quantiles of the prediction are fast.
         """
-        if not self.prior.searched:
+        prior = self.prior
+        if not prior.searched:
             return None
-        shape = self.prior.shape
-        all_cells = torch.ones(shape, dtype=torch.bool, device=self.prior.device)
-        return scores_of(self.prior.at(all_cells)).view(*shape, -1)
+        all_cells = torch.ones(prior.shape, dtype=torch.bool, device=prior.device)
+        scores = scores_of(prior.at(all_cells))
+        return scores.view(*prior.shape, -1)
 
 
 @dataclass(frozen=True)
@@ -254,8 +253,8 @@ class Static(Belief[Predicted]):
     """The model's prediction; measurements during the episode are ignored.
 
     Args:
-        correlated: whether drawn fields have the correlations of the covariance model;
-            if not, cells are independent.
+        correlated: whether drawn fields have the correlations of the covariance model.
+            If False, cells are independent.
     """
 
     learns: ClassVar[bool] = False
@@ -314,10 +313,10 @@ def draw_scores(covariance: CovarianceModel, count: int, keys: Sequence[int]) ->
 
     Args:
         covariance: covariance model of the scores.
-        count: M; a larger count only appends fields.
-        keys: a stream key of each episode, B of them.
+        count: M; the first fields do not depend on it.
+        keys: a stream key for each of B episodes.
     """
-    # An episode at a time: the last bits of a product depend on the size of the batch.
+    # One episode at a time: the last bits of a product depend on the size of the batch.
     return torch.stack([_scores_of_one(covariance, count, key) for key in keys])
 
 
@@ -338,7 +337,7 @@ def _scores_of_one(covariance: CovarianceModel, count: int, key: int) -> Tensor:
 def _white(key: int, count: int, shape: tuple[int, int]) -> Tensor:
     """Return standard normals, float32, shape [M, H, W]."""
     n_numbers = count * math.prod(shape)
-    # PyTorch draws sixteen at a time, and any remainder by another method.
+    # PyTorch draws numbers in blocks of sixteen, and any remainder by another method.
     n_drawn = -(-n_numbers // 16) * 16
     numbers = torch.randn(n_drawn, generator=rng.generator(key))[:n_numbers]
     return numbers.view(count, *shape)
@@ -352,8 +351,10 @@ def _root(size: int, correlation_cells: float) -> Tensor:
     """
     along = torch.from_numpy(correlations(size, correlation_cells))
     index = torch.arange(size)
-    values, vectors = torch.linalg.eigh(along[(index[:, None] - index).abs()])
-    return ((vectors * values.clamp(min=0).sqrt()) @ vectors.T).float()
+    distance = (index[:, None] - index).abs()
+    values, vectors = torch.linalg.eigh(along[distance])
+    scaled = vectors * values.clamp(min=0).sqrt()
+    return (scaled @ vectors.T).float()
 
 
 def fields_of(distribution: TraversabilityDistribution, scores: Tensor) -> Tensor:

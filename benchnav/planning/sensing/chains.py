@@ -1,15 +1,14 @@
 """Labels of look-alike cells given λ: 64 chains, resampled near new observations.
 
-New observations weigh the chains by their likelihood, and chains are resampled (a
-particle filter). Three kinds of moves follow. Sweeps draw cells that were not observed,
-given their neighbours. One patch of observed and other cells is proposed the other
-label as a whole. Observed cells that are new or open are drawn given all others, by the
-joint density of scores. An older observation of λ = 0 or 1, whose score is an interval,
-is represented by a Gaussian term of expectation propagation at the more probable label
-of its cell. Only cells near new observations are drawn (`sites`). A labelling that is
-in none of the chains can return only by these moves.
+Chains are weighted by the likelihood of new observations and resampled (a particle
+filter). Three kinds of moves follow. Sweeps draw unobserved cells given their
+neighbours. One proposal changes the label of a whole patch of cells. Observed cells
+that are new or open are drawn given all others, by the joint density of scores. An
+older observation of λ = 0 or 1, whose score is an interval, is represented by a
+Gaussian term of expectation propagation at the more probable label of its cell. Only
+cells near new observations are drawn (`sites`). A labelling that no chain contains can
+return only by these moves.
 Letters in shapes: B episodes, H×W cells, R×C cells of a block, N observed cells, S
-chains.
 chains.
 """
 
@@ -33,9 +32,10 @@ from benchnav.planning.sensing.labels import (
 from benchnav.planning.sensing.sites import MIN_CHANGE, Block, Evidence, Sites
 
 _ROUNDS = 6  # sweeps in an update
-_COUNTED = 3  # the last of them, which estimate probabilities
-# Passes over observed cells with stored random numbers; later passes take those of
-# other cells.
+_COUNTED = 3  # final sweeps, from which probabilities are estimated
+_FIRST_COUNTED = _ROUNDS - _COUNTED
+# Passes over observed cells with stored random numbers. Later passes use those of other
+# cells.
 _PASSES = 8
 _STEP = 13, 31  # offset of these cells in rows and columns, on the torus
 _STARTS = 4096  # stored random numbers of resamplings
@@ -59,50 +59,55 @@ def draw_labels(
     """
     block = Block.around(evidence, changed, strength)
     sites = Sites.of(evidence, changed, block, window)
-    labels = evidence.labels[block.at]
-    filtered, scores = _filtered(labels, sites, evidence.sweeps, block.torus)
-    labels = torch.where(block.in_reach.flatten(1), filtered, labels)
-    inverse = torch.cholesky_inverse(sites.factor)
-    sweeps = evidence.sweeps
     shape = block.row.shape
+    sweeps = evidence.sweeps
+    old_labels = evidence.labels[block.at]
+    filtered, scores = _filtered(old_labels, sites, sweeps, block.torus)
+    in_reach = block.in_reach.flatten(1)
+    labels = torch.where(in_reach, filtered, old_labels).view(shape)
+    inverse = torch.cholesky_inverse(sites.factor)
     p_observed = torch.zeros_like(sites.std)
     n_first = torch.zeros_like(block.p_first)
     for turn in range(_ROUNDS):
         drawn = block.noise(sweeps)
-        labels = sweep_labels(
-            labels.view(shape), block.lattice, block.free, block.even, drawn
-        )
-        if turn == _ROUNDS - _COUNTED:
+        labels = sweep_labels(labels, block.lattice, block.free, block.even, drawn)
+        if turn == _FIRST_COUNTED:
             labels, scores = _flip_patch(
                 labels, scores, sites, block, inverse, drawn, sweeps
             )
-        if turn >= _ROUNDS - _COUNTED:
-            labels, scores, p_visited = _draw_observed(
-                labels.flatten(1), scores, sites, inverse, sweeps, block.torus
+        if turn >= _FIRST_COUNTED:
+            flat = labels.flatten(1)
+            flat, scores, p_visited = _draw_observed(
+                flat, scores, sites, inverse, sweeps, block.torus
             )
-            labels = labels.view(shape)
+            labels = flat.view(shape)
             p_observed = p_observed + p_visited / _COUNTED
             bonded = connected_to_evidence(labels, block.lattice, block.evidence, drawn)
-            # Cells that no bonds join to evidence have either label with probability ½.
+            n_bonded_first = count_bits(labels & bonded)
             n_unbonded = CHAINS - count_bits(bonded)
-            n_first = n_first + count_bits(labels & bonded) + 0.5 * n_unbonded
+            # Cells that no bonds join to evidence have either label with probability ½.
+            n_first = n_first + n_bonded_first + 0.5 * n_unbonded
         sweeps = sweeps + 1
-    estimate = (n_first + 0.5) / (CHAINS * _COUNTED + 1)
-    moved = (block.free != 0) & ((estimate - block.p_first).abs() >= MIN_CHANGE)
-    block_p = torch.where(moved, estimate, block.p_first).flatten(1)
-    p_first = evidence.p_first.index_put(block.at, block_p)
-    member = block.at[0].expand_as(sites.cell)
-    # A settled cell that a patch, or its chains, took to the other label has the
-    # probability of the first among its chains.
-    p_chains = count_bits(labels.flatten(1).gather(1, sites.cell)) / CHAINS
+    labels = labels.flatten(1)
+    p_block = (n_first + 0.5) / (CHAINS * _COUNTED + 1)
+    has_moved = (p_block - block.p_first).abs() >= MIN_CHANGE
+    is_replaced = (block.free != 0) & has_moved
+    p_block = torch.where(is_replaced, p_block, block.p_first)
+    p_first = evidence.p_first.index_put(block.at, p_block.flatten(1))
+    # A settled cell whose label was changed by a patch or by resampling has the
+    # fraction of its chains with the first label.
+    site_labels = labels.gather(1, sites.cell)
+    p_chains = count_bits(site_labels) / CHAINS
     p_before = block.p_first.flatten(1).gather(1, sites.cell)
-    turned = sites.flippable & ~sites.open & ((p_chains - p_before).abs() > 1 / CHAINS)
+    has_turned = (p_chains - p_before).abs() > 1 / CHAINS
+    turned = sites.flippable & ~sites.open & has_turned
     updated = sites.open | turned
+    p_sites = torch.where(turned, p_chains, p_observed)
+    member = block.at[0].expand_as(sites.cell)
     at = member[updated], sites.row[updated], sites.column[updated]
-    p_sites = torch.where(turned, p_chains, p_observed)[updated]
-    p_first = p_first.index_put(at, p_sites)
-    labels = evidence.labels.index_put(block.at, labels.flatten(1))
-    return replace(evidence, p_first=p_first, labels=labels, sweeps=sweeps)
+    p_first = p_first.index_put(at, p_sites[updated])
+    new_labels = evidence.labels.index_put(block.at, labels)
+    return replace(evidence, p_first=p_first, labels=new_labels, sweeps=sweeps)
 
 
 def _filtered(
@@ -116,29 +121,42 @@ def _filtered(
     fresh = sites.fresh
     factor = sites.factor
     scores = sites.scores.clone()
-    white = torch.linalg.solve_triangular(factor, scores.transpose(1, 2), upper=False)
+    by_site = scores.transpose(1, 2)
+    white = torch.linalg.solve_triangular(factor, by_site, upper=False)
     white = white.transpose(1, 2).contiguous()
     log_weights = torch.zeros_like(scores[:, :, 0])
-    begin = int((~fresh).int().cumprod(1).sum(1).min())
+    n_old = (~fresh).int().cumprod(1).sum(1)
+    begin = int(n_old.min())
     uniforms = _uniforms(sweeps, sites, torus, begin)
     for site in range(begin, fresh.shape[1]):
-        new = fresh[:, site, None]
-        scale = factor[:, site, site, None]
-        mean = (white[:, :, :site] @ factor[:, site, :site, None])[..., 0]
+        is_new = fresh[:, site, None]
+        row = factor[:, site]
+        scale = row[:, site, None]
+        variance = scale.square()
+        product = white[:, :, :site] @ row[:, :site, None]
+        mean = product[..., 0]
+        site_uniforms = uniforms[:, site - begin]
         first, _, log_density, score = sites.draw(
-            site, mean, scale.square(), labels, uniforms[:, site - begin]
+            site, mean, variance, labels, site_uniforms
         )
-        white[:, :, site] = torch.where(new, (score - mean) / scale, white[:, :, site])
-        scores[:, :, site] = torch.where(new, score, scores[:, :, site])
-        log_weights = log_weights + torch.where(new, log_density, 0.0)
-        labels = _put(labels, sites.cell[:, site], first, new)
-    # Systematic resampling, which keeps all chains if their weights are equal.
-    start = _starts().to(labels.device)[sweeps % _STARTS, None]
-    steps = (torch.arange(CHAINS, device=labels.device) + start) / CHAINS
+        new_white = (score - mean) / scale
+        old_white = white[:, :, site]
+        white[:, :, site] = torch.where(is_new, new_white, old_white)
+        old_score = scores[:, :, site]
+        scores[:, :, site] = torch.where(is_new, score, old_score)
+        gain = torch.where(is_new, log_density, 0.0)
+        log_weights = log_weights + gain
+        labels = _put(labels, sites.cell[:, site], first, is_new)
+    # Systematic resampling keeps all chains if their weights are equal.
+    starts = _starts().to(labels.device)
+    start = starts[sweeps % _STARTS, None]
+    index = torch.arange(CHAINS, device=labels.device)
+    steps = (index + start) / CHAINS
     cumulative = torch.softmax(log_weights, 1).cumsum(1)
     chain = torch.searchsorted(cumulative, steps).clamp(max=CHAINS - 1)
-    labels = packed((labels[..., None] >> chain[:, None]) & 1)
-    return labels, scores.gather(1, chain[..., None].expand_as(scores))
+    bits = (labels[..., None] >> chain[:, None]) & 1
+    score_index = chain[..., None].expand_as(scores)
+    return packed(bits), scores.gather(1, score_index)
 
 
 def _flip_patch(
@@ -152,34 +170,49 @@ def _flip_patch(
 ) -> tuple[Tensor, Tensor]:
     """Propose the other label for the patch of the last new cell (Metropolis).
 
-    Single labels cannot leave a wrong class, since neighbouring scores are correlated.
-    A patch with cells that are out of reach, or observed as intervals, is not flipped.
+    Moves of single labels cannot leave a wrong class, since neighbouring scores are
+    correlated. A patch is not flipped if any of its cells is out of reach or observed
+    as an interval.
     """
     flippable = sites.flippable
     cell = sites.cell
     flat = labels.flatten(1)
     may_flip = torch.zeros_like(flat, dtype=torch.bool)
     may_flip = may_flip.scatter_reduce(1, cell, flippable, "amax").view_as(labels)
-    barred = (block.pair > 0) & (~block.in_reach | (block.observed & ~may_flip))
+    is_fixed = block.observed & ~may_flip
+    barred = (block.pair > 0) & (~block.in_reach | is_fixed)
+    last_cell = cell[:, -1:]
+    last_bits = -flippable[:, -1:].long()
     seed = torch.zeros_like(flat)
-    seed = seed.scatter_(1, cell[:, -1:], -flippable[:, -1:].long()).view_as(labels)
+    seed = seed.scatter_(1, last_cell, last_bits).view_as(labels)
     patch = connected_to_evidence(labels, block.lattice, seed, drawn)
     in_patch = unpacked(patch.flatten(1))
-    is_barred = (in_patch & barred.flatten(1)[..., None]).any(1)
-    sites_in_patch = in_patch.gather(1, cell[..., None].expand(-1, -1, CHAINS))
+    barred_cells = barred.flatten(1)[..., None]
+    is_barred = (in_patch & barred_cells).any(1)
+    site_index = cell[..., None].expand(-1, -1, CHAINS)
+    sites_in_patch = in_patch.gather(1, site_index)
     flips = (sites_in_patch & flippable[..., None]).transpose(1, 2)
-    first = unpacked(flat.gather(1, cell)).transpose(1, 2)
-    flipped_scores = torch.where(first, sites.lower[:, 1:], sites.lower[:, :1])
+    site_labels = flat.gather(1, cell)
+    first = unpacked(site_labels).transpose(1, 2)
+    first_scores = sites.lower[:, :1]
+    second_scores = sites.lower[:, 1:]
+    flipped_scores = torch.where(first, second_scores, first_scores)
     proposed = torch.where(flips, flipped_scores, scores)
     sign = torch.where(first, 1.0, -1.0)
-    gain = (sites.density[:, 1:] - sites.density[:, :1]) * sign
+    density_change = sites.density[:, 1:] - sites.density[:, :1]
+    gain = density_change * sign
     log_ratio = torch.where(flips, gain, 0.0).sum(2)
-    quadratic = ((proposed - scores) @ inverse) * (proposed + scores)
+    change = proposed - scores
+    quadratic = (change @ inverse) * (proposed + scores)
     log_ratio = log_ratio - 0.5 * quadratic.sum(2)
-    uniforms = _uniforms(sweeps + 1, sites, block.torus, cell.shape[1] - 1)
-    accepted = ~is_barred & (uniforms[:, 0, :, 0].log() < log_ratio)
-    labels = labels ^ (patch & packed(accepted)[:, None, None])
-    return labels, torch.where(accepted[..., None], proposed, scores)
+    last_site = cell.shape[1] - 1
+    uniforms = _uniforms(sweeps + 1, sites, block.torus, last_site)
+    log_uniform = uniforms[:, 0, :, 0].log()
+    accepted = ~is_barred & (log_uniform < log_ratio)
+    accepted_bits = packed(accepted)[:, None, None]
+    new_labels = labels ^ (patch & accepted_bits)
+    new_scores = torch.where(accepted[..., None], proposed, scores)
+    return new_labels, new_scores
 
 
 def _draw_observed(
@@ -197,33 +230,41 @@ def _draw_observed(
     """
     scores = scores.clone()
     p_first = torch.zeros_like(sites.std)
-    open_sites = [int(site) for site in sites.open.any(0).nonzero()[:, 0].flip(0)]
+    is_open_anywhere = sites.open.any(0)
+    open_sites = is_open_anywhere.nonzero()[:, 0].flip(0).tolist()
     begin = open_sites[-1]
     uniforms = _uniforms(sweeps, sites, torus, begin)
     for site in open_sites:
-        new = sites.open[:, site, None]
+        is_open = sites.open[:, site, None]
         row = inverse[:, site]
         precision = row[:, site, None]
-        mean = scores[:, :, site] - (scores @ row[..., None])[..., 0] / precision
-        # An interval bounds the score with noise, whatever term stands for it.
-        noise = sites.std[:, site].square() - sites.noise[:, site]
+        product = scores @ row[..., None]
+        residual = product[..., 0] / precision
+        old_score = scores[:, :, site]
+        mean = old_score - residual
+        # The noise of an interval widens its bounds, whatever term represents it.
+        exact_noise = sites.std[:, site].square()
+        noise = exact_noise - sites.noise[:, site]
         variance = (1 / precision + noise[:, None]).clamp(min=1e-12)
+        site_uniforms = uniforms[:, site - begin]
         first, p_site, _, score = sites.draw(
-            site, mean, variance, labels, uniforms[:, site - begin]
+            site, mean, variance, labels, site_uniforms
         )
-        replaces = new & ~sites.censored[:, site, None]
-        scores[:, :, site] = torch.where(replaces, score, scores[:, :, site])
+        is_censored = sites.censored[:, site, None]
+        is_replaced = is_open & ~is_censored
+        scores[:, :, site] = torch.where(is_replaced, score, old_score)
         p_first[:, site] = p_site.mean(1)
-        labels = _put(labels, sites.cell[:, site], first, new)
+        labels = _put(labels, sites.cell[:, site], first, is_open)
     return labels, scores, p_first
 
 
-def _put(labels: Tensor, cell: Tensor, first: Tensor, new: Tensor) -> Tensor:
-    """Return the labels of a block, [B, RC], with those of one cell of each episode
-    replaced where they are new.
-    """
-    word = torch.where(new, packed(first)[:, None], labels.gather(1, cell[:, None]))
-    return labels.scatter(1, cell[:, None], word)
+def _put(labels: Tensor, cell: Tensor, first: Tensor, is_new: Tensor) -> Tensor:
+    """Replace the labels of one cell of each episode where they are new, [B, RC]."""
+    index = cell[:, None]
+    old_word = labels.gather(1, index)
+    new_word = packed(first)[:, None]
+    word = torch.where(is_new, new_word, old_word)
+    return labels.scatter(1, index, word)
 
 
 def _uniforms(passes: Tensor, sites: Sites, torus: int, begin: int) -> Tensor:
@@ -231,21 +272,26 @@ def _uniforms(passes: Tensor, sites: Sites, torus: int, begin: int) -> Tensor:
 
     Float64, shape [B, N, S, 2].
     """
-    uses = passes[:, None] // _PASSES
-    row = (sites.row[:, begin:] + _STEP[0] * uses) % torus
-    column = (sites.column[:, begin:] + _STEP[1] * uses) % torus
+    count = passes[:, None]
+    uses = count // _PASSES
+    row_step, column_step = _STEP
+    row = sites.row[:, begin:] + row_step * uses
+    column = sites.column[:, begin:] + column_step * uses
+    cell = (row % torus) * torus + column % torus
     bank = _tosses(torus).to(row.device)
-    return bank[passes[:, None] % _PASSES, row * torus + column].double()
+    return bank[count % _PASSES, cell].double()
 
 
 @lru_cache(maxsize=2)
 def _tosses(torus: int) -> Tensor:
     key = rng.stream_key(0, "labels", "cells")
-    uniform = rng.uniform(key, np.arange(_PASSES), (torus**2, CHAINS, 2))
+    shape = torus**2, CHAINS, 2
+    uniform = rng.uniform(key, np.arange(_PASSES), shape)
     return torch.from_numpy(uniform).float()
 
 
 @lru_cache(maxsize=1)
 def _starts() -> Tensor:
     key = rng.stream_key(0, "labels", "chains")
-    return torch.from_numpy(rng.uniform(key, np.arange(_STARTS)))
+    uniform = rng.uniform(key, np.arange(_STARTS))
+    return torch.from_numpy(uniform)

@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 
 from benchnav.core.batch import Batch
-from benchnav.planning.sensing import copula as within
-from benchnav.planning.sensing.copula import CopulaState
+from benchnav.planning.sensing import copula_state
+from benchnav.planning.sensing.copula_state import CopulaState
 from benchnav.planning.sensing.sensor import MIN_STD, Measurement
 from benchnav.planning.sensing.sites import Evidence
 from benchnav.planning.sensing.truncated_normal import interval_moments
 
-# Change of an observed score below which its label is not drawn again.
+# Minimum change of an observed score after which its label is drawn again.
 _SAME_SCORE = 0.05
 MIN_PROBABILITY = 1e-9
 """Minimum probability of a class, so that its log odds are finite."""
@@ -27,14 +27,14 @@ class ClassesState(Batch):
     """State of the belief of look-alike classes.
 
     Args:
-        copula: scores at the more probable class of each observed cell; its prediction
-            is that of the first class.
+        copula: scores under the more probable class of each observed cell; its
+            prediction is that of the first class.
         per_class: observations under the first and under the second class; their
             posterior scores are not computed.
         density: log f / φ of the observation under either class, 0 for an interval,
             shape [B, 2, H, W].
-        pair: index of the pair of each cell, from 1; 0 without one, int64, shape
-            [B, H, W].
+        pair: index of the pair of each cell, from 1; 0 if the cell has no pair, int64,
+            shape [B, H, W].
         odds: predicted log odds of the first class, float64, shape [B, H, W].
         p_first: posterior probability of the first class under even prior odds,
             float64, shape [B, H, W].
@@ -62,15 +62,23 @@ class ClassesState(Batch):
 
 
 def log_density_ratio(given_class: CopulaState, cells: Tensor, value: Tensor) -> Tensor:
-    """Return log f / φ of observed λ [N] in some cells under a class, shape [N].
+    """Return log f / φ of observed λ under a class, shape [N].
 
-    It is 0 for intervals.
+    Args:
+        given_class: observations under the class.
+        cells: mask of N cells, bool, shape [B, H, W].
+        value: observed λ, shape [N].
+
+    Returns:
+        Log of the ratio, 0 for intervals, shape [N].
     """
-    low, high = within.scores_at(given_class.prior, cells, value)
+    low, high = copula_state.scores_at(given_class.prior, cells, value)
     prior = given_class.prior.at(cells)
-    log_prob = prior.log_prob(value[None].double())[0].double()
-    log_ratio = log_prob + 0.5 * (low.square() + math.log(2 * math.pi))
-    return torch.where(high > low, 0.0, log_ratio)
+    values = value[None].double()
+    log_prob = prior.log_prob(values)[0].double()
+    log_tau = math.log(2 * math.pi)
+    log_normal = 0.5 * (low.square() + log_tau)
+    return torch.where(high > low, 0.0, log_prob + log_normal)
 
 
 def note(state: ClassesState, sensed: Measurement) -> tuple[ClassesState, Tensor]:
@@ -83,24 +91,37 @@ def note(state: ClassesState, sensed: Measurement) -> tuple[ClassesState, Tensor
     per_class = []
     density = state.density.clone()
     for part, given_class in enumerate(state.per_class):
-        noted, news = within.note(given_class, sensed)
-        if bool(news.any()):
-            value = sensed.traversability[news]
-            std = sensed.std[news].double().clamp(min=MIN_STD)
-            low, high = within.scores_at(given_class.prior, news, value)
-            # A repeated number adds its own density, and that of its distance from the
-            # earlier one.
-            old = given_class.lower[news]
-            old_std = given_class.noise_std[news]
-            is_repeated = (high <= low) & (old >= given_class.upper[news])
-            squared = (low - old).square() / (std.square() + old_std.square())
-            new_density = log_density_ratio(given_class, news, value)
-            total = density[:, part][news] + new_density - 0.5 * squared
-            density[:, part][news] = torch.where(is_repeated, total, new_density)
+        noted, is_new = copula_state.note(given_class, sensed)
+        if bool(is_new.any()):
+            class_density = density[:, part]
+            class_density[is_new] = _new_density(
+                given_class, sensed, is_new, class_density[is_new]
+            )
         per_class.append(noted)
-        changed |= news
+        changed |= is_new
     first, second = per_class
     return replace(state, per_class=(first, second), density=density), changed
+
+
+def _new_density(
+    before: CopulaState, sensed: Measurement, is_new: Tensor, old_density: Tensor
+) -> Tensor:
+    """Return log f / φ of changed observations under a class, shape [N].
+
+    A repeated number adds its own density, and that of its distance from the earlier
+    number.
+    """
+    value = sensed.traversability[is_new]
+    std = sensed.std[is_new].double().clamp(min=MIN_STD)
+    low, high = copula_state.scores_at(before.prior, is_new, value)
+    old_low = before.lower[is_new]
+    old_std = before.noise_std[is_new]
+    is_repeated = (high <= low) & (old_low >= before.upper[is_new])
+    variance = std.square() + old_std.square()
+    squared = (low - old_low).square() / variance
+    density = log_density_ratio(before, is_new, value)
+    total = old_density + density - 0.5 * squared
+    return torch.where(is_repeated, total, density)
 
 
 def moved_cells(before: ClassesState, after: ClassesState) -> Tensor:
@@ -110,19 +131,25 @@ def moved_cells(before: ClassesState, after: ClassesState) -> Tensor:
     """
     moved = before.pair != after.pair
     for old, new in zip(before.per_class, after.per_class, strict=True):
-        for old_end, new_end in ((old.lower, new.lower), (old.upper, new.upper)):
-            is_near = (old_end - new_end).abs() <= _SAME_SCORE
-            moved |= ~((old_end == new_end) | is_near)
-    return moved & after.per_class[0].observed & (after.pair > 0)
+        for name in ("lower", "upper"):
+            old_end = getattr(old, name)
+            new_end = getattr(new, name)
+            # Infinite ends may be equal, but their difference is NaN.
+            is_close = (old_end - new_end).abs() <= _SAME_SCORE
+            moved |= ~((old_end == new_end) | is_close)
+    observed = after.per_class[0].observed
+    return moved & observed & (after.pair > 0)
 
 
 def evidence_of(state: ClassesState) -> Evidence:
     """Return the evidence from which labels are drawn."""
     first, second = state.per_class
+    lower = torch.stack((first.lower, second.lower), 1)
+    upper = torch.stack((first.upper, second.upper), 1)
     return Evidence(
         field=state.copula.field,
-        lower=torch.stack((first.lower, second.lower), 1),
-        upper=torch.stack((first.upper, second.upper), 1),
+        lower=lower,
+        upper=upper,
         noise_std=first.noise_std,
         density=state.density,
         precision=state.copula.precision,
@@ -139,19 +166,18 @@ def labelled(state: ClassesState) -> CopulaState:
 
     Intervals that differ from before have no terms.
     """
-    chosen = state.probability() >= 0.5
+    is_first = state.probability() >= 0.5
     first, second = state.per_class
     before = state.copula
-    lower, upper, noise_std = (
-        torch.where(chosen, getattr(first, name), getattr(second, name))
-        for name in ("lower", "upper", "noise_std")
-    )
+    lower = torch.where(is_first, first.lower, second.lower)
+    upper = torch.where(is_first, first.upper, second.upper)
+    noise_std = torch.where(is_first, first.noise_std, second.noise_std)
     is_number = upper <= lower
     same_ends = (lower == before.lower) & (upper == before.upper)
-    same = same_ends & (noise_std == before.noise_std)
-    old_precision = torch.where(same, before.precision, 0.0)
+    is_same = same_ends & (noise_std == before.noise_std)
+    old_precision = torch.where(is_same, before.precision, 0.0)
     precision = torch.where(is_number, 1 / noise_std.square(), old_precision)
-    old_shift = torch.where(same, before.shift, 0.0)
+    old_shift = torch.where(is_same, before.shift, 0.0)
     shift = torch.where(is_number, precision * lower, old_shift)
     return replace(
         before,
@@ -170,14 +196,13 @@ def moments_of(state: ClassesState) -> tuple[Tensor, Tensor, Tensor]:
     Each has the shape [B, 2, H, W].
     """
     copula = state.copula
-    chosen = state.probability() >= 0.5
     cells = copula.observed & (state.pair > 0)
-    means, stds, skews = (
-        torch.stack((values, values), 1)
-        for values in (copula.mean, copula.std, copula.skew)
-    )
+    means = torch.stack((copula.mean, copula.mean), 1)
+    stds = torch.stack((copula.std, copula.std), 1)
+    skews = torch.stack((copula.skew, copula.skew), 1)
     if not bool(cells.any()):
         return means, stds, skews
+    is_first = state.probability()[cells] >= 0.5
     mean = copula.mean[cells]
     variance = copula.std[cells].square().clamp(min=1e-12)
     # The cavity of the cell's own term. The prior field has a precision of 1.
@@ -185,23 +210,45 @@ def moments_of(state: ClassesState) -> tuple[Tensor, Tensor, Tensor]:
     centre = (mean / variance - copula.shift[cells]) / cavity_precision
     cavity = 1 / cavity_precision
     for part, given_class in enumerate(state.per_class):
-        lower = given_class.lower[cells]
-        upper = given_class.upper[cells]
-        total = cavity + given_class.noise_std[cells].square()
-        gain = cavity / total
-        is_number = upper <= lower
-        bounds = centre, total, lower, torch.where(is_number, lower + 1, upper)
-        moments = interval_moments(*(values.cpu().numpy() for values in bounds))
-        noisy_mean, noisy_variance = (
-            torch.from_numpy(values).to(lower) for values in moments
-        )
-        noisy_mean = torch.where(is_number, lower, noisy_mean)
-        noisy_variance = torch.where(is_number, 0.0, noisy_variance)
-        std = (cavity - cavity * gain + gain.square() * noisy_variance).sqrt()
-        new_mean = centre + gain * (noisy_mean - centre)
-        new = new_mean, std, torch.zeros_like(std)
-        is_chosen = chosen[cells] == (part == 0)
-        for values, new_values in zip((means, stds, skews), new, strict=True):
-            old_values = values[:, part][cells]
-            values[:, part][cells] = torch.where(is_chosen, old_values, new_values)
+        new_mean, new_std = _moments_given(given_class, cells, centre, cavity)
+        # The posterior already holds under the more probable class.
+        is_chosen = is_first == (part == 0)
+        new_skew = torch.zeros_like(new_std)
+        updates = (means, new_mean), (stds, new_std), (skews, new_skew)
+        for values, new_values in updates:
+            class_values = values[:, part]
+            old_values = class_values[cells]
+            class_values[cells] = torch.where(is_chosen, old_values, new_values)
     return means, stds, skews
+
+
+def _moments_given(
+    given_class: CopulaState, cells: Tensor, centre: Tensor, cavity: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return mean and standard deviation of scores under a class, each of shape [N].
+
+    Args:
+        given_class: observations under the class.
+        cells: mask of N observed cells, bool, shape [B, H, W].
+        centre: cavity mean, shape [N].
+        cavity: cavity variance, shape [N].
+    """
+    lower = given_class.lower[cells]
+    upper = given_class.upper[cells]
+    total = cavity + given_class.noise_std[cells].square()
+    gain = cavity / total
+    is_number = upper <= lower
+    # A number has no interval; its moments are replaced below.
+    interval_upper = torch.where(is_number, lower + 1, upper)
+    intervals = centre, total, lower, interval_upper
+    arrays = [values.cpu().numpy() for values in intervals]
+    moments = interval_moments(*arrays)
+    noisy_mean, noisy_variance = (
+        torch.from_numpy(values).to(lower) for values in moments
+    )
+    noisy_mean = torch.where(is_number, lower, noisy_mean)
+    noisy_variance = torch.where(is_number, 0.0, noisy_variance)
+    added_variance = gain.square() * noisy_variance
+    variance = cavity - cavity * gain + added_variance
+    mean = centre + gain * (noisy_mean - centre)
+    return mean, variance.sqrt()

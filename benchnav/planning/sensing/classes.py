@@ -2,22 +2,22 @@
 conditions λ within the class.
 
 Some classes look exactly alike, so that a prediction splits a cell's weight between the
-two classes of a pair. Such a cell has one label, the first class or the second. Under
-either label, its prediction is the one in which that class has all of the pair's
-weight; the weights of other classes are unchanged. A cell that may be of two pairs is
-of the heavier one. Given labels c and normal scores z_i = Φ⁻¹(F_i(y_i | c_i)) of
-observed λ y, the joint density of all observations is
+two classes of a pair. Such a cell has a label, the first class or the second. Under
+either label, that class has all of the pair's weight in the cell's prediction; the
+weights of other classes are unchanged. A cell that may belong to two pairs belongs to
+the heavier one. Given labels c and normal scores z_i = Φ⁻¹(F_i(y_i | c_i)) of observed
+λ y, the joint density of all observations is
 
     p(y | c) = N(z; 0, K + noise) · Π_i f_i(y_i | c_i) / φ(z_i),
 
-with the correlations K of the scores; for λ at 0 or 1 it has the probability of an
-interval instead of the density. The labels are a Potts field without an outer field
-(`labels`), whose 64 chains are drawn given y (`chains`).
+where K is the correlation matrix of the scores. For λ of 0 or 1, the probability of an
+interval replaces the density. The labels are a Potts field without an outer field
+(`labels`), of which 64 chains are drawn given y (`chains`).
 
 The prediction's odds of the two classes enter a cell's own posterior once,
 P(first | y) ∝ odds · P(first | y, even odds). They are not an outer field of the
-chains: a model has used the neighbours of a cell, and an outer field would count this
-evidence once for each of them. Without measurements a cell has the model's
+chains: the model has already used the neighbours of a cell, and an outer field would
+count this evidence once more for each of them. Without measurements a cell has the model's
 probabilities.
 
 λ is then the average of its distributions under either label, each conditioned as in
@@ -41,7 +41,7 @@ from benchnav.core.conditioned import ConditionedDistribution
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import expect
 from benchnav.core.pooled import PooledDistribution
-from benchnav.planning.sensing import copula as within
+from benchnav.planning.sensing import copula_state
 from benchnav.planning.sensing.belief import Belief, CovarianceModel
 from benchnav.planning.sensing.chains import draw_labels
 from benchnav.planning.sensing.class_state import (
@@ -69,27 +69,28 @@ from benchnav.planning.sensing.sensor import Measurement
 
 _MAX_STRENGTH = 0.88  # ln(1 + √2) is critical
 _FIRST_SWEEPS = 40  # of cells without measurements, on whole maps
-_MORE_SWEEPS = 10  # of cells that are observed later
-_SAME_ODDS = 0.01  # of a prediction
+_MORE_SWEEPS = 10  # of cells whose appearance is observed later
+_MIN_STD = 1e-9  # of a score, as a divisor
+_SAME_ODDS = 0.01  # maximum difference of log odds that counts as none
 
 
 @dataclass(frozen=True)
 class Classes(Belief[ClassesState]):
     """Belief that updates the class of look-alike cells, and λ within the class.
 
-    Two things are approximate. If an observation is a number under one class and an
-    interval under the other, labels are weighed with the noise of the first class.
+    Two approximations are made. If an observation is a number under one class and an
+    interval under the other, labels are weighted with the noise of the first class.
     Drawn fields have no skewness under the less probable class.
 
     Args:
         correlation_m: assumed ℓ, as in `Copula`.
         window: maximum number of observations in an update, as in `Copula`.
-        strength: β, the log odds that a neighbour of one class adds; None for that of
-            the training maps, but at most 0.88. From 0.881 = ln(1 + √2) on a whole
-            Potts field tends to one class, so that few observations would decide the
-            class of all look-alike cells. A strength that is fitted to neighbours is
-            far above, 2.3 on stakes-v1. On its maps the mean log loss of P(class) of
-            cells up to 6 m from a path with measurements is 0.693 without evidence,
+        strength: β, the log odds that a neighbour adds for its own class; None for the
+            strength on the training maps, but at most 0.88. Above 0.881 = ln(1 + √2) a
+            Potts field tends to a single class, so that few observations would decide
+            the class of all look-alike cells. A strength fitted to neighbouring cells
+            is far higher, 2.3 on stakes-v1. On these maps the mean log loss of P(class)
+            in cells up to 6 m from a path with measurements is 0.693 without evidence,
             0.665 with β = 0.5, 0.617 with 0.8, 0.603 with 0.88, 0.624 with 1.0, 0.774
             with 1.4 and 1.070 with 2.15.
     """
@@ -120,11 +121,13 @@ class Classes(Belief[ClassesState]):
         """
         first, second, pair, odds = split(prior, covariance)
         copula = self._copula.init(first, covariance)
+        under_second = self._copula.init(second, covariance)
         zeros = torch.zeros_like(copula.mean)
+        density = torch.stack((zeros, zeros), 1)
         state = ClassesState(
             copula=copula,
-            per_class=(copula, self._copula.init(second, covariance)),
-            density=torch.stack((zeros, zeros), 1),
+            per_class=(copula, under_second),
+            density=density,
             pair=pair,
             odds=odds,
             p_first=zeros + 0.5,
@@ -141,21 +144,21 @@ class Classes(Belief[ClassesState]):
     ) -> ClassesState:
         """Draw labels near new observations, and condition cells there.
 
-        A new prediction replaces the old one in the cells that `Copula` takes. Observed
-        λ there is scored again; several measurements of a cell count as one.
+        A new prediction replaces the old one in the same cells as in `Copula`. Scores
+        of observed λ there are computed again; several measurements of a cell count as
+        one.
         """
         updated = state
         renewed = torch.zeros_like(sensed.mask)
         if prior is not None:
             updated, renewed = self._with_prior(state, prior)
         updated, changed = note(updated, sensed)
-        updated = self._draw_labels(
-            updated, changed | (renewed & moved_cells(state, updated))
-        )
+        rescored = renewed & moved_cells(state, updated)
+        updated = self._draw_labels(updated, changed | rescored)
         copula = labelled(updated)
-        other_label = (copula.lower != updated.copula.lower) | (
-            copula.upper != updated.copula.upper
-        )
+        other_lower = copula.lower != updated.copula.lower
+        other_upper = copula.upper != updated.copula.upper
+        other_label = other_lower | other_upper
         new = changed | (copula.observed & (renewed | other_label))
         copula = self._copula.learn(copula, new)
         updated = replace(updated, copula=copula)
@@ -163,30 +166,24 @@ class Classes(Belief[ClassesState]):
         cells = self.changed(state, updated)
         first, second = updated.per_class
         first_table = copula.table.having(first.prior, cells)
-        second_table = second.table.having(second.prior, cells & (updated.pair > 0))
-        return replace(
-            updated,
-            copula=replace(copula, table=first_table),
-            per_class=(first, replace(second, table=second_table)),
-        )
+        paired_cells = cells & (updated.pair > 0)
+        second_table = second.table.having(second.prior, paired_cells)
+        copula = replace(copula, table=first_table)
+        second = replace(second, table=second_table)
+        return replace(updated, copula=copula, per_class=(first, second))
 
-    def _draw_labels(self, state: ClassesState, news: Tensor) -> ClassesState:
+    def _draw_labels(self, state: ClassesState, new: Tensor) -> ClassesState:
         """Return the state with labels drawn near new observations, bool, [B, H, W]."""
-        members = (news & (state.pair > 0)).flatten(1).any(1).nonzero()[:, 0]
+        members = _members_with(new & (state.pair > 0))
         if len(members) == 0:
             return state
-        drawn = draw_labels(
-            evidence_of(state).select(members),
-            news[members],
-            self._strength(state.copula.covariance),
-            self.window,
-        )
-        return replace(
-            state,
-            p_first=state.p_first.index_copy(0, members, drawn.p_first),
-            labels=state.labels.index_copy(0, members, drawn.labels),
-            sweeps=state.sweeps.index_copy(0, members, drawn.sweeps),
-        )
+        strength = self._strength(state.copula.covariance)
+        evidence = evidence_of(state).select(members)
+        drawn = draw_labels(evidence, new[members], strength, self.window)
+        p_first = state.p_first.index_copy(0, members, drawn.p_first)
+        labels = state.labels.index_copy(0, members, drawn.labels)
+        sweeps = state.sweeps.index_copy(0, members, drawn.sweeps)
+        return replace(state, p_first=p_first, labels=labels, sweeps=sweeps)
 
     def distribution(self, state: ClassesState) -> TraversabilityDistribution:
         """Return the average of the distributions under either class.
@@ -196,15 +193,13 @@ class Classes(Belief[ClassesState]):
         if not statistics_of(state.copula.covariance).look_alikes:
             return self._copula.distribution(state.copula)
         dtype = state.copula.prior.dtype
-        first = state.probability()
         moments = [values.to(dtype) for values in moments_of(state)]
-        parts = [
-            ConditionedDistribution(
-                given_class.prior, *(values[:, part] for values in moments)
-            )
-            for part, given_class in enumerate(state.per_class)
-        ]
-        weights = torch.stack((first, 1 - first), 1).to(dtype)
+        parts = []
+        for part, given_class in enumerate(state.per_class):
+            mean, std, skew = (values[:, part] for values in moments)
+            parts.append(ConditionedDistribution(given_class.prior, mean, std, skew))
+        p_first = state.probability()
+        weights = torch.stack((p_first, 1 - p_first), 1).to(dtype)
         return PooledDistribution(tuple(parts), weights)
 
     def at(self, state: ClassesState, cells: Tensor) -> TabulatedDistribution:
@@ -217,28 +212,31 @@ class Classes(Belief[ClassesState]):
         if not bool(has_pair.any()):
             return copula_belief
         cells = cells & (state.pair > 0)
-        moments = [values.movedim(1, -1)[cells] for values in moments_of(state)]
+        by_class = [values.movedim(1, -1) for values in moments_of(state)]
+        moments = [values[cells] for values in by_class]
         tables = state.copula.table, state.per_class[1].table
         under_class = []
         for part, given_class in enumerate(state.per_class):
             table = tables[part].having(given_class.prior, cells)
-            part_moments = (values[:, part] for values in moments)
-            under_class.append(table.below(cells, *part_moments))
+            mean, std, skew = (values[:, part] for values in moments)
+            under_class.append(table.below(cells, mean, std, skew))
         under_first, under_second = under_class
-        p_first = state.probability()[cells][:, None].to(under_first)
+        p_first = state.probability()[cells].to(under_first)
+        pooled = torch.lerp(under_second, under_first, p_first[:, None])
         below = copula_belief.below.clone()
-        pooled = torch.lerp(under_second, under_first, p_first)
         below[:, 0, has_pair] = pooled.T.to(below)
         return TabulatedDistribution(below)
 
     def changed(self, before: ClassesState, after: ClassesState) -> Tensor:
         """Return a mask of cells whose score, class or prediction changed."""
         moved = self._copula.changed(before.copula, after.copula)
+        other_probability = before.p_first != after.p_first
         other_odds = before.odds != after.odds
-        moved |= ((before.p_first != after.p_first) | other_odds) & (after.pair > 0)
+        moved |= (other_probability | other_odds) & (after.pair > 0)
         for old, new in zip(before.per_class, after.per_class, strict=True):
-            rescored = (old.lower != new.lower) | (old.noise_std != new.noise_std)
-            moved |= new.observed & rescored
+            other_score = old.lower != new.lower
+            other_noise = old.noise_std != new.noise_std
+            moved |= new.observed & (other_score | other_noise)
             if old.prior is not new.prior:
                 moved |= old.prior.differs(new.prior)
         return moved
@@ -248,16 +246,13 @@ class Classes(Belief[ClassesState]):
     ) -> ClassesState:
         """Replace episodes; see `Belief`."""
         put = self._copula.put
+        copula = put(state.copula, members, others.copula)
         first, second = state.per_class
         new_first, new_second = others.per_class
-        return replace(
-            state.put(members, others),
-            copula=put(state.copula, members, others.copula),
-            per_class=(
-                put(first, members, new_first),
-                put(second, members, new_second),
-            ),
-        )
+        first = put(first, members, new_first)
+        second = put(second, members, new_second)
+        merged = state.put(members, others)
+        return replace(merged, copula=copula, per_class=(first, second))
 
     def sample_fields(
         self, state: ClassesState, count: int, keys: Sequence[int]
@@ -265,37 +260,34 @@ class Classes(Belief[ClassesState]):
         """Draw a chain's labels, then scores given all observations, and λ of both.
 
         Prior odds can make the probability of a label differ from its fraction among
-        the chains. Labels of the less likely class are then changed to the other. One
-        number a field decides this for all cells, so that patches stay whole.
+        the chains. Labels of the less likely class are then changed to the other class,
+        by one random number per field, so that patches remain whole.
         """
         scores = self._copula.sample_scores(state.copula, count, keys)
         means, stds, _ = moments_of(state)
-        spread = stds / state.copula.std.clamp(min=MIN_PROBABILITY)[:, None]
-        of_chains = count_bits(state.labels) / CHAINS
-        p_first = state.probability()
-        others = (1 - of_chains).clamp(min=MIN_PROBABILITY)
-        p_to_first = ((p_first - of_chains) / others).clamp(min=0)
-        firsts = of_chains.clamp(min=MIN_PROBABILITY)
-        p_to_second = ((of_chains - p_first) / firsts).clamp(min=0)
+        score_std = state.copula.std.clamp(min=_MIN_STD)
+        scales = stds / score_std[:, None]
+        p_to_first, p_to_second = _switch_probabilities(state)
         streams = [rng.stream_key(key, "labels") for key in keys]
-        uniform = np.stack(
-            [rng.uniform(stream, np.arange(count), (2,)) for stream in streams]
-        )
-        drawn = torch.from_numpy(uniform).to(scores.device)
+        indices = np.arange(count)
+        uniforms = [rng.uniform(stream, indices, (2,)) for stream in streams]
+        drawn = torch.from_numpy(np.stack(uniforms)).to(scores.device)
         chains = (drawn[..., 0] * CHAINS).long()
+        tosses = drawn[..., 1]
         fields = []
-        for index, drawn_scores in enumerate(scores.unbind(1)):
-            bit = state.labels >> chains[:, index, None, None] & 1
-            first = bit.bool()
-            toss = drawn[:, index, 1, None, None]
-            first = torch.where(first, toss >= p_to_second, toss < p_to_first)
-            first = first | (state.pair == 0)
-            away = drawn_scores - state.copula.mean
+        for index, field_scores in enumerate(scores.unbind(1)):
+            chain = chains[:, index, None, None]
+            toss = tosses[:, index, None, None]
+            bits = state.labels >> chain & 1
+            in_first = bits.bool()
+            is_first = torch.where(in_first, toss >= p_to_second, toss < p_to_first)
+            is_first = is_first | (state.pair == 0)
+            residual = field_scores - state.copula.mean
             parts = []
             for part, given_class in enumerate(state.per_class):
-                score = means[:, part] + spread[:, part] * away
+                score = means[:, part] + scales[:, part] * residual
                 parts.append(given_class.fields(score[:, None])[:, 0])
-            fields.append(torch.where(first, parts[0], parts[1]))
+            fields.append(torch.where(is_first, parts[0], parts[1]))
         return torch.stack(fields, 1)
 
     def _strength(self, covariance: CovarianceModel) -> float:
@@ -306,7 +298,7 @@ class Classes(Belief[ClassesState]):
 
     def _sweep(self, state: ClassesState, fresh: Tensor, count: int) -> ClassesState:
         """Sweep labels of unobserved cells, bool [B, H, W], given those of all others."""
-        members = fresh.flatten(1).any(1).nonzero()[:, 0]
+        members = _members_with(fresh)
         if len(members) == 0:
             return state
         fresh = fresh[members]
@@ -314,10 +306,12 @@ class Classes(Belief[ClassesState]):
         sweeps = state.sweeps[members]
         strength = self._strength(state.copula.covariance)
         lattice = Lattice.of(state.pair[members], strength)
-        height, width = fresh.shape[1:]
-        row = torch.arange(height, device=fresh.device)[:, None].expand_as(fresh)
-        column = torch.arange(width, device=fresh.device).expand_as(fresh)
         degree = lattice.degree()
+        height, width = fresh.shape[1:]
+        rows = torch.arange(height, device=fresh.device)
+        columns = torch.arange(width, device=fresh.device)
+        row = rows[:, None].expand_as(fresh)
+        column = columns.expand_as(fresh)
         free = -fresh.long()
         even = -((row + column) % 2)
         torus = max(height, width)
@@ -325,11 +319,9 @@ class Classes(Belief[ClassesState]):
             bits = noise(sweeps, row, column, degree, strength, torus)
             labels = sweep_labels(labels, lattice, free, even, bits)
             sweeps = sweeps + 1
-        return replace(
-            state,
-            labels=state.labels.index_copy(0, members, labels),
-            sweeps=state.sweeps.index_copy(0, members, sweeps),
-        )
+        all_labels = state.labels.index_copy(0, members, labels)
+        all_sweeps = state.sweeps.index_copy(0, members, sweeps)
+        return replace(state, labels=all_labels, sweeps=all_sweeps)
 
     def _with_prior(
         self, state: ClassesState, prior: TraversabilityDistribution
@@ -340,20 +332,22 @@ class Classes(Belief[ClassesState]):
             The state, and the mask of cells with a new prediction, bool, [B, H, W].
         """
         first, second, pair, odds = split(prior, state.copula.covariance)
-        new_first, first_differs = within.with_prior(state.per_class[0], first)
-        new_second, second_differs = within.with_prior(state.per_class[1], second)
+        new_first, first_differs = copula_state.with_prior(state.per_class[0], first)
+        new_second, second_differs = copula_state.with_prior(state.per_class[1], second)
         odds_differ = (odds - state.odds).abs() > _SAME_ODDS
         renewed = first_differs | second_differs | odds_differ
         rescored = renewed & new_first.observed
         density = state.density.clone()
         for part, given_class in enumerate((new_first, new_second)):
             value = given_class.value[rescored]
-            density[:, part][rescored] = log_density_ratio(given_class, rescored, value)
+            log_ratio = log_density_ratio(given_class, rescored, value)
+            density[:, part][rescored] = log_ratio
         fresh = renewed & (pair != state.pair)
         table = state.copula.table.without(first_differs)
+        copula = replace(state.copula, prior=new_first.prior, table=table)
         updated = replace(
             state,
-            copula=replace(state.copula, prior=new_first.prior, table=table),
+            copula=copula,
             per_class=(new_first, new_second),
             density=density,
             pair=torch.where(renewed, pair, state.pair),
@@ -361,8 +355,31 @@ class Classes(Belief[ClassesState]):
             p_first=torch.where(fresh, 0.5, state.p_first),
             labels=torch.where(fresh, _fair(pair), state.labels),
         )
-        return self._sweep(updated, fresh & (pair > 0), _MORE_SWEEPS), renewed
+        swept = self._sweep(updated, fresh & (pair > 0), _MORE_SWEEPS)
+        return swept, renewed
 
 
 def _fair(pair: Tensor) -> Tensor:
-    return fair(*pair.shape[1:]).to(pair.device).expand_as(pair)
+    height, width = pair.shape[1:]
+    labels = fair(height, width).to(pair.device)
+    return labels.expand_as(pair)
+
+
+def _members_with(cells: Tensor) -> Tensor:
+    """Return the indices of episodes with a cell of a mask, int64."""
+    return cells.flatten(1).any(1).nonzero()[:, 0]
+
+
+def _switch_probabilities(state: ClassesState) -> tuple[Tensor, Tensor]:
+    """Return probabilities of switching a label to the first class and to the second.
+
+    They make up for the difference between the posterior probability of the first class
+    and its fraction among the chains. Each has the shape [B, H, W].
+    """
+    p_first = state.probability()
+    of_chains = count_bits(state.labels) / CHAINS
+    in_second = (1 - of_chains).clamp(min=MIN_PROBABILITY)
+    p_to_first = ((p_first - of_chains) / in_second).clamp(min=0)
+    in_first = of_chains.clamp(min=MIN_PROBABILITY)
+    p_to_second = ((of_chains - p_first) / in_first).clamp(min=0)
+    return p_to_first, p_to_second

@@ -1,8 +1,8 @@
 """Conditioning of the maps of one episode on its observations, and the estimate of ℓ.
 
 Only cells within `_REACH` ℓ of changed observations are updated, from all observations
-within `_BEYOND` ℓ more. They change only if mean or standard deviation of the score
-move by `_MIN_CHANGE` or more.
+up to `_BEYOND` ℓ farther away. A cell changes only if the mean or the standard
+deviation of its score moves by `_MIN_CHANGE` or more.
 Letters in shapes: N observations, H×W map.
 """
 
@@ -21,21 +21,28 @@ from benchnav.planning.sensing.gaussian import (
     evidence,
     predict,
 )
-from benchnav.planning.sensing.lattice import Lattice, condition_and_predict, spacing_of
+from benchnav.planning.sensing.lattice import (
+    Cells,
+    Lattice,
+    condition_and_predict,
+    spacing_of,
+)
 
-_REACH = 4.0  # ℓ; the correlation is 3e-4 at this distance
-# ℓ; observations farther off change no cell within `_REACH` by `_MIN_CHANGE`.
+_REACH = 4.0  # in ℓ; the correlation is 3e-4 at this distance
+# In ℓ. Observations farther away change no cell within `_REACH` by `_MIN_CHANGE`.
 _BEYOND = 2.0
-# Maximum number of observations that are conditioned on without a lattice, those
-# nearest to changed ones: an update takes half a second at most. Other observed cells
-# are not updated.
+# Maximum number of observations without a lattice, so that an update takes at most half
+# a second. Those nearest to changed ones are used, and other observed cells are not
+# updated.
 _MAX_EXACT = 2048
 _MIN_CHANGE = 0.005  # of a score
-_OF_SKEW = 1 / 6  # change of the median's score per change of the skewness
+_MEDIAN_PER_SKEW = 1 / 6  # change of the median of a score per change of its skewness
+_MOMENTS = ("mean", "std", "skew")
 MEDIAN_M = 1.5
 """Median of the prior of ℓ, in metres."""
 _LOG_STD = math.log(2)  # of the prior of ℓ
-_LENGTHS_M = tuple(MEDIAN_M * 2 ** (step / 4) for step in range(-8, 9))
+_OCTAVES = [step / 4 for step in range(-8, 9)]
+_LENGTHS_M = tuple(MEDIAN_M * 2**octaves for octaves in _OCTAVES)
 MIN_OBSERVATIONS = 8
 """Minimum number of observations for an estimate of ℓ."""
 
@@ -46,68 +53,99 @@ def condition_maps(
     """Condition terms and scores near changed observations of one episode, in place.
 
     Cells within `_REACH` ℓ of changed observations are computed from all observations
-    within `_BEYOND` ℓ more. Hence nothing that affects them is left out or forgotten.
+    up to `_BEYOND` ℓ farther away. Hence no observation that affects them is omitted.
+
+    Args:
+        field: correlations of the scores.
+        member: index of the episode in the field.
+        maps: maps of `CopulaState` by name, float64, shape [H, W].
+        new: mask of changed observations, bool, shape [H, W].
+        window: number of observations above which a lattice is used.
     """
     length = float(field.length[member])
     reach = math.ceil(_REACH * length)
     rows, columns = _around(new, reach)
-    near = _around(new, reach + math.ceil(_BEYOND * length))
+    nearby = _around(new, reach + math.ceil(_BEYOND * length))
     remaining = np.zeros_like(new)
-    remaining[near] = ~np.isnan(maps["value"][near])
+    values = maps["value"][nearby]
+    remaining[nearby] = ~np.isnan(values)
     by_lattice = remaining.sum() > window and spacing_of(length) > 1
     limit = remaining.size if by_lattice else _MAX_EXACT
-    row, column = nearest(remaining, new, limit)
-    cells = row, column
+    cells = nearest(remaining, new, limit)
     remaining[cells] = False
     observed = _observed(maps, *cells)
-    shape = rows.stop - rows.start, columns.stop - columns.start
+    block = rows, columns
     if by_lattice:
-        block = np.mgrid[rows.start : rows.stop, columns.start : columns.stop]
-        targets = block[0].ravel(), block[1].ravel()
+        target_rows, target_columns = np.mgrid[block]
+        targets = target_rows.ravel(), target_columns.ravel()
         basis = Lattice.around(field, member, cells)
-        precision, shift, (mean, variance, skew) = condition_and_predict(
+        precision, shift, moments = condition_and_predict(
             basis, observed, cells, targets
         )
     else:
-        at_row = torch.from_numpy(row)[:, None]
-        at_column = torch.from_numpy(column)[:, None]
-        covariance = field.covariance(
-            member, at_row - at_row.T, at_column - at_column.T
-        ).numpy()
-        solved = condition(covariance, observed)
-        precision = solved.precision
-        shift = solved.shift
-        block_rows = torch.arange(rows.start, rows.stop)
-        block_columns = torch.arange(columns.start, columns.stop)
-        across = field.covariance(
-            member,
-            (at_row - block_rows)[..., None],
-            (at_column - block_columns)[:, None],
+        precision, shift, moments = _condition_exactly(
+            field, member, observed, cells, block
         )
-        mean, variance, skew = predict(
-            solved, covariance, observed, across.flatten(1).numpy()
-        )
-    moments = np.stack((mean, np.sqrt(variance.clip(0)), skew)).reshape(3, *shape)
-    old = np.stack([maps[name][rows, columns] for name in ("mean", "std", "skew")])
-    # Observed cells beyond the limit keep their posterior, which has used more than
-    # this update. Conditioning on numbers never increases a standard deviation.
-    unchanged = remaining[rows, columns]
+    mean, variance, skew = moments
+    std = np.sqrt(variance.clip(0))
+    old_moments = np.stack([maps[name][block] for name in _MOMENTS])
+    new_moments = np.stack((mean, std, skew)).reshape(old_moments.shape)
+    # Observed cells beyond the limit keep their posterior, which includes more
+    # observations than this update.
+    unchanged = remaining[block]
     if not observed.interval.any():
-        unchanged |= moments[1] > old[1] + _MIN_CHANGE
-        moments[1] = np.minimum(moments[1], old[1])
-    min_change = _MIN_CHANGE / np.array((1, 1, _OF_SKEW))[:, None, None]
-    moved = (abs(moments - old) >= min_change).any(0) & ~unchanged
-    for name, values in zip(("mean", "std", "skew"), moments, strict=True):
-        np.copyto(maps[name][rows, columns], values, where=moved)
-    maps["precision"][cells], maps["shift"][cells] = precision, shift
+        # Conditioning on numbers never increases a standard deviation.
+        old_std = old_moments[1]
+        new_std = new_moments[1]
+        unchanged |= new_std > old_std + _MIN_CHANGE
+        new_moments[1] = np.minimum(new_std, old_std)
+    scales = np.array((1, 1, _MEDIAN_PER_SKEW))[:, None, None]
+    min_change = _MIN_CHANGE / scales
+    has_moved = abs(new_moments - old_moments) >= min_change
+    moved = has_moved.any(0) & ~unchanged
+    for name, new_values in zip(_MOMENTS, new_moments, strict=True):
+        np.copyto(maps[name][block], new_values, where=moved)
+    maps["precision"][cells] = precision
+    maps["shift"][cells] = shift
+
+
+def _condition_exactly(
+    field: Field,
+    member: int,
+    observed: Observed,
+    cells: Cells,
+    block: tuple[slice, slice],
+) -> tuple[ndarray, ndarray, tuple[ndarray, ndarray, ndarray]]:
+    """Condition on observations and predict a block of cells, without a lattice.
+
+    The result is that of `condition_and_predict`.
+    """
+    row = torch.from_numpy(cells[0])[:, None]
+    column = torch.from_numpy(cells[1])[:, None]
+    row_offsets = row - row.T
+    column_offsets = column - column.T
+    inner = field.covariance(member, row_offsets, column_offsets).numpy()
+    solved = condition(inner, observed)
+    rows, columns = block
+    block_rows = torch.arange(rows.start, rows.stop)
+    block_columns = torch.arange(columns.start, columns.stop)
+    row_offsets = (row - block_rows)[..., None]
+    column_offsets = (column - block_columns)[:, None]
+    across = field.covariance(member, row_offsets, column_offsets)
+    flat_across = across.flatten(1).numpy()
+    moments = predict(solved, inner, observed, flat_across)
+    return solved.precision, solved.shift, moments
 
 
 def _around(new: ndarray, reach: int) -> tuple[slice, slice]:
     """Return the rows and columns of a map within some cells of changed ones."""
-    rows, columns = (
-        slice(max(low - reach, 0), min(high + reach + 1, size))
-        for (low, high), size in zip(bounds(new), new.shape, strict=True)
-    )
+    slices = []
+    for ends, size in zip(bounds(new), new.shape, strict=True):
+        first, last = ends
+        start = max(first - reach, 0)
+        stop = min(last + reach + 1, size)
+        slices.append(slice(start, stop))
+    rows, columns = slices
     return rows, columns
 
 
@@ -123,7 +161,14 @@ def estimate_length(
     row: ndarray,
     column: ndarray,
 ) -> float:
-    """Return ℓ of one episode in cells: the mode of its posterior among `_LENGTHS_M`."""
+    """Return ℓ of one episode in cells: the mode of its posterior among `_LENGTHS_M`.
+
+    Args:
+        covariance_model: covariance model, whose ℓ is ignored.
+        maps: maps of `CopulaState` by name, float64, shape [H, W].
+        row: rows of the observed cells, shape [N].
+        column: columns of the observed cells, shape [N].
+    """
     grid = covariance_model.grid
     observed = _observed(maps, row, column)
     field = _candidates(grid.shape, grid.resolution_m, covariance_model.nugget)
@@ -136,19 +181,24 @@ def estimate_length(
         log_likelihood = evidence(covariance, observed, solved)
         z = math.log(length_m / MEDIAN_M) / _LOG_STD
         log_posterior.append(log_likelihood - 0.5 * z**2)
-    return float(field.length[int(np.argmax(log_posterior))])
+    best = int(np.argmax(log_posterior))
+    return float(field.length[best])
 
 
 @lru_cache(maxsize=8)
 def _candidates(shape: tuple[int, int], resolution_m: float, nugget: float) -> Field:
-    return Field.of(
-        shape, [length / resolution_m for length in _LENGTHS_M], "cpu", nugget
-    )
+    lengths = [length / resolution_m for length in _LENGTHS_M]
+    return Field.of(shape, lengths, "cpu", nugget)
 
 
 def bounds(new: ndarray) -> list[tuple[int, int]]:
     """Return first and last row, and first and last column, of the cells of a mask."""
-    return [(int(places.min()), int(places.max())) for places in new.nonzero()]
+    ends = []
+    for indices in new.nonzero():
+        first = int(indices.min())
+        last = int(indices.max())
+        ends.append((first, last))
+    return ends
 
 
 def nearest(observed: ndarray, new: ndarray, window: int) -> tuple[ndarray, ndarray]:
@@ -160,11 +210,14 @@ def nearest(observed: ndarray, new: ndarray, window: int) -> tuple[ndarray, ndar
         window: maximum number of cells; more if more are new.
     """
     row, column = observed.nonzero()
-    (top, bottom), (left, right) = bounds(new)
+    (top, bottom), (first_column, last_column) = bounds(new)
     down = np.maximum(top - row, row - bottom).clip(0)
-    across = np.maximum(left - column, column - right).clip(0)
-    # Of equal distances the first cell goes first, on every machine.
-    distance = np.where(new[row, column], -1, down**2 + across**2)
+    across = np.maximum(first_column - column, column - last_column).clip(0)
+    squared_distance = down**2 + across**2
+    is_new = new[row, column]
+    distance = np.where(is_new, -1, squared_distance)
+    # A stable sort breaks ties in the same order on every machine.
     order = distance.argsort(kind="stable")
-    chosen = order[: max(window, int(new.sum()))]
+    count = max(window, int(new.sum()))
+    chosen = order[:count]
     return row[chosen], column[chosen]

@@ -1,14 +1,14 @@
 """Conditioning of a field of correlated standard normals on observations.
 
 An observation of a cell's normal score is either a number with noise, or an interval
-with noise, as where λ is 0 or 1. Conditioning on numbers is exact. Intervals have no
-closed form: expectation propagation finds for each interval a Gaussian term. The
-product of the terms with the field matches, cell by cell, the mean and variance that
-the interval gives (Minka 2001). Equations are as in Rasmussen and Williams (2006),
-section 3.6, with all terms updated at once and damped.
+with noise, for example if λ is 0 or 1. Conditioning on numbers is exact. Intervals have
+no closed form: expectation propagation finds a Gaussian term for each. The product of
+the terms with the field matches, cell by cell, the mean and variance under the
+intervals (Minka 2001). Equations are as in Rasmussen and Williams (2006), section 3.6,
+with all terms updated at once and damped.
 
-One field at a time, in NumPy, whose calls are cheapest for small systems; all in
-float64. PyTorch multiplies and solves, since NumPy's rounding there depends on the
+Fields are conditioned one at a time, in float64. NumPy has the least overhead for small
+systems; PyTorch multiplies and solves, since NumPy's rounding there depends on the
 number of threads. Letters in shapes: B fields, N observations, M cells, H×W map.
 """
 
@@ -69,15 +69,18 @@ class Field(Batch):
             device: device of the correlations.
             nugget: nugget of all fields.
         """
-        by_length = {
-            length: [correlations(size, length) for size in shape] for length in lengths
-        }
-        down, across = (
-            torch.from_numpy(np.stack([by_length[length][axis] for length in lengths]))
-            for axis in (0, 1)
+        height, width = shape
+        # Most fields have the same ℓ.
+        down_by_length = {ell: correlations(height, ell) for ell in set(lengths)}
+        across_by_length = {ell: correlations(width, ell) for ell in set(lengths)}
+        down = np.stack([down_by_length[ell] for ell in lengths])
+        across = np.stack([across_by_length[ell] for ell in lengths])
+        return cls(
+            length=torch.tensor(lengths, dtype=torch.float64, device=device),
+            down=torch.from_numpy(down).to(device),
+            across=torch.from_numpy(across).to(device),
+            nugget=nugget,
         )
-        length = torch.tensor(lengths, dtype=torch.float64, device=device)
-        return cls(length, down.to(device), across.to(device), nugget)
 
     def write(self, member: int, field: "Field") -> None:
         """Replace one field by the only field of another object, in place."""
@@ -85,12 +88,12 @@ class Field(Batch):
             getattr(self, name)[member] = getattr(field, name)[0]
 
     def covariance(self, member: int | Tensor, rows: Tensor, columns: Tensor) -> Tensor:
-        """Return correlations of cells at given distances, of the broadcast shape.
+        """Return correlations of pairs of cells, of the broadcast shape.
 
         Args:
             member: index of the field, or of the field of each pair, int64.
-            rows: rows between the two cells, of either sign, int64.
-            columns: columns between them.
+            rows: offset in rows between the two cells, of either sign, int64.
+            columns: offset in columns.
         """
         correlation = self.shared(member, rows, columns)
         if self.nugget:
@@ -100,16 +103,14 @@ class Field(Batch):
 
     def shared(self, member: int | Tensor, rows: Tensor, columns: Tensor) -> Tensor:
         """Return `covariance` without the nugget, also of a cell with itself."""
-        return (
-            (1 - self.nugget)
-            * self.down[member, rows.abs()]
-            * self.across[member, columns.abs()]
-        )
+        down = self.down[member, rows.abs()]
+        across = self.across[member, columns.abs()]
+        return (1 - self.nugget) * down * across
 
 
 @dataclass(frozen=True)
 class Observed:
-    """Observed scores, and the Gaussian terms that stand for them.
+    """Observed scores, and the Gaussian terms that represent them.
 
     Args:
         lower: minimum score, −∞ if unbounded, shape [N].
@@ -153,7 +154,7 @@ class Posterior:
         """Return moments of M cells of unit variance.
 
         Args:
-            covariance: covariances of the observed cells with them, [N, M].
+            covariance: covariances of observed cells with the M cells, [N, M].
 
         Returns:
             Mean [M], variance [M], and A of shape [N, M]; AᵀA is the reduction in their
@@ -161,7 +162,8 @@ class Posterior:
         """
         reduction = _reduction(self.factor, self.root, covariance)
         mean = times(self.weights, covariance)
-        variance = (1 - np.square(reduction).sum(0)).clip(0)
+        explained = np.square(reduction).sum(0)
+        variance = (1 - explained).clip(0)
         return mean, variance, reduction
 
 
@@ -176,8 +178,8 @@ def posterior(covariance: ndarray, precision: ndarray, shift: ndarray) -> Poster
     root = np.sqrt(precision)
     factor = _factor(covariance, root)
     # (K⁻¹ + T)⁻¹ ν = K (ν − √T (I + √T K √T)⁻¹ √T K ν)
-    pulled = torch.from_numpy(root * times(covariance, shift))
-    solved = torch.cholesky_solve(pulled[:, None], factor)[:, 0].numpy()
+    scaled = torch.from_numpy(root * times(covariance, shift))
+    solved = torch.cholesky_solve(scaled[:, None], factor)[:, 0].numpy()
     weights = shift - root * solved
     return Posterior(
         root=root, factor=factor, weights=weights, precision=precision, shift=shift
@@ -189,7 +191,7 @@ def condition(covariance: ndarray, observed: Observed) -> Posterior:
 
     Args:
         covariance: K of the observed cells, shape [N, N].
-        observed: observations; their terms are the start values of those of intervals.
+        observed: observations; the terms of intervals are start values.
     """
     censored = observed.interval
     precision = np.where(censored, 0.0, 1 / np.square(observed.std))
@@ -211,7 +213,8 @@ def condition(covariance: ndarray, observed: Observed) -> Posterior:
         terms, converged = terms.step(mean, variance, lower, upper, std)
         if converged:
             break
-    precision, shift = precision.copy(), shift.copy()
+    precision = precision.copy()
+    shift = shift.copy()
     precision[censored], shift[censored] = terms
     return posterior(covariance, precision, shift)
 
@@ -228,7 +231,8 @@ def evidence(covariance: ndarray, observed: Observed, solved: Posterior) -> floa
         solved: the conditioned field, from `condition`.
     """
     mean, variance, _ = solved.moments(covariance)
-    log_determinant = np.log(solved.factor.diagonal().numpy()).sum()
+    diagonal = solved.factor.diagonal().numpy()
+    log_determinant = np.log(diagonal).sum()
     exact_part = 0.5 * (solved.shift * mean).sum() - log_determinant
     censored = observed.interval
     terms = Terms(solved.precision[censored], solved.shift[censored])
@@ -236,12 +240,14 @@ def evidence(covariance: ndarray, observed: Observed, solved: Posterior) -> floa
     centre, cavity = terms.cavity(mean[censored], variance)
     total = cavity + np.square(observed.std[censored])
     lower = observed.lower[censored]
-    log_mass = standardise(centre, total, lower, observed.upper[censored])[2]
+    upper = observed.upper[censored]
+    log_mass = standardise(centre, total, lower, upper)[2]
     # The integral of the Gaussian term, which the interval's mass replaces.
     scaled = 1 + cavity * terms.precision
     joint = np.square(centre + cavity * terms.shift) / scaled
-    term = (joint - np.square(centre)) / (2 * cavity) - 0.5 * np.log(scaled)
-    return float(exact_part + (log_mass - term).sum())
+    exponent = (joint - np.square(centre)) / (2 * cavity)
+    log_integral = exponent - 0.5 * np.log(scaled)
+    return float(exact_part + (log_mass - log_integral).sum())
 
 
 def predict(
@@ -249,18 +255,18 @@ def predict(
 ) -> tuple[ndarray, ndarray, ndarray]:
     """Return mean, variance and skewness of M cells, each of shape [M].
 
-    An interval makes the posterior of its cell skewed, and by the residual correlation
-    that of its neighbours. A cell's third cumulant is the sum of the third cumulants of
-    the intervals' cells times the cube of the cell's regression on each. This is exact
-    for a single interval and of first order for several (Opper, Paquet and Winther
-    2013, "Perturbative corrections for approximate inference in Gaussian latent
-    variable models").
+    An interval skews the posterior of its cell and, by residual correlation, of its
+    neighbours. A cell's third cumulant is a sum over interval-censored cells: their
+    third cumulant times the cube of the cell's regression on them. This is exact for a
+    single interval and of first order for several (Opper, Paquet and Winther 2013,
+    "Perturbative corrections for approximate inference in Gaussian latent variable
+    models").
 
     Args:
         solved: the conditioned field, from `condition`.
         covariance: K of the observed cells, shape [N, N].
         observed: observations.
-        block: covariances of the observed cells with the M, shape [N, M].
+        block: covariances of the observed cells with the M cells, shape [N, M].
     """
     mean, variance, reduction = solved.moments(block)
     censored = observed.interval
@@ -306,10 +312,10 @@ def skewness(third: ndarray, regression: ndarray, variance: ndarray) -> ndarray:
 
     Args:
         third: third cumulants of the interval-censored cells.
-        regression: regression of the cells on these, [intervals, M].
+        regression: regression of the M cells on these, shape [intervals, M].
         variance: variance of the cells, [M].
     """
-    # Products and roots, which are far quicker than powers.
+    # Products and roots are far faster than powers.
     cumulant = times(third, regression * regression * regression)
     spread = variance.clip(MIN_VARIANCE)
     skew: ndarray = cumulant / (spread * np.sqrt(spread))
@@ -335,7 +341,7 @@ def times(first: ndarray, second: ndarray) -> ndarray:
 
 
 class Terms(NamedTuple):
-    """Gaussian terms, one a cell: exp(shift · z − precision · z² / 2).
+    """Gaussian terms of cells: exp(shift · z − precision · z² / 2).
 
     Both fields have the shape [N].
     """
@@ -347,19 +353,24 @@ class Terms(NamedTuple):
         """Return mean and variance of the cells of a field, given the terms.
 
         Args:
-            covariance: covariance of the field, [N, N].
-            centre: its mean, [N].
+            covariance: covariance of the field, shape [N, N].
+            centre: mean of the field, shape [N].
         """
         root = np.sqrt(self.precision)
-        reduction = _reduction(_factor(covariance, root), root, covariance)
+        factor = _factor(covariance, root)
+        reduction = _reduction(factor, root, covariance)
         residual_cov = covariance - times(reduction.T, reduction)
-        mean = centre + times(residual_cov, self.shift - self.precision * centre)
-        return mean, residual_cov.diagonal().clip(MIN_VARIANCE)
+        residual_shift = self.shift - self.precision * centre
+        mean = centre + times(residual_cov, residual_shift)
+        variance = residual_cov.diagonal().clip(MIN_VARIANCE)
+        return mean, variance
 
     def cavity(self, mean: ndarray, variance: ndarray) -> tuple[ndarray, ndarray]:
         """Return cavity means and variances."""
-        cavity = 1 / (1 / variance - self.precision).clip(MIN_VARIANCE)
-        return cavity * (mean / variance - self.shift), cavity
+        precision = (1 / variance - self.precision).clip(MIN_VARIANCE)
+        cavity = 1 / precision
+        centre = cavity * (mean / variance - self.shift)
+        return centre, cavity
 
     def step(
         self,
@@ -371,7 +382,7 @@ class Terms(NamedTuple):
     ) -> "tuple[Terms, bool]":
         """Return the terms of `towards`, and whether they converged.
 
-        They have if no term moves its own cell by more than `_TOLERANCE`.
+        Terms have converged if no term moves its own cell by more than `_TOLERANCE`.
         """
         new = self.towards(mean, variance, lower, upper, std)
         added = new.precision - self.precision
@@ -398,7 +409,6 @@ class Terms(NamedTuple):
         remaining = (1 - cavity * shrink).clip(MIN_FRACTION)
         precision = shrink / remaining
         shift = centre * precision + (noisy_mean - centre) / total / remaining
-        return Terms(
-            self.precision + _DAMPING * (precision - self.precision),
-            self.shift + _DAMPING * (shift - self.shift),
-        )
+        damped_precision = self.precision + _DAMPING * (precision - self.precision)
+        damped_shift = self.shift + _DAMPING * (shift - self.shift)
+        return Terms(damped_precision, damped_shift)

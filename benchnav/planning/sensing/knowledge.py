@@ -1,10 +1,9 @@
-"""Knowledge of robots about their maps: observations, belief, and the λ̂ and free mask
-that follow.
+"""Knowledge of robots about their maps: observations, belief, λ̂ and free mask.
 
 A belief that learns receives measured λ at each step. At some steps the appearance
-sensor is used as well and the belief is updated, after a new prediction if more was
-observed. A `Learner` holds the parts that do this, a `Knowledge` the current state.
-Only sensors receive the `Truth`.
+sensor is used as well, the model predicts again if more was observed, and the belief is
+updated. A `Learner` contains the parts that do this, and a `Knowledge` the current
+state. Only sensors receive the `Truth`.
 Letters in shapes: B episodes, S state dimensions, H×W cells, N cells of all maps
 together.
 """
@@ -34,7 +33,7 @@ Result = TypeVar("Result")
 
 
 class KnowledgeError(BenchnavError):
-    """Exception raised by a sensor, belief, model or risk measure during an episode.
+    """Failure of a sensor, belief, model or risk measure during an episode.
 
     `__cause__` is the original exception, `outcome` the outcome of the episodes.
     """
@@ -52,7 +51,7 @@ class Truth(Batch):
     Args:
         terrain: the true maps, B of them.
         field: current λ of all cells, shape [B, H, W].
-        keys: a stream key of each episode for the sensors' noise, B of them.
+        keys: a stream key of the sensors' noise for each of B episodes.
     """
 
     terrain: Terrain
@@ -78,10 +77,9 @@ class Knowledge(Batch):
 
     Args:
         memory: observed appearance; None if the whole map was observed at the start.
-        has_news: mask of episodes with observations, or less noisy ones, that the
+        has_news: mask of episodes with new or less noisy observations that the
             prediction does not include, bool, shape [B].
-        sensed: measured λ since the last update; of two measurements of a cell the
-            later.
+        sensed: measured λ since the last update; the last measurement of each cell.
         ever_sensed: mask of cells with measured λ, bool, shape [B, H, W].
         footprint: mask of cells observed in the last step, bool, shape [B, H, W].
         observation: input of the model.
@@ -89,7 +87,7 @@ class Knowledge(Batch):
         risk_map: λ̂, shape [B, H, W].
         spread: spread of the belief (`TraversabilityDistribution.spread`), shape
             [B, H, W]; None if it is not stored.
-        free: free mask without the area at the goal, bool, shape [B, H, W].
+        free: free mask, to which the area at the goal is not added, bool, [B, H, W].
     """
 
     memory: Memory | None
@@ -127,7 +125,8 @@ def unseen_ground(
         return prior
     value = 1.0
     if unseen == "pessimistic":
-        value = float(statistics.mixture((1, 1, 1), like.double()).cvar(_PESSIMISTIC))
+        single_cell = statistics.mixture((1, 1, 1), like.double())
+        value = float(single_cell.cvar(_PESSIMISTIC))
     means = torch.full_like(prior.means[:, :1], value)
     return TraversabilityMixture(torch.ones_like(means), means, torch.zeros_like(means))
 
@@ -159,7 +158,7 @@ def call(outcome: Outcome, work: Callable[[], Result]) -> Result:
     """Call user code; convert its exceptions.
 
     Raises:
-        KnowledgeError: If it fails; the episodes end with this outcome.
+        KnowledgeError: If `work` fails; the episodes end with this outcome.
     """
     try:
         return work()

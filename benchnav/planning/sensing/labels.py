@@ -1,7 +1,7 @@
-"""A Potts field of two states on look-alike cells, sampled by 64 chains, a bit each.
+"""A Potts field of two states on look-alike cells, sampled by 64 chains of one bit.
 
-Cells that may be of one of two classes are coupled to those of their four neighbours
-that may be of the same two. Without an outer field, at strength β:
+A cell that may belong to either class of a pair is coupled to those of its four
+neighbours that may belong to the same pair. Without an outer field, at strength β:
 
     P(labels) ∝ exp(β · number of coupled neighbours with equal labels).
 
@@ -9,7 +9,7 @@ A cell's 64 labels are the bits of one integer, so that a few integer operations
 all chains (multi-spin coding). Heat-bath sweeps alternate between the two colours of
 the checkerboard. P(class) is estimated from clusters (Swendsen and Wang 1987): bonds
 join coupled neighbours of equal label with the probability 1 − exp(−β). A cell that no
-bonds join to evidence is of either class with probability ½, whatever its bit. Random
+bonds join to evidence has either class with probability ½, whatever its bit. Random
 numbers are keyed by cell and by the number of sweeps of an episode, so that they do not
 depend on the other episodes of a batch.
 Letters in shapes: B episodes, H×W cells, S chains.
@@ -25,11 +25,13 @@ from torch import Tensor
 from benchnav.core import rng
 
 CHAINS = 64
-_SWEEPS = 64  # with stored random numbers; later sweeps take those of other cells
+_SWEEPS = 64  # with stored random numbers; later sweeps use those of other cells
 _STEP = 11, 29  # offset of these cells in rows and columns, on the torus
 _NEIGHBOURS = 4
+_MAX_LEVEL = 2 * _NEIGHBOURS  # of stored bits by log odds; bonds follow
 
-_HALVES = (0x5555555555555555, 0x3333333333333333, 0x0F0F0F0F0F0F0F0F)
+# Masks of alternate bits, pairs of bits and groups of four bits.
+_MASKS = (0x5555555555555555, 0x3333333333333333, 0x0F0F0F0F0F0F0F0F)
 
 
 @dataclass(frozen=True)
@@ -57,20 +59,21 @@ class Lattice:
         """
         right = torch.zeros_like(pair)
         down = torch.zeros_like(pair)
-        same_right = (pair[..., :-1] == pair[..., 1:]) & (pair[..., 1:] > 0)
-        same_down = (pair[..., :-1, :] == pair[..., 1:, :]) & (pair[..., 1:, :] > 0)
+        right_pair = pair[..., 1:]
+        same_right = (pair[..., :-1] == right_pair) & (right_pair > 0)
         right[..., :-1] = -same_right.long()
+        lower_pair = pair[..., 1:, :]
+        same_down = (pair[..., :-1, :] == lower_pair) & (lower_pair > 0)
         down[..., :-1, :] = -same_down.long()
         return cls(right, down, strength)
 
     def neighbours(self, words: Tensor) -> tuple[Tensor, ...]:
         """Return words of the right, left, lower and upper neighbours; 0 if uncoupled."""
-        return (
-            words.roll(-1, -1) & self.right,
-            (words & self.right).roll(1, -1),
-            words.roll(-1, -2) & self.down,
-            (words & self.down).roll(1, -2),
-        )
+        right = words.roll(-1, -1) & self.right
+        left = (words & self.right).roll(1, -1)
+        below = words.roll(-1, -2) & self.down
+        above = (words & self.down).roll(1, -2)
+        return right, left, below, above
 
     def degree(self) -> Tensor:
         """Return the number of coupled neighbours, int64, shape [B, H, W]."""
@@ -83,9 +86,9 @@ class Noise:
     """Random bits of a sweep.
 
     Args:
-        chosen: for 0 to 4 neighbours of the first class, whether the cell takes that
-            class, int64, five of shape [B, H, W].
-        right: bonds to the right neighbour, effective if both are of one class.
+        chosen: bits of the chains in which a cell takes the first class, for 0 to 4
+            neighbours of that class, int64, five of shape [B, H, W].
+        right: bonds to the right neighbour, effective if both have the same class.
         down: likewise for the cell below.
     """
 
@@ -118,14 +121,13 @@ def noise(
     bank_row = (row + uses * _STEP[0]) % size
     bank_column = (column + uses * _STEP[1]) % size
     index = bank_row * size + bank_column
-    levels = [
-        (2 * n_first - degree + _NEIGHBOURS).clamp(0, 2 * _NEIGHBOURS)
-        for n_first in range(_NEIGHBOURS + 1)
-    ]
-    chosen = tuple(bank[turn, index, level] for level in levels)
-    right = bank[turn, index, 2 * _NEIGHBOURS + 1]
-    down = bank[turn, index, 2 * _NEIGHBOURS + 2]
-    return Noise(chosen, right, down)
+    chosen = []
+    for n_first in range(_NEIGHBOURS + 1):
+        level = (2 * n_first - degree + _NEIGHBOURS).clamp(0, _MAX_LEVEL)
+        chosen.append(bank[turn, index, level])
+    right = bank[turn, index, _MAX_LEVEL + 1]
+    down = bank[turn, index, _MAX_LEVEL + 2]
+    return Noise(tuple(chosen), right, down)
 
 
 @lru_cache(maxsize=4)
@@ -138,26 +140,29 @@ def _bank(strength: float, size: int) -> Tensor:
     log_odds = strength * np.arange(-_NEIGHBOURS, _NEIGHBOURS + 1)
     probabilities = 1 / (1 + np.exp(-log_odds))
     bond_probability = -np.expm1(-strength)
-    bits = np.empty((_SWEEPS, size * size, 2 * _NEIGHBOURS + 3), dtype=np.int64)
+    n_cells = size * size
+    bits = np.empty((_SWEEPS, n_cells, _MAX_LEVEL + 3), dtype=np.int64)
     for sweep in range(_SWEEPS):
-        uniform = rng.uniform(key, np.array([sweep]), (3, size * size, CHAINS))[0]
+        uniform = rng.uniform(key, np.array([sweep]), (3, n_cells, CHAINS))[0]
         for level, probability in enumerate(probabilities):
             bits[sweep, :, level] = _packed(uniform[0] < probability)
         for direction in (1, 2):
             bonds = _packed(uniform[direction] < bond_probability)
-            bits[sweep, :, 2 * _NEIGHBOURS + direction] = bonds
+            bits[sweep, :, _MAX_LEVEL + direction] = bonds
     return torch.from_numpy(bits)
 
 
 def _packed(bits: np.ndarray) -> np.ndarray:
-    return np.packbits(bits, axis=-1, bitorder="little").view("<i8")[:, 0]
+    octets = np.packbits(bits, axis=-1, bitorder="little")
+    return octets.view("<i8")[:, 0]
 
 
 def fair(height: int, width: int) -> Tensor:
     """Return labels of probability ½, int64, shape [H, W]."""
     key = rng.stream_key(0, "labels", "first")
-    bits = rng.uniform(key, np.arange(height * width), (CHAINS,)) < 0.5
-    return torch.from_numpy(_packed(bits)).view(height, width)
+    uniform = rng.uniform(key, np.arange(height * width), (CHAINS,))
+    words = _packed(uniform < 0.5)
+    return torch.from_numpy(words).view(height, width)
 
 
 def sweep_labels(
@@ -183,11 +188,14 @@ def sweep_labels(
         carry = odd_row & odd_column
         twos = pair_row ^ pair_column ^ carry
         fours = pair_row & pair_column
-        none = ~(ones | twos | fours)
-        exactly = (none, ones & ~twos, twos & ~ones, ones & twos, fours)
+        is_zero = ~(ones | twos | fours)
+        is_one = ones & ~twos
+        is_two = twos & ~ones
+        is_three = ones & twos
+        counts = (is_zero, is_one, is_two, is_three, fours)
         new = torch.zeros_like(labels)
-        for number, choice in zip(exactly, drawn.chosen, strict=True):
-            new |= number & choice
+        for has_count, chosen in zip(counts, drawn.chosen, strict=True):
+            new |= has_count & chosen
         labels = (labels & ~colour) | (new & colour)
     return labels
 
@@ -195,7 +203,7 @@ def sweep_labels(
 def connected_to_evidence(
     labels: Tensor, lattice: Lattice, evidence: Tensor, drawn: Noise
 ) -> Tensor:
-    """Return the chains in which bonds join a cell to evidence, int64, [B, H, W].
+    """Return bits of chains in which bonds join a cell to evidence, int64, [B, H, W].
 
     Args:
         labels: labels of the chains, int64, shape [B, H, W].
@@ -203,8 +211,10 @@ def connected_to_evidence(
         evidence: all bits set on cells with evidence of their label, int64.
         drawn: random bits.
     """
-    right = lattice.right & drawn.right & ~(labels ^ labels.roll(-1, -1))
-    down = lattice.down & drawn.down & ~(labels ^ labels.roll(-1, -2))
+    same_right = ~(labels ^ labels.roll(-1, -1))
+    same_below = ~(labels ^ labels.roll(-1, -2))
+    right = lattice.right & drawn.right & same_right
+    down = lattice.down & drawn.down & same_below
     bonds = Lattice(right, down, lattice.strength)
     connected = evidence
     while True:
@@ -218,18 +228,23 @@ def connected_to_evidence(
 
 def count_bits(words: Tensor) -> Tensor:
     """Return the number of set bits, int64."""
-    pairs, fours, bytes_ = _HALVES
-    words = words - ((words >> 1) & pairs)
-    words = (words & fours) + ((words >> 2) & fours)
-    words = (words + (words >> 4)) & bytes_
-    return ((words * 0x0101010101010101) >> 56) & 0xFF
+    bit_mask, pair_mask, four_mask = _MASKS
+    # Counts in each pair of bits, then in each four, then in each byte.
+    words = words - ((words >> 1) & bit_mask)
+    words = (words & pair_mask) + ((words >> 2) & pair_mask)
+    words = (words + (words >> 4)) & four_mask
+    total = words * 0x0101010101010101  # the sum of all bytes is in the highest
+    return (total >> 56) & 0xFF
 
 
 def unpacked(words: Tensor) -> Tensor:
     """Return the bits of words of shape [*], bool, shape [*, S]."""
-    return (words[..., None] >> torch.arange(CHAINS, device=words.device) & 1).bool()
+    chain = torch.arange(CHAINS, device=words.device)
+    bits = words[..., None] >> chain & 1
+    return bits.bool()
 
 
 def packed(bits: Tensor) -> Tensor:
     """Return words of bits of shape [*, S], int64, shape [*]."""
-    return (bits.long() << torch.arange(CHAINS, device=bits.device)).sum(-1)
+    chain = torch.arange(CHAINS, device=bits.device)
+    return (bits.long() << chain).sum(-1)

@@ -1,9 +1,9 @@
 """Sparse conditioning of a correlated field on many observations, by a lattice of cells.
 
-Where ℓ is several cells long, the field is smooth from cell to cell. Its values on a
-lattice of every few cells, the basis, then determine it. The rest of a cell's variance
-counts as independent of all other cells. All observations are used; the cost is N m²
-for N of them and m basis cells, instead of N³.
+If ℓ is several cells long, the field is smooth from cell to cell. Its values on a
+coarse lattice of cells, the basis, then determine it. The remaining variance of a cell
+counts as independent of all other cells. All observations are used. For N observations
+and m basis cells the cost is N m² instead of N³.
 
 Sources: Snelson and Ghahramani (2006), "Sparse Gaussian processes using pseudo-inputs"
 (FITC), for point observations; Naish-Guzman and Holden (2008), "The generalized FITC
@@ -33,8 +33,8 @@ from benchnav.planning.sensing.gaussian import (
 
 # Added to a variance of 1, so that the lattice's covariance has a Cholesky factor.
 _JITTER = 1e-8
-# Steps of the lattice that the basis extends beyond the observed cells; with 1 some
-# variances are off by 0.02.
+# Steps of the lattice by which the basis extends beyond the observed cells. With 1,
+# some variances have an error of 0.02.
 _MARGIN = 2
 
 Cells = tuple[ndarray, ndarray]  # rows and columns
@@ -43,7 +43,7 @@ Cells = tuple[ndarray, ndarray]  # rows and columns
 def spacing_of(length: float) -> int:
     """Return the spacing of the basis in cells: ℓ/2.
 
-    Standard deviations are then off by less than 0.003.
+    Errors of standard deviations are then below 0.003.
     """
     return int(length // 2)
 
@@ -68,31 +68,35 @@ class Lattice:
     def around(cls, field: Field, member: int, cells: Cells) -> "Lattice":
         """Return the basis for some observed cells."""
         spacing = spacing_of(float(field.length[member]))
-        lines = [
-            np.arange(spacing // 2, correlations.shape[1], spacing)
-            for correlations in (field.down, field.across)
-        ]
-        blocks = [
-            (indices // spacing).clip(0, len(line) - 1)
-            for indices, line in zip(cells, lines, strict=True)
-        ]
-        is_used = np.zeros([len(line) + 2 * _MARGIN for line in lines], bool)
+        height = field.down.shape[1]
+        width = field.across.shape[1]
+        basis_rows = np.arange(spacing // 2, height, spacing)
+        basis_columns = np.arange(spacing // 2, width, spacing)
+        nearest_row = (cells[0] // spacing).clip(0, len(basis_rows) - 1)
+        nearest_column = (cells[1] // spacing).clip(0, len(basis_columns) - 1)
+        # Padded by the margin on all sides.
+        n_rows = len(basis_rows) + 2 * _MARGIN
+        n_columns = len(basis_columns) + 2 * _MARGIN
+        is_used = np.zeros((n_rows, n_columns), bool)
         for down in range(2 * _MARGIN + 1):
             for across in range(2 * _MARGIN + 1):
-                is_used[blocks[0] + down, blocks[1] + across] = True
+                is_used[nearest_row + down, nearest_column + across] = True
         rows, columns = is_used[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN].nonzero()
-        basis = lines[0][rows], lines[1][columns]
+        basis = basis_rows[rows], basis_columns[columns]
         covariance = _shared(field, member, basis, basis)
         covariance.diagonal().add_(_JITTER)
-        return cls(field, member, basis, torch.linalg.cholesky(covariance))
+        root = torch.linalg.cholesky(covariance)
+        return cls(field, member, basis, root)
 
     def coefficients(self, cells: Cells) -> tuple[ndarray, ndarray]:
-        """Return coefficients of cells in independent normals, [m, M], and their
-        residual variance, [M].
+        """Return coefficients [m, M] of cells in independent normals, and residuals [M].
+
+        A residual is the variance of a cell that the coefficients do not explain.
         """
         shared = _shared(self.field, self.member, self.basis, cells)
         weights = torch.linalg.solve_triangular(self.root, shared, upper=False).numpy()
-        return weights, (1 - np.square(weights).sum(0)).clip(0)
+        residual = 1 - np.square(weights).sum(0)
+        return weights, residual.clip(0)
 
 
 def _shared(field: Field, member: int, first: Cells, second: Cells) -> Tensor:
@@ -127,9 +131,8 @@ class Normals:
 
         The squares of a column add up to the variance of a cell.
         """
-        return torch.linalg.solve_triangular(
-            self.factor, torch.from_numpy(weights), upper=False
-        ).numpy()
+        columns = torch.from_numpy(weights)
+        return torch.linalg.solve_triangular(self.factor, columns, upper=False).numpy()
 
 
 def _moments(
@@ -139,13 +142,21 @@ def _moments(
     precision: ndarray,
     shift: ndarray,
 ) -> tuple[ndarray, ndarray, ndarray]:
-    """Return mean [M] and variance [M] of cells with terms, and their whitened
-    coefficients, [m, M].
+    """Return mean [M], variance [M] and whitened coefficients [m, M] of cells with terms.
+
+    Args:
+        normals: normals of the lattice.
+        weights: coefficients of the cells, shape [m, M].
+        residual: residual variance of the cells, shape [M].
+        precision: precision of their terms, shape [M].
+        shift: precision times mean of their terms, shape [M].
     """
     whitened = normals.whiten(weights)
     shrink = 1 / (1 + residual * precision)
-    mean = (times(whitened.T, normals.whitened_shift) + residual * shift) * shrink
-    variance = (residual + np.square(whitened).sum(0) * shrink) * shrink
+    explained = times(whitened.T, normals.whitened_shift)
+    mean = (explained + residual * shift) * shrink
+    explained_variance = np.square(whitened).sum(0)
+    variance = (residual + explained_variance * shrink) * shrink
     return mean, variance, whitened
 
 
@@ -155,7 +166,8 @@ def _weighted(
     """Return the precision [m, m] and the shift [m] that terms add to the normals."""
     shrink = 1 / (1 + residual * precision)
     scaled = torch.from_numpy(weights * (precision * shrink))
-    return scaled @ torch.from_numpy(weights).T, times(weights, shift * shrink)
+    added_precision = scaled @ torch.from_numpy(weights).T
+    return added_precision, times(weights, shift * shrink)
 
 
 def condition_and_predict(
@@ -165,12 +177,12 @@ def condition_and_predict(
 
     Args:
         lattice: the basis around the observed cells.
-        observed: observations; their terms are the start values of those of intervals.
+        observed: observations; the terms of intervals are start values.
         cells: the observed cells, N.
         targets: the cells to predict, M; observed ones may be among them.
 
     Returns:
-        Precision and shift of the terms that stand for the observations, each of shape
+        Precision and shift of the terms that represent the observations, each of shape
         [N]; and mean, variance and skewness of the targets, each of shape [M].
     """
     censored = observed.interval
@@ -178,55 +190,60 @@ def condition_and_predict(
     precision = np.where(censored, 0.0, 1 / np.square(observed.std))
     shift = precision * np.where(censored, 0.0, observed.lower)
     weights, residual = lattice.coefficients(cells)
-    added, pulled = _weighted(
-        weights[:, exact], residual[exact], precision[exact], shift[exact]
-    )
-    prior_precision = added + torch.eye(len(pulled), dtype=added.dtype)
-    prior_shift = pulled
+    of_exact = weights[:, exact], residual[exact]
+    added, prior_shift = _weighted(*of_exact, precision[exact], shift[exact])
+    prior_precision = added + torch.eye(len(prior_shift), dtype=added.dtype)
     normals = Normals.of(prior_precision, prior_shift)
+    censored_weights = weights[:, censored]
+    censored_residual = residual[censored]
     if censored.any():
         # One term for each interval, all updated at once and damped.
         terms = Terms(observed.precision[censored], observed.shift[censored])
         lower = observed.lower[censored]
         upper = observed.upper[censored]
         std = observed.std[censored]
-        of_censored = weights[:, censored], residual[censored]
+        of_censored = censored_weights, censored_residual
         for _ in range(DAMPED_ROUNDS):
-            added, pulled = _weighted(*of_censored, *terms)
-            normals = Normals.of(prior_precision + added, prior_shift + pulled)
+            added, added_shift = _weighted(*of_censored, *terms)
+            normals = Normals.of(prior_precision + added, prior_shift + added_shift)
             mean, variance, _ = _moments(normals, *of_censored, *terms)
             variance = variance.clip(MIN_VARIANCE)
             terms, converged = terms.step(mean, variance, lower, upper, std)
             if converged:
                 break
         precision[censored], shift[censored] = terms
-        added, pulled = _weighted(*of_censored, *terms)
-        normals = Normals.of(prior_precision + added, prior_shift + pulled)
+        added, added_shift = _weighted(*of_censored, *terms)
+        normals = Normals.of(prior_precision + added, prior_shift + added_shift)
     # Terms of the targets that are observed.
-    map_shape = lattice.field.down.shape[1], lattice.field.across.shape[1]
-    maps = np.zeros((2, *map_shape))
-    maps[0][cells], maps[1][cells] = precision, shift
-    basis, target_residual = lattice.coefficients(targets)
-    target_precision = maps[0][targets]
-    target_shift = maps[1][targets]
+    field = lattice.field
+    map_shape = field.down.shape[1], field.across.shape[1]
+    precision_map = np.zeros(map_shape)
+    shift_map = np.zeros(map_shape)
+    precision_map[cells] = precision
+    shift_map[cells] = shift
+    target_precision = precision_map[targets]
+    target_weights, target_residual = lattice.coefficients(targets)
     mean, variance, whitened = _moments(
-        normals, basis, target_residual, target_precision, target_shift
+        normals, target_weights, target_residual, target_precision, shift_map[targets]
     )
-    skew = np.zeros_like(mean)
-    if censored.any():
-        own_mean, own_variance, own_whitened = _moments(
-            normals, *of_censored, precision[censored], shift[censored]
-        )
-        own_variance = own_variance.clip(MIN_VARIANCE)
-        shrink = 1 / (1 + residual[censored] * precision[censored])
-        gain = own_whitened * shrink / own_variance
-        unshrink = 1 + target_residual * target_precision
-        regression = times(gain.T, whitened) / unshrink
-        target_index = np.full(map_shape, -1)
-        target_index[targets] = np.arange(len(mean))
-        indices = target_index[cells[0][censored], cells[1][censored]]
-        is_target = indices >= 0
-        regression[is_target.nonzero()[0], indices[is_target]] = 1
-        third = third_cumulants(observed, precision, shift, own_mean, own_variance)
-        skew = skewness(third, regression, variance)
+    if not censored.any():
+        return precision, shift, (mean, variance, np.zeros_like(mean))
+    own_precision = precision[censored]
+    own_mean, own_variance, own_whitened = _moments(
+        normals, censored_weights, censored_residual, own_precision, shift[censored]
+    )
+    own_variance = own_variance.clip(MIN_VARIANCE)
+    shrink = 1 / (1 + censored_residual * own_precision)
+    gain = own_whitened * shrink / own_variance
+    unshrink = 1 + target_residual * target_precision
+    regression = times(gain.T, whitened) / unshrink
+    target_index = np.full(map_shape, -1)
+    target_index[targets] = np.arange(len(mean))
+    censored_cells = cells[0][censored], cells[1][censored]
+    indices = target_index[censored_cells]
+    is_target = indices >= 0
+    own_rows = is_target.nonzero()[0]
+    regression[own_rows, indices[is_target]] = 1
+    third = third_cumulants(observed, precision, shift, own_mean, own_variance)
+    skew = skewness(third, regression, variance)
     return precision, shift, (mean, variance, skew)

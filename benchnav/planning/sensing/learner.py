@@ -29,13 +29,18 @@ from benchnav.planning.sensing.knowledge import (
     nothing_sensed,
     unseen_ground,
 )
-from benchnav.planning.sensing.sensor import Measurement, NoiseKey, Sensor
+from benchnav.planning.sensing.sensor import (
+    Appearance,
+    Measurement,
+    NoiseKey,
+    Sensor,
+)
 from benchnav.planning.world.outcome import Outcome
 
 Predict = Callable[[Terrain, Observation], TraversabilityDistribution]
-"""Function that predicts from an observation.
+"""Function from terrain and its observation to a prediction.
 
-The terrain, with current λ, is only for privileged models.
+The terrain, with its current λ, is only for privileged models.
 """
 
 
@@ -51,7 +56,7 @@ class Learner:
         measure: risk measure that returns λ̂.
         rules: free space, and the λ assumed for unobserved terrain.
         predict: the model; unused if the sensor shows the whole map.
-        keeps_spread: whether the spread of the belief is stored with λ̂, for policies.
+        keeps_spread: whether the spread of the belief is stored next to λ̂, for policies.
     """
 
     sensor: Sensor
@@ -96,20 +101,20 @@ class Learner:
                 raises, or returns an invalid value.
         """
         memory = None
+        seen = None
         observation = truth.terrain.observe()
         if not self.sensor.sees_all:
             noise_key = NoiseKey(truth.keys, 0)
             first = self._measurement(self.sensor, truth, robot_state, noise_key)
             assert first.appearance is not None
             memory = remember(Memory.none(observation), first.appearance)
+            seen = memory.seen
             observation, prediction = self._predict(memory, truth)
         assert prediction is not None
         belief_state = self.believe(prediction)
         risk_map, spread = self._measured(prediction)
-        seen = None if memory is None else memory.seen
-        no_episodes = torch.zeros(
-            len(robot_state), dtype=torch.bool, device=robot_state.device
-        )
+        device = robot_state.device
+        no_episodes = torch.zeros(len(robot_state), dtype=torch.bool, device=device)
         no_cells = torch.zeros_like(truth.field, dtype=torch.bool)
         return Knowledge(
             memory=memory,
@@ -130,9 +135,10 @@ class Learner:
         Raises:
             KnowledgeError: If the belief raises.
         """
+        # A custom belief may modify its input.
+        prior = prediction.clone()
         return call(
-            Outcome.BELIEF_ERROR,
-            lambda: self.belief.init(prediction.clone(), self.covariance),
+            Outcome.BELIEF_ERROR, lambda: self.belief.init(prior, self.covariance)
         )
 
     def sense(
@@ -146,14 +152,14 @@ class Learner:
     ) -> Knowledge:
         """Add the observations of a step.
 
-        Appearance at every step adds hardly more than appearance at each update, and
-        takes far longer. A belief that does not learn receives no λ.
+        A belief that does not learn receives no λ. Appearance is usually observed only
+        before an update: at every step, it would take far longer and add little.
 
         Args:
             knowledge: current knowledge; it is not changed.
             truth: true state in this step.
             robot_state: robot states, shape [B, S].
-            step: number of steps taken, for all episodes or for each, B of them.
+            step: number of steps taken, one for all episodes or one for each.
             observes: mask of episodes that use the appearance sensor, bool, shape [B].
             measures: mask of episodes that use the sensor of λ, bool, shape [B].
 
@@ -166,39 +172,15 @@ class Learner:
         noise_key = NoiseKey(truth.keys, step)
         no_cells = torch.zeros_like(knowledge.footprint)
         knowledge = replace(knowledge, footprint=no_cells)
-        uses = (
-            (self.sensor, observes),
-            (self.ground, measures & self.belief.learns),
-        )
-        for sensor, episode_mask in uses:
-            if sensor.sees_all or not bool(episode_mask.any()):
+        measures = measures & self.belief.learns
+        for sensor, in_use in ((self.sensor, observes), (self.ground, measures)):
+            if sensor.sees_all or not bool(in_use.any()):
                 continue
             new = self._measurement(sensor, truth, robot_state, noise_key)
-            before = knowledge.sensed
-            in_use = episode_mask[:, None, None]
-            mask = new.mask & in_use
-            traversability = torch.where(
-                mask, new.traversability, before.traversability
-            )
-            std = torch.where(mask, new.std, before.std)
-            knowledge = replace(
-                knowledge,
-                sensed=Measurement(traversability=traversability, std=std),
-                ever_sensed=knowledge.ever_sensed | mask,
-                footprint=knowledge.footprint | mask,
-            )
-            if new.appearance is None or knowledge.memory is None:
-                continue
-            appearance = replace(new.appearance, seen=new.appearance.seen & in_use)
-            memory = remember(knowledge.memory, appearance)
-            # A cell that is observed for the first time, or with less noise.
-            is_better = memory.noise_level != knowledge.memory.noise_level
-            knowledge = replace(
-                knowledge,
-                memory=memory,
-                has_news=knowledge.has_news | is_better.flatten(1).any(1),
-                footprint=knowledge.footprint | appearance.seen,
-            )
+            knowledge = _with_traversability(knowledge, new, in_use)
+            if new.appearance is not None and knowledge.memory is not None:
+                memory = knowledge.memory
+                knowledge = _with_appearance(knowledge, memory, new.appearance, in_use)
         return knowledge
 
     def update(self, knowledge: Knowledge, truth: Truth) -> tuple[Knowledge, Tensor]:
@@ -228,10 +210,13 @@ class Learner:
             Outcome.BELIEF_ERROR,
             lambda: self.belief.update(before, knowledge.sensed, prior),
         )
-        changed = call(
-            Outcome.BELIEF_ERROR,
-            lambda: self._checked_cells(self.belief.changed(before, after), knowledge),
-        )
+
+        def changed_cells() -> Tensor:
+            cells = self.belief.changed(before, after)
+            check_map("cells from `changed`", cells, torch.bool, knowledge.free)
+            return cells
+
+        changed = call(Outcome.BELIEF_ERROR, changed_cells)
         knowledge = replace(
             knowledge,
             has_news=torch.zeros_like(knowledge.has_news),
@@ -253,10 +238,11 @@ class Learner:
 
         def believe() -> TraversabilityDistribution:
             believed = self.belief.at(knowledge.belief_state, cells)
+            shape = believed.shape
             expect(
-                believed.shape == expected_shape,
+                shape == expected_shape,
                 f"a distribution of shape {list(expected_shape)} from `at`, got "
-                f"{list(believed.shape)}.",
+                f"{list(shape)}.",
             )
             return believed
 
@@ -316,7 +302,7 @@ class Learner:
     def _inferred(self, knowledge: Knowledge, changed: Tensor) -> Knowledge:
         """Return the knowledge with λ̂ and the free mask of changed cells updated."""
         believed = self.at(knowledge, changed)
-        # Measures take a batch of maps.
+        # Risk measures expect a batch of maps.
         batch = map_tensors(believed, lambda values: values[None])
         risk_map, spread = self._measured(batch)
         seen = None
@@ -325,18 +311,15 @@ class Learner:
         free = call(
             Outcome.BELIEF_ERROR, lambda: self.rules.free(risk_map[0], believed, seen)
         )
-        new_values = risk_map.flatten().to(knowledge.risk_map.dtype)
-        updated = replace(
-            knowledge,
-            risk_map=knowledge.risk_map.index_put((changed,), new_values),
-            free=knowledge.free.index_put((changed,), free[0]),
-        )
+        new_risk = risk_map.flatten().to(knowledge.risk_map.dtype)
+        all_risk = knowledge.risk_map.index_put((changed,), new_risk)
+        all_free = knowledge.free.index_put((changed,), free[0])
+        updated = replace(knowledge, risk_map=all_risk, free=all_free)
         if knowledge.spread is None or spread is None:
             return updated
         new_spread = spread.flatten().to(knowledge.spread.dtype)
-        return replace(
-            updated, spread=knowledge.spread.index_put((changed,), new_spread)
-        )
+        all_spread = knowledge.spread.index_put((changed,), new_spread)
+        return replace(updated, spread=all_spread)
 
     def _measured(
         self, believed: TraversabilityDistribution
@@ -345,24 +328,27 @@ class Learner:
 
         def measure() -> tuple[Tensor, Tensor | None]:
             risk_map = risk.apply(self.measure, believed)
-            return risk_map, believed.spread() if self.keeps_spread else None
+            spread = believed.spread() if self.keeps_spread else None
+            return risk_map, spread
 
         return call(Outcome.MODEL_ERROR, measure)
 
     def _predict(
         self, memory: Memory, truth: Truth
     ) -> tuple[Observation, TraversabilityDistribution]:
-        """Return the model's input and its prediction, with `rules.unseen` elsewhere."""
+        """Return the model's input and its prediction.
+
+        In unobserved cells, `rules.unseen` determines the prediction.
+        """
         statistics = self.statistics
         observation = masked(memory, statistics.layer_means)
         terrain = replace(truth.terrain, traversability=truth.field)
         predicted = call(
             Outcome.MODEL_ERROR, lambda: self.predict(terrain, observation)
         )
-        unseen = unseen_ground(
-            statistics, self.rules.unseen, memory.seen.shape, truth.field
-        )
-        return observation, choose(memory.seen, predicted, unseen)
+        seen = memory.seen
+        unseen = unseen_ground(statistics, self.rules.unseen, seen.shape, truth.field)
+        return observation, choose(seen, predicted, unseen)
 
     def _measurement(
         self, sensor: Sensor, truth: Truth, robot_state: Tensor, noise_key: NoiseKey
@@ -370,11 +356,16 @@ class Learner:
         """Return a sensor's measurement after validation."""
 
         def sense() -> Measurement:
-            inputs = truth.terrain, truth.field, robot_state
-            # Sensors of this package do not change their inputs.
+            terrain = truth.terrain
+            field = truth.field
+            state = robot_state
+            # A custom sensor may modify its inputs; those of this package do not.
             if not type(sensor).__module__.startswith("benchnav."):
-                inputs = truth.terrain.clone(), truth.field.clone(), robot_state.clone()
-            measurement = self._checked(sensor.sense(*inputs, noise_key), truth.field)
+                terrain = terrain.clone()
+                field = field.clone()
+                state = state.clone()
+            measurement = sensor.sense(terrain, field, state, noise_key)
+            _check_measurement(measurement, truth.field)
             expect(
                 sensor is not self.sensor or measurement.appearance is not None,
                 "`Measurement.appearance` from a sensor of appearance, got None. List "
@@ -384,29 +375,59 @@ class Learner:
 
         return call(Outcome.SENSOR_ERROR, sense)
 
-    def _checked(self, sensed: Any, like: Tensor) -> Measurement:
-        """Return a sensor's measurement if it is valid, else raise ConfigError."""
-        expect(
-            isinstance(sensed, Measurement),
-            f"a Measurement from `sense`, got {type(sensed).__name__}.",
-        )
-        for name in ("traversability", "std"):
-            check_map(f"`Measurement.{name}`", getattr(sensed, name), like.dtype, like)
-        values = sensed.traversability[sensed.mask]
-        expect(
-            bool(((values >= 0) & (values <= 1)).all()),
-            "`Measurement.traversability` in [0, 1], or NaN.",
-        )
-        if sensed.appearance is not None:
-            check_map("`Appearance.seen`", sensed.appearance.seen, torch.bool, like)
-            check_map(
-                "`Appearance.noise_level`",
-                sensed.appearance.noise_level,
-                like.dtype,
-                like,
-            )
-        return sensed
 
-    def _checked_cells(self, cells: Any, knowledge: Knowledge) -> Tensor:
-        check_map("cells from `changed`", cells, torch.bool, knowledge.free)
-        return cells
+def _with_traversability(
+    knowledge: Knowledge, new: Measurement, in_use: Tensor
+) -> Knowledge:
+    """Add measured λ of the episodes that use the sensor, bool, shape [B]."""
+    mask = new.mask & in_use[:, None, None]
+    before = knowledge.sensed
+    traversability = torch.where(mask, new.traversability, before.traversability)
+    std = torch.where(mask, new.std, before.std)
+    sensed = Measurement(traversability=traversability, std=std)
+    return replace(
+        knowledge,
+        sensed=sensed,
+        ever_sensed=knowledge.ever_sensed | mask,
+        footprint=knowledge.footprint | mask,
+    )
+
+
+def _with_appearance(
+    knowledge: Knowledge, memory: Memory, new: Appearance, in_use: Tensor
+) -> Knowledge:
+    """Add the appearance in episodes that use the sensor, bool, shape [B]."""
+    seen = new.seen & in_use[:, None, None]
+    new_memory = remember(memory, replace(new, seen=seen))
+    # A cell is observed for the first time, or with less noise.
+    is_better = new_memory.noise_level != memory.noise_level
+    is_new = is_better.flatten(1).any(1)
+    return replace(
+        knowledge,
+        memory=new_memory,
+        has_news=knowledge.has_news | is_new,
+        footprint=knowledge.footprint | seen,
+    )
+
+
+def _check_measurement(measurement: Any, like: Tensor) -> None:
+    """Check a sensor's measurement against maps of the episodes.
+
+    Raises:
+        ConfigError: If its type, dtype, shape, device or values are invalid.
+    """
+    expect(
+        isinstance(measurement, Measurement),
+        f"a Measurement from `sense`, got {type(measurement).__name__}.",
+    )
+    dtype = like.dtype
+    traversability = measurement.traversability
+    check_map("`Measurement.traversability`", traversability, dtype, like)
+    check_map("`Measurement.std`", measurement.std, dtype, like)
+    values = traversability[measurement.mask]
+    is_valid = (values >= 0) & (values <= 1)
+    expect(bool(is_valid.all()), "`Measurement.traversability` in [0, 1], or NaN.")
+    appearance = measurement.appearance
+    if appearance is not None:
+        check_map("`Appearance.seen`", appearance.seen, torch.bool, like)
+        check_map("`Appearance.noise_level`", appearance.noise_level, dtype, like)

@@ -1,14 +1,13 @@
 """The sensor `near`: a mast camera whose noise grows with distance.
 
-A cell is in line of sight unless terrain in between rises above the line from the mast
-to it. The horizon is carried outwards from ring to ring of cells around the robot's,
-linear between cells (XDraw), so that planes and long walls along the grid are exact.
-Line of sight is that of a mast in the middle of the robot's cell. Terrain that is out
-of range, out of the field of view or hidden below the horizon raises no horizon. Hence
-the mask of observed cells depends only on observed terrain, as long as hidden terrain
-stays below its horizon.
-Letters in shapes: B episodes, S state dimensions, H×W cells, N cells of the rings,
-observed or in total.
+A cell is visible unless terrain in between rises above the line from the mast to it.
+The horizon is computed ring by ring around the robot's cell, outwards, and is linear
+between the cells of a ring (XDraw). Planes and long walls along the grid are therefore
+exact. The mast is in the middle of the robot's cell. Terrain that is out of range, out
+of the field of view or hidden below the horizon raises no horizon. Hence the mask of
+observed cells depends only on observed terrain, as long as hidden terrain stays below
+its horizon.
+Letters in shapes: B episodes, S state dimensions, H×W cells, N cells of the rings.
 
 Source: Franklin, Ray and Mehta (1994), "Geometric algorithms for siting of air defense
 missile batteries", for XDraw.
@@ -31,21 +30,21 @@ from benchnav.planning.sensing.sensor import Appearance, Measurement, NoiseKey, 
 class Near(Sensor):
     """Appearance of terrain near the robot, from a mast, with noise.
 
-    The robot's own cell and its eight neighbours are always observed; other cells if
-    their centre is in range, in the field of view and in line of sight. Noise is normal
-    and independent for each cell and step; its standard deviation is proportional to
-    the distance of the cell's centre. The defaults give ±4 of 255 and ±16 mm at 8 m, as
-    a good stereo camera does; slopes of cells of 0.5 m are then known to about 1°.
-    Layers other than colour and elevation have no noise, and slope is computed from
-    observed elevation.
+    The robot's own cell and its eight neighbours are always observed. Any other cell is
+    observed if its centre is in range, in the field of view and in line of sight. Noise
+    is normal and independent between cells and steps. Its standard deviation is
+    proportional to the distance of the cell's centre. The defaults are ±4 of 255 and
+    ±16 mm at 8 m, as for a good stereo camera. Slopes of cells of 0.5 m then have an
+    error of about 1°. Layers other than colour and elevation have no noise, and slope
+    is computed from observed elevation.
 
     Args:
         range_m: range in metres.
         fov_deg: field of view, centred on the robot's heading, in (0, 360].
         height_m: height of the mast above the terrain under the robot, in metres.
-        colour_noise: standard deviation of each channel of a colour, 0–255, for each
-            metre of distance.
-        elevation_noise: standard deviation of elevation in metres, for each metre of
+        colour_noise: standard deviation of each colour channel (0–255) per metre of
+            distance.
+        elevation_noise: standard deviation of elevation in metres, per metre of
             distance.
     """
 
@@ -77,32 +76,36 @@ class Near(Sensor):
     def sense(
         self, terrain: Terrain, field: Tensor, robot_state: Tensor, noise_key: NoiseKey
     ) -> Measurement:
-        """Return the appearance of cells in sight; robots off the map see nothing."""
+        """Return the appearance of cells in sight; robots off the map observe nothing."""
         distance = self._distances(terrain, robot_state.double())
         seen = distance.isfinite()
-        noise = noise_key.normal("look", seen, (4,)) * distance[seen][:, None]
-        colour = terrain.rgb.movedim(1, -1)[seen] + self.colour_noise * noise[:, :3]
+        # Independent normals for red, green, blue and elevation.
+        normals = noise_key.normal("look", seen, (4,))
+        noise = normals * distance[seen][:, None]
+        colour = terrain.rgb.movedim(1, -1)[seen]
+        noisy_colour = colour + self.colour_noise * noise[:, :3]
+        rounded = noisy_colour.round().clamp(0, 255)
         rgb = torch.zeros_like(terrain.rgb)
-        rgb.movedim(1, -1)[seen] = colour.round().clamp(0, 255).to(rgb.dtype)
+        rgb.movedim(1, -1)[seen] = rounded.to(rgb.dtype)
         heights = terrain.elevation_m[seen]
         noisy_heights = heights + self.elevation_noise * noise[:, 3]
         elevation_m = torch.full_like(terrain.elevation_m, math.nan)
         elevation_m[seen] = noisy_heights.to(heights.dtype)
+        layers = {}
+        for name, layer in terrain.layers.items():
+            layers[name] = torch.where(seen, layer, math.nan)
         observation = Observation(
             rgb=rgb,
             elevation_m=elevation_m,
             slope_deg=torch.full_like(terrain.slope_deg, math.nan),
             grid=terrain.grid,
-            layers={
-                name: torch.where(seen, layer, math.nan)
-                for name, layer in terrain.layers.items()
-            },
+            layers=layers,
         )
-        return Measurement.of_appearance(
-            Appearance(
-                seen=seen, observation=observation, noise_level=distance.to(field.dtype)
-            )
+        noise_level = distance.to(field.dtype)
+        appearance = Appearance(
+            seen=seen, observation=observation, noise_level=noise_level
         )
+        return Measurement.of_appearance(appearance)
 
     def _distances(self, terrain: Terrain, robot_state: Tensor) -> Tensor:
         """Return distances to the centres of observed cells, in metres, [B, H, W].
@@ -112,13 +115,14 @@ class Near(Sensor):
         grid = terrain.grid
         x, y, heading = robot_state[:, :3].T[..., None]
         range_cells = max(1, math.ceil(self.range_m / grid.resolution_m))
-        rings = _rings(min(range_cells, max(grid.shape) - 1), robot_state.device)
+        n_rings = min(range_cells, max(grid.shape) - 1)
+        rings = _rings(n_rings, robot_state.device)
         row, column = grid.cell_of(x, y)
-        rows, columns = row + rings.row, column + rings.column
-        on_map = (
-            (rows >= 0) & (rows < grid.height) & (columns >= 0) & (columns < grid.width)
-        )
-        on_map &= grid.contains(x, y)
+        rows = row + rings.row
+        columns = column + rings.column
+        in_rows = (rows >= 0) & (rows < grid.height)
+        in_columns = (columns >= 0) & (columns < grid.width)
+        on_map = in_rows & in_columns & grid.contains(x, y)
         centre_x, centre_y = grid.centre_of(rows, columns)
         dx = centre_x - x
         dy = centre_y - y
@@ -127,15 +131,19 @@ class Near(Sensor):
         if self.fov_deg < 360:
             turn = torch.atan2(dy, dx) - heading + math.pi
             off_heading = turn.remainder(math.tau) - math.pi
-            in_view &= off_heading.abs() <= math.radians(self.fov_deg) / 2
+            half_fov = math.radians(self.fov_deg) / 2
+            in_view &= off_heading.abs() <= half_fov
         in_view = on_map & (in_view | (rings.number <= 1))
 
         row_on_map = rows.clamp(0, grid.height - 1)
-        cell = row_on_map * grid.width + columns.clamp(0, grid.width - 1)
+        column_on_map = columns.clamp(0, grid.width - 1)
+        cell = row_on_map * grid.width + column_on_map
         height_m = terrain.elevation_m.flatten(1).gather(1, cell).double()
         rise = height_m - height_m[:, :1] - self.height_m
         gradient = rise / rings.number.clamp(min=1)
-        visible = in_view & rings.in_sight(gradient.where(in_view, -math.inf))
+        # Only cells in view raise the horizon.
+        gradient = gradient.where(in_view, -math.inf)
+        visible = in_view & rings.in_sight(gradient)
         distances = torch.full_like(terrain.elevation_m, math.inf, dtype=distance.dtype)
         member, ray = visible.nonzero(as_tuple=True)
         cells = member, rows[member, ray], columns[member, ray]
@@ -152,9 +160,9 @@ class _Rings(Batch):
         column: column, likewise.
         number: number of the ring, shape [N]: the larger of the distances to the
             centre in rows and in columns.
-        inner: for each cell, the two cells of the next inner ring between which its ray
+        inner: the two cells of the next inner ring between which each cell's ray
             passes, as indices within that ring, shape [N, 2].
-        fraction: weight of the second of them, float64, shape [N].
+        fraction: weight of the second of these cells, float64, shape [N].
     """
 
     row: Tensor
@@ -168,36 +176,42 @@ class _Rings(Batch):
 
         Args:
             rise: height of each cell above the mast's top, divided by the number of its
-                ring, which orders cells along a ray as the tangent does. −∞ for cells
-                that raise no horizon, shape [B, N].
+                ring, shape [B, N]. Along a ray, this orders cells as the tangent of
+                their elevation angle does. It is −∞ for cells that raise no horizon.
         """
         visible = [torch.ones_like(rise[:, :9], dtype=torch.bool)]
         horizon = rise[:, 1:9]
-        for number in range(2, int(self.number[-1]) + 1):
-            ring = slice((2 * number - 1) ** 2, (2 * number + 1) ** 2)
+        n_rings = int(self.number[-1])
+        for number in range(2, n_rings + 1):
+            start = (2 * number - 1) ** 2
+            stop = (2 * number + 1) ** 2
+            ring = slice(start, stop)
+            ring_rise = rise[:, ring]
             first, second = self.inner[ring].T
             inner_horizon = torch.lerp(
                 horizon[:, first], horizon[:, second], self.fraction[ring]
             )
-            visible.append(rise[:, ring] >= inner_horizon)
-            horizon = torch.maximum(rise[:, ring], inner_horizon)
+            visible.append(ring_rise >= inner_horizon)
+            horizon = torch.maximum(ring_rise, inner_horizon)
         return torch.cat(visible, 1)
 
 
 @lru_cache(maxsize=8)
-def _rings(cells: int, device: torch.device) -> _Rings:
-    """Return the rings up to the number `cells`."""
-    steps = torch.arange(-cells, cells + 1)
-    row, column = (
-        values.flatten() for values in torch.meshgrid(steps, steps, indexing="ij")
-    )
+def _rings(n_rings: int, device: torch.device) -> _Rings:
+    """Return the central cell and the rings around it."""
+    steps = torch.arange(-n_rings, n_rings + 1)
+    offsets = torch.meshgrid(steps, steps, indexing="ij")
+    row, column = (values.flatten() for values in offsets)
     number = torch.maximum(row.abs(), column.abs())
-    # By ring and, within it, by row and column: `order` is stable.
+    # A stable sort by ring keeps the order of rows and columns within each ring.
     order = number.argsort(stable=True)
-    row, column, number = row[order], column[order], number[order]
+    row = row[order]
+    column = column[order]
+    number = number[order]
     ring_start = (2 * number - 1).clamp(min=0) ** 2
-    indices = torch.empty(len(steps), len(steps), dtype=torch.int64)
-    indices[row + cells, column + cells] = torch.arange(len(order)) - ring_start
+    index_in_ring = torch.empty(len(steps), len(steps), dtype=torch.int64)
+    index = torch.arange(len(order)) - ring_start
+    index_in_ring[row + n_rings, column + n_rings] = index
     # The ray crosses the next inner ring at the fraction (number − 1) / number, where
     # one of its two coordinates is an integer.
     scaled = torch.stack((row, column)) * (number - 1)
@@ -205,12 +219,12 @@ def _rings(cells: int, device: torch.device) -> _Rings:
     lower = scaled.div(divisor, rounding_mode="floor")
     remainder = scaled % divisor
     upper = lower + (remainder > 0)
-    inner = torch.stack([indices[tuple(ends + cells)] for ends in (lower, upper)], 1)
+    inner_cells = [index_in_ring[tuple(ends + n_rings)] for ends in (lower, upper)]
     rings = _Rings(
         row=row,
         column=column,
         number=number,
-        inner=inner,
+        inner=torch.stack(inner_cells, 1),
         fraction=remainder.sum(0) / divisor.double(),
     )
     return rings.to(device)

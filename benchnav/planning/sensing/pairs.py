@@ -1,5 +1,4 @@
-"""Pairs of look-alike classes: the cells that may be of one, and their prediction under
-either class.
+"""Pairs of look-alike classes: their cells, and the prediction under either class.
 
 Letters in shapes: B episodes, H×W cells.
 """
@@ -25,7 +24,7 @@ def statistics_of(covariance: CovarianceModel) -> GroundStatistics:
     """Return the terrain statistics, which list the look-alike classes.
 
     Raises:
-        ConfigError: If the covariance model has none.
+        ConfigError: If the covariance model has no statistics.
     """
     expect(
         covariance.statistics is not None,
@@ -45,10 +44,10 @@ def split(
         covariance: the covariance model, whose statistics list the look-alike classes.
 
     Returns:
-        The predictions under the first and under the second class of each cell's pair,
-        the pair's index from 1 (0 if the cell has no pair, int64), and the log odds of
-        its first class (float64, 0 without a pair), each of shape [B, H, W]. Components
-        that belong to no class are in both predictions.
+        The predictions under the first and under the second class of each cell's pair;
+        the index of the pair from 1, int64, 0 without a pair; and the log odds of its
+        first class, float64, 0 without a pair. Each has the shape [B, H, W]. Components
+        without a class are in both predictions.
 
     Raises:
         ConfigError: If the prediction has no classes, or the statistics do not list the
@@ -75,7 +74,8 @@ def split(
     if not pairs:
         return prior, prior, pair, odds
     weights = prior.weights.double()
-    normalised = replace(prior, weights=weights / weights.sum(-3, keepdim=True))
+    normalised_weights = weights / weights.sum(-3, keepdim=True)
+    normalised = replace(prior, weights=normalised_weights)
     probabilities = normalised.class_probabilities(len(names))
     group = torch.tensor(prior.group, device=prior.device).view(-1, 1, 1)
     max_weight = torch.full_like(odds, _MIN_PAIR_WEIGHT)
@@ -91,13 +91,14 @@ def split(
         pair = torch.where(is_of_pair, index, pair)
         odds = torch.where(is_of_pair, (first / second).log(), odds)
         for part, probability in enumerate((first, second)):
-            # The class gets all of the pair's weight; the other class of it gets none.
-            other_id = ids[1 - part]
-            others = torch.where(group == other_id, 0.0, 1.0)
+            # The class has all of the pair's weight; the other class has no weight.
+            excluded_id = ids[1 - part]
+            others = torch.where(group == excluded_id, 0.0, 1.0)
             gain = (pair_weight / probability)[:, None]
             scale = torch.where(group == ids[part], gain, others)
             scales[part] = torch.where(is_of_pair[:, None], scale, scales[part])
-    under_first, under_second = (
-        replace(prior, weights=(weights * scale).to(prior.dtype)) for scale in scales
-    )
+    first_weights = (weights * scales[0]).to(prior.dtype)
+    second_weights = (weights * scales[1]).to(prior.dtype)
+    under_first = replace(prior, weights=first_weights)
+    under_second = replace(prior, weights=second_weights)
     return under_first, under_second, pair, odds

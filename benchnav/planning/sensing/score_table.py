@@ -1,8 +1,8 @@
 """Tables of λ by normal score: fast distributions of cells after conditioning.
 
 A row belongs to one cell and contains the normal scores of `VALUES` under the cell's
-prediction. They give P(λ ≤ value) for a posterior of the score. Rows are computed only
-for requested cells, and are cached.
+prediction. From them follows P(λ ≤ value) for a posterior of the score. Rows are
+computed only for requested cells, and are cached.
 Letters in shapes: B episodes, H×W cells, *B any leading dimensions, K values of λ, R
 rows, N cells.
 """
@@ -15,15 +15,15 @@ import torch
 from torch import Tensor
 
 from benchnav.core.batch import Batch, map_tensors
-from benchnav.core.conditioned import LEAST_SKEW, unskewed
+from benchnav.core.conditioned import MIN_SKEW, unskewed
 from benchnav.core.distribution import TraversabilityDistribution, check_floor, tail_of
 
 VALUES: tuple[float, ...] = (
     *(round(0.005 * step, 3) for step in range(40)),
     *(round(0.2 + 0.02 * step, 2) for step in range(41)),
 )
-"""Values of λ between which a belief's CDF is linear: denser where risk is."""
-_MAX_SCORE = 9.0  # beyond which ranks cannot be distinguished
+"""Values of λ between which a belief's CDF is linear, denser in the lower tail."""
+_MAX_SCORE = 9.0  # float64 cannot distinguish ranks beyond it
 _MIN_STD = 1e-9
 _CHUNK_SIZE = 512  # cells, so that intermediate results fit the CPU cache
 
@@ -55,21 +55,25 @@ class TabulatedDistribution(TraversabilityDistribution):
         values = self._values()
         upper = torch.searchsorted(values, at.contiguous()).clamp(1, len(VALUES) - 1)
         lower = upper - 1
-        lower_cdf, upper_cdf = (
-            self.below.gather(-3, index.expand(self.shape).unsqueeze(-3)).squeeze(-3)
-            for index in (lower, upper)
-        )
-        fraction = (at - values[lower]) / (values[upper] - values[lower])
-        inside = torch.lerp(lower_cdf, upper_cdf, fraction.clamp(0, 1))
+        low = values[lower]
+        high = values[upper]
+        fraction = ((at - low) / (high - low)).clamp(0, 1)
+        inside = torch.lerp(self._below_at(lower), self._below_at(upper), fraction)
         strictly_below = torch.where(at <= 0, 0.0, inside)
-        at_most = torch.where(at < 0, 0.0, torch.where(at < 1, inside, 1.0))
+        at_most = torch.where(at < 1, inside, 1.0)
+        at_most = torch.where(at < 0, 0.0, at_most)
         return strictly_below, at_most
+
+    def _below_at(self, index: Tensor) -> Tensor:
+        """Return `below` at an index of `VALUES` in each cell, shape [*B, H, W]."""
+        cell_index = index.expand(self.shape).unsqueeze(-3)
+        return self.below.gather(-3, cell_index).squeeze(-3)
 
     def quantile(self, probability: Tensor | float) -> Tensor:
         """Return quantiles of λ, shape [*B, H, W]; see the base class."""
         level = torch.as_tensor(probability, dtype=self.dtype, device=self.device)
-        rows = self.below.movedim(-3, -1).contiguous()
         levels = level.expand(self.shape).unsqueeze(-1)
+        rows = self.below.movedim(-3, -1).contiguous()
         return value_at(rows, levels).squeeze(-1)
 
     def mean(self) -> Tensor:
@@ -79,7 +83,7 @@ class TabulatedDistribution(TraversabilityDistribution):
     def cvar(self, level: float) -> Tensor:
         """Return the mean of λ over its worst 1 − level fraction, shape [*B, H, W].
 
-        With p = 1 − level it is 1/p ∫₀¹ max(p − F, 0).
+        For p = 1 − level it is 1/p ∫₀¹ max(p − F, 0).
         """
         tail = tail_of(level)
         below = self.below.movedim(-3, -1)
@@ -87,13 +91,16 @@ class TabulatedDistribution(TraversabilityDistribution):
         remaining = (tail - below).clamp(min=0)
         low = remaining[..., :-1]
         high = remaining[..., 1:]
+        mean_remaining = (low + high) / 2
         if tail == 1:  # F does not exceed it
-            return ((low + high) / 2 @ step).clamp(max=1)
-        # In the interval in which F exceeds p, only the part before counts.
+            return (mean_remaining @ step).clamp(max=1)
+        # Only the part of an interval up to the crossing of F and p counts.
         rise = below.diff(dim=-1).clamp(min=1e-30)
-        part = low / torch.where(high > 0, 1.0, rise)
-        pieces = torch.where(high > 0, (low + high) / 2, low * part / 2)
-        return ((pieces @ step) / tail).clamp(max=1)  # may exceed 1 by rounding
+        is_before = high > 0
+        fraction = low / torch.where(is_before, 1.0, rise)
+        pieces = torch.where(is_before, mean_remaining, low * fraction / 2)
+        mean = (pieces @ step) / tail
+        return mean.clamp(max=1)  # may exceed 1 by rounding
 
     def expected_time(self, floor: float) -> Tensor:
         """Return E[1 / max(λ, floor)], shape [*B, H, W].
@@ -107,10 +114,12 @@ class TabulatedDistribution(TraversabilityDistribution):
         end = np.maximum(high, floor)
         times = 1 / start - 1 / end
         logs = np.log(end / start)
+        width = high - low
         weights = np.zeros(len(VALUES))
-        weights[:-1] += (high * times - logs) / (high - low)
-        weights[1:] += (logs - low * times) / (high - low)
-        return 1 + self.below.movedim(-3, -1) @ self.below.new_tensor(weights)
+        weights[:-1] += (high * times - logs) / width
+        weights[1:] += (logs - low * times) / width
+        below = self.below.movedim(-3, -1)
+        return 1 + below @ self.below.new_tensor(weights)
 
     def time_cvar(self, level: float, floor: float) -> Tensor:
         """Return the CVaR of the time 1 / max(λ, floor), shape [*B, H, W]."""
@@ -121,47 +130,52 @@ class TabulatedDistribution(TraversabilityDistribution):
         low = values[:-1]
         high = values[1:].clamp(min=floor)
         slope = below.diff(dim=-1) / values.diff()
-        # In the interval in which F exceeds p, the CDF of the tail is linear up to that
-        # λ, and 1 above it.
-        remaining = (tail - below[..., :-1]).clamp(min=0)
+        below_low = below[..., :-1]
+        # The CDF of the tail is linear up to the crossing of F and p, and 1 above it.
+        remaining = (tail - below_low).clamp(min=0)
         crossing = low + remaining / slope.clamp(min=1e-30)
         split = torch.minimum(crossing.clamp(min=floor), high)
         start = low.clamp(min=floor)
-        offset = below[..., :-1] - slope * low
-        linear = offset * (1 / start - 1 / split) + slope * (split / start).log()
-        return 1 + (linear / tail + (1 / split - 1 / high)).sum(-1)
+        offset = below_low - slope * low
+        log_growth = (split / start).log()
+        linear = offset * (1 / start - 1 / split) + slope * log_growth
+        excess = linear / tail + (1 / split - 1 / high)
+        return 1 + excess.sum(-1)
 
     def _values(self) -> Tensor:
         return self.below.new_tensor(VALUES)
 
 
 def value_at(rows: Tensor, levels: Tensor) -> Tensor:
-    """Return λ at which numbers that increase with λ reach levels.
+    """Return λ at which a function that increases with λ reaches levels.
 
-    It is 0 below the first number of a row and 1 above the last.
+    It is 0 for levels below the first value of a row and 1 for levels above the last.
 
     Args:
-        rows: numbers of each cell at `VALUES`, shape [*B, K].
+        rows: the function of each cell at `VALUES`, shape [*B, K].
         levels: levels, shape [*B, N].
 
     Returns:
         λ, shape [*B, N].
     """
-    after = torch.searchsorted(rows, levels.contiguous())
-    upper = after.clamp(1, len(VALUES) - 1)
-    low = rows.gather(-1, upper - 1)
+    index = torch.searchsorted(rows, levels.contiguous())
+    upper = index.clamp(1, len(VALUES) - 1)
+    lower = upper - 1
+    low = rows.gather(-1, lower)
     high = rows.gather(-1, upper)
-    fraction = (levels - low) / torch.where(high > low, high - low, 1.0)
+    rise = torch.where(high > low, high - low, 1.0)
+    fraction = ((levels - low) / rise).clamp(0, 1)
     values = rows.new_tensor(VALUES)
-    inside = torch.lerp(values[upper - 1], values[upper], fraction.clamp(0, 1))
-    return torch.where(after == len(VALUES), 1.0, torch.where(after == 0, 0.0, inside))
+    inside = torch.lerp(values[lower], values[upper], fraction)
+    inside = torch.where(index == 0, 0.0, inside)
+    return torch.where(index == len(VALUES), 1.0, inside)
 
 
 @dataclass(frozen=True)
 class _Rows:
     """Scores of `VALUES`, float32, shape [R, K].
 
-    Rows of several episodes together, so that `select` leaves them as they are.
+    The rows of all episodes are stored together, so that `select` does not copy them.
     """
 
     scores: Tensor
@@ -183,21 +197,24 @@ class ScoreTable(Batch):
     def empty(cls, prior: TraversabilityDistribution) -> "ScoreTable":
         """Return a table without rows."""
         row_index = torch.full(prior.shape, -1, dtype=torch.int64, device=prior.device)
-        return cls(row_index, _Rows(scores_of(prior.at(row_index >= 0))))
+        no_cells = prior.at(row_index >= 0)
+        return cls(row_index, _Rows(scores_of(no_cells)))
 
     def put(self, members: Tensor, others: "ScoreTable") -> "ScoreTable":
         """Replace episodes; see `Batch`."""
         offset = len(self.rows.scores)
-        row_index = torch.where(others.row_index >= 0, others.row_index + offset, -1)
+        has_row = others.row_index >= 0
+        new_index = torch.where(has_row, others.row_index + offset, -1)
+        row_index = self.row_index.index_copy(0, members, new_index)
         rows = torch.cat((self.rows.scores, others.rows.scores))
-        return ScoreTable(self.row_index.index_copy(0, members, row_index), _Rows(rows))
+        return ScoreTable(row_index, _Rows(rows))
 
     def without(self, cells: Tensor) -> "ScoreTable":
         """Return the table without the rows of some cells, bool, [B, H, W]."""
         return replace(self, row_index=self.row_index.masked_fill(cells, -1))
 
     def having(self, prior: TraversabilityDistribution, cells: Tensor) -> "ScoreTable":
-        """Return a table that has a row of each of some cells.
+        """Return the table with a row for each requested cell.
 
         Args:
             prior: the prediction, shape [B, H, W].
@@ -218,46 +235,54 @@ class ScoreTable(Batch):
         return ScoreTable(row_index, _Rows(rows))
 
     def below(self, cells: Tensor, mean: Tensor, std: Tensor, skew: Tensor) -> Tensor:
-        """Return P(λ ≤ value) at `VALUES`, and at 1 P(λ < 1), of cells, [N, K].
+        """Return P(λ ≤ value) of cells at `VALUES`, shape [N, K]; P(λ < 1) at 1.
 
         Args:
             cells: mask of the cells, bool, shape [B, H, W]; each has a row.
-            mean: mean of the posterior of their scores, shape [N].
-            std: its standard deviation, shape [N].
-            skew: its skewness, shape [N].
+            mean: posterior mean of their scores, shape [N].
+            std: posterior standard deviation of their scores, shape [N].
+            skew: posterior skewness of their scores, shape [N].
         """
         scores = self.rows.scores[self.row_index[cells]]
-        mean, std = mean.to(scores), std.to(scores).clamp(min=_MIN_STD)
-        away = (scores - mean[:, None]) / std[:, None]
-        is_skewed = skew.abs() >= LEAST_SKEW
+        mean = mean.to(scores)
+        std = std.to(scores).clamp(min=_MIN_STD)
+        normal = (scores - mean[:, None]) / std[:, None]
+        is_skewed = skew.abs() >= MIN_SKEW
         if bool(is_skewed.any()):
-            normal = unskewed(away[is_skewed], skew[is_skewed, None]).to(away)
-            away = away.index_put((is_skewed,), normal)
-        return (1 + torch.erf(away * math.sqrt(0.5))) / 2
+            cell_skew = skew[is_skewed, None]
+            unskewed_scores = unskewed(normal[is_skewed], cell_skew).to(normal)
+            normal = normal.index_put((is_skewed,), unskewed_scores)
+        return (1 + torch.erf(normal * math.sqrt(0.5))) / 2
 
 
 def scores_of(prior: TraversabilityDistribution) -> Tensor:
     """Return normal scores of `VALUES` in each cell of a map of one row, [1, R].
 
-    Float32, shape [R, K]. At an atom at 0 or 1 the score is the end of its interval
-    that is nearer to the other values.
+    An atom at 0 or 1 has an interval of scores; its end towards the other values is
+    returned.
+
+    Returns:
+        Scores, float32, shape [R, K].
     """
-    count = prior.shape[-1]
-    parts = [
-        _scores_of(prior, start, start + _CHUNK_SIZE)
-        for start in range(0, max(count, 1), _CHUNK_SIZE)
-    ]
+    n_cells = max(prior.shape[-1], 1)
+    parts = []
+    for start in range(0, n_cells, _CHUNK_SIZE):
+        parts.append(_scores_of(prior, start, start + _CHUNK_SIZE))
     return parts[0] if len(parts) == 1 else torch.cat(parts)
 
 
 def _scores_of(prior: TraversabilityDistribution, start: int, end: int) -> Tensor:
     """Return the scores of a chunk of cells, all values at once."""
     n_values = len(VALUES)
-    cells = map_tensors(
-        prior, lambda of: of[..., start:end].repeat_interleave(n_values, dim=-1)
-    )
+
+    def repeat(parameter: Tensor) -> Tensor:
+        return parameter[..., start:end].repeat_interleave(n_values, dim=-1)
+
+    cells = map_tensors(prior, repeat)
+    n_cells = cells.shape[-1] // n_values
     values = torch.tensor(VALUES, dtype=torch.float64, device=prior.device)
-    value = values.repeat(cells.shape[-1] // n_values)
-    low, high = cells.to_normal(value[None])
-    ends = torch.where(value < 1, high, low)[0]
-    return ends.float().clamp(-_MAX_SCORE, _MAX_SCORE).view(-1, n_values)
+    repeated = values.repeat(n_cells)
+    low, high = cells.to_normal(repeated[None])
+    ends = torch.where(repeated < 1, high, low)[0]
+    clamped = ends.float().clamp(-_MAX_SCORE, _MAX_SCORE)
+    return clamped.view(-1, n_values)

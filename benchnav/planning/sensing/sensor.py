@@ -1,9 +1,9 @@
-"""Sensors: the appearance of terrain, its λ, and the input of a planner at each step.
+"""Sensors of appearance and of λ, and the input of a planner at each step.
 
 A sensor receives the truth and returns a measurement of it: the appearance of cells
 (kind `sensor`) or their λ (kind `ground`). Its noise is keyed by episode, cell and
-step, so that all planners and beliefs meet common random numbers. Every robot has
-`contact`, the λ of the cell under it.
+step, so that all planners and beliefs have common random numbers. Every robot has the
+sensor `contact`, which measures λ of the cell under it.
 Letters in shapes: B episodes, S state dimensions, H×W cells, N sensed cells.
 """
 
@@ -31,10 +31,10 @@ class Step(Batch):
 
     Args:
         state: robot states, shape [B, S].
-        traversability: λ observed under the robot in the last step; NaN in the first,
-            shape [B].
+        traversability: λ observed under the robot in the last step; NaN in the first
+            step, shape [B].
         time_s: time since the start of the episodes, in seconds.
-        draw: whether the plan will be drawn; if not, a planner may omit the layers of
+        draw: whether the plan will be drawn. If False, a planner may omit the layers of
             its `Plan`.
     """
 
@@ -50,11 +50,10 @@ class Appearance(Batch):
 
     Args:
         seen: mask of observed cells, bool, shape [B, H, W].
-        observation: colour, elevation and layers of the observed cells. Its other
-            cells and its slopes are ignored; slopes are computed from the observed
-            elevation.
-        noise_level: observation noise of each cell, in any unit, shape [B, H, W]. Of
-            several observations of a cell the least noisy one is kept.
+        observation: colour, elevation and layers of the observed cells. All other cells
+            and the slopes are ignored; slopes are computed from observed elevation.
+        noise_level: observation noise of each cell, in any unit, shape [B, H, W]. The
+            memory keeps the least noisy observation of a cell.
     """
 
     seen: Tensor
@@ -98,8 +97,8 @@ class NoiseKey:
     """Key of a sensor's noise: common random numbers for all planners and beliefs.
 
     Args:
-        keys: a stream key of each episode, B of them.
-        step: number of steps taken, for all episodes or for each, B of them.
+        keys: a stream key for each of B episodes.
+        step: number of steps taken, one for all episodes or one for each.
     """
 
     keys: Sequence[int]
@@ -113,26 +112,29 @@ class NoiseKey:
         Args:
             name: name of the stream, for a sensor that draws more than once.
             cells: mask of cells, bool, shape [B, H, W].
-            shape: shape of the draw of one cell; four numbers cost hardly more than
-                one.
+            shape: shape of the draw of a cell; drawing four numbers is hardly slower
+                than drawing one.
 
         Returns:
             Float64, in the order of `cells.nonzero()`, shape [N, *shape].
         """
-        member, cell = cells.flatten(1).nonzero().cpu().numpy().T
+        indices = cells.flatten(1).nonzero().cpu().numpy()
+        member, cell = indices.T
         steps = np.broadcast_to(np.array(self.step), len(self.keys))
         keys = [rng.stream_key(key, name) for key in self.keys]
-        counters = steps[member] * cells[0].numel() + cell
+        n_cells = cells[0].numel()
+        counters = steps[member] * n_cells + cell
         per_cell = int(np.prod(shape, dtype=int))
         normals = rng.normal_of_each(keys, member, counters, per_cell)
-        return torch.from_numpy(normals.reshape(-1, *shape)).to(cells.device)
+        draws = normals.reshape(-1, *shape)
+        return torch.from_numpy(draws).to(cells.device)
 
 
 class Sensor(Specified, ABC):
     """Base class of sensors: parts of kind `sensor` (appearance) and `ground` (λ).
 
     Attributes:
-        sees_all: whether the sensor shows the whole map at the start. If so, `sense`
+        sees_all: whether the sensor shows the whole map at the start. If True, `sense`
             is not called during the episode.
     """
 
@@ -151,8 +153,8 @@ class Sensor(Specified, ABC):
             noise_key: key of the noise of this step.
 
         Returns:
-            The measurement. A sensor may read the truth only of cells that it reports;
-            `check_sensor` replaces all others.
+            The measurement. It may depend only on the truth of cells that it reports;
+            `check_sensor` tests this by changing all others.
         """
 
 
@@ -167,13 +169,12 @@ class Full(Sensor):
     ) -> Measurement:
         """Return the appearance of all cells."""
         seen = torch.ones_like(field, dtype=torch.bool)
-        return Measurement.of_appearance(
-            Appearance(
-                seen=seen,
-                observation=terrain.observe(),
-                noise_level=torch.zeros_like(field),
-            )
+        observation = terrain.observe()
+        noise_level = torch.zeros_like(field)
+        appearance = Appearance(
+            seen=seen, observation=observation, noise_level=noise_level
         )
+        return Measurement.of_appearance(appearance)
 
 
 @dataclass(frozen=True)
@@ -184,7 +185,8 @@ class Contact(Sensor):
         self, terrain: Terrain, field: Tensor, robot_state: Tensor, noise_key: NoiseKey
     ) -> Measurement:
         """Return λ of the robot's own cell."""
-        x, y = robot_state[:, 0], robot_state[:, 1]
+        x = robot_state[:, 0]
+        y = robot_state[:, 1]
         row, column = terrain.grid.cell_of(x, y)
         values = torch.full_like(field, torch.nan)
         on_map = terrain.grid.contains(x, y)
@@ -232,12 +234,14 @@ class Probe(Sensor):
         cells = in_range.nonzero(as_tuple=True)
         truth = terrain.truth.at(in_range)
         value = field[cells]
-        lower, upper = (ends[0].double() for ends in truth.to_normal(value[None]))
+        interval = truth.to_normal(value[None])
+        lower, upper = (ends[0].double() for ends in interval)
         # An atom has no single score to which noise could be added.
         is_atom = upper > lower
         noise = noise_key.normal("noise", in_range)
         score = lower.masked_fill(is_atom, 0.0) + self.noise_std * noise
-        noisy = truth.from_normal(score[None].to(value.dtype))[0].to(field.dtype)
+        noisy_score = score[None].to(value.dtype)
+        noisy = truth.from_normal(noisy_score)[0].to(field.dtype)
         values = torch.full_like(field, torch.nan)
         values[cells] = torch.where(is_atom, value, noisy)
         std = torch.full_like(field, self.noise_std)
@@ -252,9 +256,11 @@ class Probe(Sensor):
         x, y = grid.centre_of(row[:, None], column[None, :])
         dx = x - robot_state[:, 0, None, None]
         dy = y - robot_state[:, 1, None, None]
-        in_square = (dx.abs() <= self.radius_m) & (dy.abs() <= self.radius_m)
-        # Square roots only of the few cells that may be near: those of all cells take
-        # as long as the rest of a measurement.
+        in_columns = dx.abs() <= self.radius_m
+        in_rows = dy.abs() <= self.radius_m
+        in_square = in_columns & in_rows
+        # Distances are computed only for the few cells that may be near. For all cells
+        # they would take as long as all other steps of a measurement.
         member, row, column = in_square.nonzero(as_tuple=True)
         distance = torch.hypot(dx[member, 0, column], dy[member, row, 0])
         return in_square.index_put((member, row, column), distance <= self.radius_m)

@@ -18,10 +18,10 @@ from benchnav.planning.sensing.gaussian import Field
 from benchnav.planning.sensing.labels import Lattice, Noise, noise, unpacked
 
 _REACH = 12  # cells
-# Probability of the less likely label under which an observed cell is not drawn again.
+# An observed cell is not drawn again if its less likely label has a lower probability.
 _SETTLED = 0.005
 MIN_CHANGE = 0.01
-"""Minimum change of the probability of a cell that was not observed."""
+"""Minimum change of the probability of an unobserved cell."""
 _MIN_PRECISION = 1e-6  # of a term
 
 
@@ -38,7 +38,7 @@ class Evidence(Batch):
         density: log f / φ of the observation under either class, 0 for an interval,
             shape [B, 2, H, W].
         precision: precision of the Gaussian terms of observations, shape [B, H, W].
-        shift: precision times mean of the terms.
+        shift: precision times mean of the terms, shape [B, H, W].
         pair: index of the pair of each cell, from 1; 0 without one, int64, shape
             [B, H, W].
         p_first: posterior probability of the first class, float64, shape [B, H, W].
@@ -91,36 +91,30 @@ class Block:
     @classmethod
     def around(cls, evidence: Evidence, changed: Tensor, strength: float) -> "Block":
         """Return the block of all cells in reach of changed ones, and their neighbours."""
-        ends = torch.tensor(
-            [bounds(new) for new in changed.cpu().numpy()], device=changed.device
-        )
-        row_ends, column_ends = ends.permute(1, 2, 0)
-        lines = []
-        for (low, high), size in zip(
-            (row_ends, column_ends), changed.shape[1:], strict=True
-        ):
-            length = int((high - low).max()) + 1 + 2 * (_REACH + 1)
-            length = min(length, size)
-            begin = (low - _REACH - 1).clamp(min=0).clamp(max=size - length)
-            lines.append(begin[:, None] + torch.arange(length, device=low.device))
-        row = lines[0][:, :, None].expand(-1, -1, lines[1].shape[1])
-        column = lines[1][:, None].expand_as(row)
-        at = (
-            torch.arange(len(changed), device=changed.device)[:, None],
-            row.flatten(1),
-            column.flatten(1),
-        )
-        pair, p_first, observed = (
-            values[at].view_as(row)
-            for values in (evidence.pair, evidence.p_first, ~evidence.noise_std.isnan())
-        )
+        device = changed.device
+        ends = [bounds(new) for new in changed.cpu().numpy()]
+        by_axis = torch.tensor(ends, device=device).permute(1, 2, 0)
+        row_ends, column_ends = by_axis
+        height, width = changed.shape[1:]
+        rows = _indices_around(row_ends, height)
+        columns = _indices_around(column_ends, width)
+        n_columns = columns.shape[1]
+        row = rows[:, :, None].expand(-1, -1, n_columns)
+        column = columns[:, None].expand_as(row)
+        member = torch.arange(len(changed), device=device)[:, None]
+        at = member, row.flatten(1), column.flatten(1)
+        is_observed = ~evidence.noise_std.isnan()
+        pair = evidence.pair[at].view_as(row)
+        p_first = evidence.p_first[at].view_as(row)
+        observed = is_observed[at].view_as(row)
         distance = torch.zeros_like(row)
-        for index, (low, high) in ((row, row_ends), (column, column_ends)):
-            before = low[:, None, None] - index
-            after = index - high[:, None, None]
-            distance = torch.maximum(distance, torch.maximum(before, after))
-        # Only neighbours of cells in reach are coupled: the size of the block depends
-        # on the other episodes of the batch.
+        for index, (first, last) in ((row, row_ends), (column, column_ends)):
+            before = first[:, None, None] - index
+            after = index - last[:, None, None]
+            outside = torch.maximum(before, after)
+            distance = torch.maximum(distance, outside)
+        # The size of the block depends on the other episodes of the batch, so only
+        # neighbours of cells in reach are coupled.
         pair = torch.where(distance <= _REACH + 1, pair, 0)
         in_reach = distance <= _REACH
         lattice = Lattice.of(pair, strength)
@@ -134,13 +128,14 @@ class Block:
             in_reach=in_reach,
             lattice=lattice,
             degree=lattice.degree(),
-            torus=max(changed.shape[1:]),
+            torus=max(height, width),
         )
 
     @property
     def free(self) -> Tensor:
         """All bits set on cells whose labels a sweep draws."""
-        return -((self.pair > 0) & self.in_reach & ~self.observed).long()
+        is_free = (self.pair > 0) & self.in_reach & ~self.observed
+        return -is_free.long()
 
     @property
     def even(self) -> Tensor:
@@ -153,8 +148,10 @@ class Block:
 
         They are observed, or out of reach and settled by cells that are farther away.
         """
-        informative = ~self.in_reach & ((self.p_first - 0.5).abs() > MIN_CHANGE)
-        return -((self.pair > 0) & (self.observed | informative)).long()
+        is_settled = (self.p_first - 0.5).abs() > MIN_CHANGE
+        informative = ~self.in_reach & is_settled
+        has_evidence = (self.pair > 0) & (self.observed | informative)
+        return -has_evidence.long()
 
     def noise(self, sweeps: Tensor) -> Noise:
         """Return the random bits of the next sweep."""
@@ -177,7 +174,8 @@ class Sites:
         column: columns, int64.
         cell: index in the block, int64, shape [B, N].
         neighbours: block indices of the four neighbours, int64, shape [B, N, 4].
-        coupled: all bits set where a neighbour is coupled to the cell, int64.
+        coupled: all bits set where a neighbour is coupled to the cell, int64, shape
+            [B, N, 4].
         strength: β.
         lower: minimum score under either class, shape [B, 2, N].
         upper: maximum score.
@@ -214,38 +212,27 @@ class Sites:
     def of(
         cls, evidence: Evidence, changed: Tensor, block: Block, window: int
     ) -> "Sites":
-        """Return the observed cells nearest to new observations."""
-        is_observed = (~evidence.noise_std.isnan()).cpu().numpy()
-        cells = [
-            nearest(mask, new, window)
-            for mask, new in zip(is_observed, changed.cpu().numpy(), strict=True)
-        ]
-        rows = [torch.from_numpy(row) for row, _ in cells]
-        columns = [torch.from_numpy(column) for _, column in cells]
-        is_site = [row >= 0 for row in rows]
-        # Padded in front, so that new observations are last.
-        row, column, exists = (
-            pad_sequence(values, batch_first=True).flip(1).to(changed.device)
-            for values in (rows, columns, is_site)
-        )
+        """Return the observed cells nearest to new observations.
+
+        Args:
+            evidence: evidence of B episodes.
+            changed: mask of cells with new observations, bool, shape [B, H, W].
+            block: block around these cells.
+            window: maximum number of cells; more if more have changed.
+        """
+        row, column, exists = _nearest_cells(evidence, changed, window)
         at = block.at[0], row, column
-        height, width = block.row.shape[1:]
-        down = row - block.row[:, 0, :1]
-        right = column - block.column[:, 0, :1]
-        in_rows = (down >= 0) & (down < height)
-        in_columns = (right >= 0) & (right < width)
-        inside = exists & in_rows & in_columns
-        cell = torch.where(inside, down * width + right, 0)
-        inside &= block.in_reach.flatten(1).gather(1, cell)
-        neighbours, coupled = _neighbours(cell, block.lattice)
+        cell, inside = _cells_in_block(row, column, exists, block)
+        neighbours, couplings = _neighbours(cell, block.lattice)
+        coupled = torch.where(inside[..., None], couplings, 0)
 
         def by_class(values: Tensor) -> Tensor:
-            at_sites = values.transpose(0, 1)[:, *at].transpose(0, 1)
+            class_first = values.transpose(0, 1)
+            at_sites = class_first[:, *at].transpose(0, 1)
             return torch.where(exists[:, None], at_sites, 0.0)
 
         lower = by_class(evidence.lower)
         upper = by_class(evidence.upper)
-        has_pair = evidence.pair[at] > 0
         std = torch.where(exists, evidence.noise_std[at], 1.0)
         fresh = changed[at] & exists
         interval = (upper > lower)[:, 0]
@@ -258,18 +245,24 @@ class Sites:
         covariance = evidence.field.covariance(member, row_offset, column_offset)
         both_exist = exists[:, :, None] & exists[:, None]
         covariance = torch.where(both_exist, covariance, 0.0)
-        covariance.diagonal(dim1=1, dim2=2).copy_(torch.where(exists, 1 + noise, 1.0))
+        variance = torch.where(exists, 1 + noise, 1.0)
+        covariance.diagonal(dim1=1, dim2=2).copy_(variance)
         labels = unpacked(evidence.labels[at]).transpose(1, 2)
-        scores = torch.where(labels, lower[:, :1], lower[:, 1:])
+        first_scores = lower[:, :1]
+        second_scores = lower[:, 1:]
+        scores = torch.where(labels, first_scores, second_scores)
         term_mean = evidence.shift[at] / precision
         scores = torch.where(censored[:, None], term_mean[:, None], scores)
+        is_old = exists & ~fresh
+        old_scores = torch.where(is_old[:, None], scores, 0.0)
+        may_change = inside & (evidence.pair[at] > 0)
         unsettled = (evidence.p_first[at] - 0.5).abs() < 0.5 - _SETTLED
         return cls(
             row=row,
             column=column,
             cell=cell,
             neighbours=neighbours,
-            coupled=torch.where(inside[..., None], coupled, 0),
+            coupled=coupled,
             strength=block.lattice.strength,
             lower=lower,
             upper=upper,
@@ -277,11 +270,11 @@ class Sites:
             std=std,
             noise=noise,
             factor=torch.linalg.cholesky(covariance),
-            scores=torch.where((exists & ~fresh)[:, None], scores, 0.0),
+            scores=old_scores,
             fresh=fresh,
             censored=censored,
-            open=fresh | (inside & has_pair & unsettled),
-            flippable=inside & has_pair & ~interval,
+            open=fresh | (may_change & unsettled),
+            flippable=may_change & ~interval,
         )
 
     def draw(
@@ -297,23 +290,23 @@ class Sites:
         Args:
             site: index of the site.
             mean: mean of the noisy score given others, shape [B, S].
-            variance: its variance, shape [B, 1].
+            variance: variance of the noisy score given others, shape [B, 1].
             labels: labels of the block, int64, shape [B, RC].
             uniforms: random numbers in [0, 1), shape [B, S, 2].
 
         Returns:
-            Whether the label is the first (bool), the probability of that, the log
-            density of the observation, and the score, each of shape [B, S].
+            Whether the label is the first (bool), the probability of the first label,
+            the log density of the observation, and the score, each of shape [B, S].
         """
         coupled = self.coupled[:, site]
         neighbour_labels = labels.gather(1, self.neighbours[:, site]) & coupled
-        odds = self.strength * (
-            unpacked(neighbour_labels).sum(1) * 2 + coupled.sum(1)[:, None]
-        )
-        lower, upper, density = (
-            values[:, :, site, None]
-            for values in (self.lower, self.upper, self.density)
-        )
+        n_first = unpacked(neighbour_labels).sum(1)
+        # Coupled neighbours are −1, so that the sum is minus their number.
+        minus_n_coupled = coupled.sum(1)[:, None]
+        odds = self.strength * (n_first * 2 + minus_n_coupled)
+        lower = self.lower[:, :, site, None]
+        upper = self.upper[:, :, site, None]
+        density = self.density[:, :, site, None]
         is_number = upper <= lower
         std = variance.sqrt()[:, None]
         mean = mean[:, None]
@@ -323,37 +316,102 @@ class Sites:
         log_density = density - 0.5 * low.square() - std.log() - half_log_tau
         # Mirrored to the lower tail, where Φ loses no digits.
         mirrored = low + high > 0
-        low, high = torch.where(mirrored, -high, low), torch.where(mirrored, -low, high)
-        log_high = torch.special.log_ndtr(high)
-        log_ratio = (torch.special.log_ndtr(low) - log_high).clamp(max=-1e-300)
-        log_mass = log_high + torch.log(-torch.expm1(log_ratio))
+        lower_z = torch.where(mirrored, -high, low)
+        upper_z = torch.where(mirrored, -low, high)
+        log_upper = torch.special.log_ndtr(upper_z)
+        log_lower = torch.special.log_ndtr(lower_z)
+        log_ratio = (log_lower - log_upper).clamp(max=-1e-300)
+        log_mass = log_upper + torch.log(-torch.expm1(log_ratio))
         log_evidence = torch.where(is_number, log_density, log_mass)
-        p_first = torch.sigmoid(odds + log_evidence[:, 0] - log_evidence[:, 1])
-        log_prior = torch.nn.functional.logsigmoid(torch.stack((odds, -odds), 1))
+        first_evidence, second_evidence = log_evidence.unbind(1)
+        p_first = torch.sigmoid(odds + first_evidence - second_evidence)
+        both_odds = torch.stack((odds, -odds), 1)
+        log_prior = torch.nn.functional.logsigmoid(both_odds)
         log_total = (log_evidence + log_prior).logsumexp(1)
-        first = uniforms[..., 0] < p_first
-        p_low = torch.special.ndtr(low)
-        rank = p_low + (torch.special.ndtr(high) - p_low) * uniforms[:, None, :, 1]
-        inner = torch.special.ndtri(rank.clamp(min=1e-300))
-        inner = mean + std * torch.where(mirrored, -inner, inner)
+        is_first = uniforms[..., 0] < p_first
+        # A score within the interval, by inversion of its CDF.
+        p_low = torch.special.ndtr(lower_z)
+        p_interval = torch.special.ndtr(upper_z) - p_low
+        rank = p_low + p_interval * uniforms[:, None, :, 1]
+        z = torch.special.ndtri(rank.clamp(min=1e-300))
+        inner = mean + std * torch.where(mirrored, -z, z)
         inner = torch.maximum(torch.minimum(inner, upper), lower)
         score = torch.where(is_number, lower, inner)
-        score = torch.where(first, score[:, 0], score[:, 1])
-        return first, p_first, log_total, score
+        score = torch.where(is_first, score[:, 0], score[:, 1])
+        return is_first, p_first, log_total, score
+
+
+def _indices_around(ends: tuple[Tensor, Tensor], size: int) -> Tensor:
+    """Return the rows or columns of a block, all of one length, int64, [B, length].
+
+    Args:
+        ends: first and last index of changed cells, each of shape [B].
+        size: number of rows or columns of the map.
+    """
+    first, last = ends
+    margin = _REACH + 1
+    extent = int((last - first).max()) + 1
+    length = min(extent + 2 * margin, size)
+    begin = (first - margin).clamp(min=0).clamp(max=size - length)
+    steps = torch.arange(length, device=first.device)
+    return begin[:, None] + steps
+
+
+def _nearest_cells(
+    evidence: Evidence, changed: Tensor, window: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return rows, columns and existence of the observed cells nearest to new ones.
+
+    Each has the shape [B, N]; episodes with fewer cells are padded in front, so that
+    new observations are last.
+    """
+    is_observed = (~evidence.noise_std.isnan()).cpu().numpy()
+    is_new = changed.cpu().numpy()
+    rows = []
+    columns = []
+    for observed, new in zip(is_observed, is_new, strict=True):
+        cells = nearest(observed, new, window)
+        rows.append(torch.from_numpy(cells[0]))
+        columns.append(torch.from_numpy(cells[1]))
+    is_cell = [row >= 0 for row in rows]
+    row = _padded(rows).to(changed.device)
+    column = _padded(columns).to(changed.device)
+    exists = _padded(is_cell).to(changed.device)
+    return row, column, exists
+
+
+def _padded(sequences: list[Tensor]) -> Tensor:
+    """Return sequences in reverse order as rows of a tensor, padded in front by 0."""
+    return pad_sequence(sequences, batch_first=True).flip(1)
+
+
+def _cells_in_block(
+    row: Tensor, column: Tensor, exists: Tensor, block: Block
+) -> tuple[Tensor, Tensor]:
+    """Return the block indices of cells, and a mask of those in reach, each [B, N]."""
+    height, width = block.row.shape[1:]
+    down = row - block.row[:, 0, :1]
+    right = column - block.column[:, 0, :1]
+    in_rows = (down >= 0) & (down < height)
+    in_columns = (right >= 0) & (right < width)
+    inside = exists & in_rows & in_columns
+    cell = torch.where(inside, down * width + right, 0)
+    inside &= block.in_reach.flatten(1).gather(1, cell)
+    return cell, inside
 
 
 def _neighbours(cell: Tensor, lattice: Lattice) -> tuple[Tensor, Tensor]:
     """Return the four neighbours of some cells of a block, and their couplings.
 
-    All bits of a coupling are set or none; both have the shape [B, N, 4].
+    A coupling has either all bits set or no bit. Both have the shape [B, N, 4].
     """
     width = lattice.right.shape[2]
     last = lattice.right[0].numel() - 1
     all_bits = torch.full_like(lattice.right, -1)
-    couplings = torch.stack(
-        [part.flatten(1) for part in lattice.neighbours(all_bits)], 2
-    )
+    words = [word.flatten(1) for word in lattice.neighbours(all_bits)]
+    couplings = torch.stack(words, 2)
     steps = torch.tensor((1, -1, width, -width), device=cell.device)
     index = cell[..., None]
     neighbours = (index + steps).clamp(0, last)
-    return neighbours, couplings.gather(1, index.expand(-1, -1, 4))
+    coupled = couplings.gather(1, index.expand(-1, -1, 4))
+    return neighbours, coupled

@@ -17,7 +17,7 @@ MIN_FRACTION = 1e-9
 def interval_moments(
     mean: ndarray, variance: ndarray, lower: ndarray, upper: ndarray
 ) -> tuple[ndarray, ndarray]:
-    """Return mean and variance of truncated normals, also far out in a tail.
+    """Return mean and variance of truncated normals.
 
     Args:
         mean: mean before truncation, float64.
@@ -26,7 +26,8 @@ def interval_moments(
         upper: upper bound, above `lower`; ∞ if unbounded.
     """
     low, high, log_mass, flipped = standardise(mean, variance, lower, upper)
-    at_low, at_high = _density(low, log_mass), _density(high, log_mass)
+    at_low = _density(low, log_mass)
+    at_high = _density(high, log_mass)
     shift = at_low - at_high
     low_term = _finite(low) * at_low
     high_term = _finite(high) * at_high
@@ -34,7 +35,8 @@ def interval_moments(
     fraction = fraction.clip(MIN_FRACTION, 1)
     shift = shift.clip(low, high)
     signed_shift = np.where(flipped, -shift, shift)
-    return mean + np.sqrt(variance) * signed_shift, variance * fraction
+    new_mean = mean + np.sqrt(variance) * signed_shift
+    return new_mean, variance * fraction
 
 
 @np.errstate(over="ignore", invalid="ignore")
@@ -43,15 +45,22 @@ def third_cumulant(
 ) -> ndarray:
     """Return the third cumulant of truncated normals."""
     low, high, log_mass, flipped = standardise(mean, variance, lower, upper)
-    at_low, at_high = _density(low, log_mass), _density(high, log_mass)
-    low, high = _finite(low), _finite(high)
+    at_low = _density(low, log_mass)
+    at_high = _density(high, log_mass)
+    low = _finite(low)
+    high = _finite(high)
+    # Raw moments.
     first = at_low - at_high
     second = 1 + low * at_low - high * at_high
-    third = (low**2 + 2) * at_low - (high**2 + 2) * at_high
-    # Far out in a tail, where all digits cancel, the limit is an exponential.
+    low_third = (low**2 + 2) * at_low
+    high_third = (high**2 + 2) * at_high
+    third = low_third - high_third
+    # Far out in a tail all digits cancel. The limit is an exponential distribution.
     bound = 2 * (second - first**2).clip(0) ** 1.5
-    cumulant = (third - 3 * first * second + 2 * first**3).clip(-bound, bound)
-    return variance**1.5 * np.where(flipped, -cumulant, cumulant)
+    cumulant = third - 3 * first * second + 2 * first**3
+    cumulant = cumulant.clip(-bound, bound)
+    signed = np.where(flipped, -cumulant, cumulant)
+    return variance**1.5 * signed
 
 
 def standardise(
@@ -62,12 +71,15 @@ def standardise(
     Flipped intervals are mirrored to the lower tail, where Φ loses no digits.
     """
     std = np.sqrt(variance)
-    low, high = (lower - mean) / std, (upper - mean) / std
+    low = (lower - mean) / std
+    high = (upper - mean) / std
     flipped = low > -high
-    low, high = np.where(flipped, -high, low), np.where(flipped, -low, high)
-    log_high = log_ndtr(high)
-    apart = (log_ndtr(low) - log_high).clip(max=-1e-300)
-    return low, high, log_high + np.log(-np.expm1(apart)), flipped
+    mirrored_low = np.where(flipped, -high, low)
+    mirrored_high = np.where(flipped, -low, high)
+    log_high = log_ndtr(mirrored_high)
+    log_ratio = (log_ndtr(mirrored_low) - log_high).clip(max=-1e-300)
+    log_mass = log_high + np.log(-np.expm1(log_ratio))
+    return mirrored_low, mirrored_high, log_mass, flipped
 
 
 def _finite(ends: ndarray) -> ndarray:
@@ -75,5 +87,8 @@ def _finite(ends: ndarray) -> ndarray:
     return np.where(np.isinf(ends), 0.0, ends)
 
 
-def _density(at: ndarray, log_mass: ndarray) -> ndarray:
-    return np.exp(-0.5 * np.square(at) - 0.5 * math.log(2 * math.pi) - log_mass)
+def _density(z: ndarray, log_mass: ndarray) -> ndarray:
+    """Return φ(z) divided by the probability of the interval."""
+    half_log_tau = 0.5 * math.log(2 * math.pi)
+    log_density = -0.5 * np.square(z) - half_log_tau
+    return np.exp(log_density - log_mass)

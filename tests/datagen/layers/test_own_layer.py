@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchnav.core import registry
+from benchnav.core import part_lookup, registry
 from benchnav.core.errors import ConfigError
 from benchnav.datagen import (
     TerrainDataset,
@@ -206,7 +206,7 @@ def test_a_recipe_with_a_layer_is_changed_by_its_place_in_the_list(
 def test_a_layer_of_this_process_only_is_not_made_in_two(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(registry, "_REGISTERED", {})
+    monkeypatch.setattr(part_lookup, "_REGISTERED", {})
     registry.register("layer", "mine", Plain)
     recipe = recipe_from_dict(small_stakes().to_dict() | {"layers": ["mine"]}, "test")
     with pytest.raises(ConfigError, match="one process with layer 'plain'"):

@@ -15,7 +15,8 @@ from torch import Tensor
 
 from benchnav.core.errors import CheckpointError, ConfigError
 from benchnav.core.grid import Grid
-from benchnav.core.mixture import LogNormalCDF, TraversabilityMixture
+from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.mixture_density import LogNormalCDF
 from benchnav.core.terrain import Observation, Terrain
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.base import predict

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from benchnav.core import registry
+from benchnav.core import part_lookup, registry
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.predictor import Oracle
 from benchnav.models.quality import baselines, figures
@@ -19,7 +19,7 @@ from tests.models.stub import ColourModel
 
 @pytest.fixture(autouse=True)
 def _colour_model(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(registry, "_REGISTERED", {})
+    monkeypatch.setattr(part_lookup, "_REGISTERED", {})
     registry.register("model", "colours", ColourModel)
 
 

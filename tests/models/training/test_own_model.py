@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 import torch
 
-from benchnav.core import registry
+from benchnav.core import part_lookup, registry
 from benchnav.core.errors import CheckpointError, ConfigError
 from benchnav.core.sources import load_file
 from benchnav.datagen.files.reader import TerrainDataset
@@ -240,7 +240,7 @@ def test_an_installed_class_is_loaded_by_its_name_and_its_code_compared_too(
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(registry, "_REGISTERED", {})
+    monkeypatch.setattr(part_lookup, "_REGISTERED", {})
     registry.register("model", "cells", module.CellModel)
     assert (
         call("train", "fit", "cells", "--data", dataset.path, "--out", "c", *QUICK) == 0

@@ -18,7 +18,8 @@ from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.quantiles import LEVELS, QuantileDistribution
 from benchnav.planning.sensing.belief import CovarianceModel
-from benchnav.planning.sensing.copula import Copula, CopulaState
+from benchnav.planning.sensing.copula import Copula
+from benchnav.planning.sensing.copula_state import CopulaState
 from benchnav.planning.sensing.gaussian import Observed, condition, predict
 from benchnav.planning.sensing.lattice import Lattice
 from benchnav.planning.sensing.sensor import (

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchnav.core import registry
+from benchnav.core import part_lookup, registry
 from benchnav.core.errors import ConfigError
 from benchnav.models.fused import FusedModel
 from benchnav.models.nets.ensemble import Ensemble
@@ -21,7 +21,7 @@ from tests.models.support import linear_table, make_terrain
 
 @pytest.fixture(autouse=True)
 def _colour_model(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(registry, "_REGISTERED", {})
+    monkeypatch.setattr(part_lookup, "_REGISTERED", {})
     registry.register("model", "colours", ColourModel)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchnav.core import registry
+from benchnav.core import part_lookup, registry
 from benchnav.core.quantiles import LEVELS, QuantileDistribution
 from benchnav.core.terrain import Observation
 from benchnav.datagen.files.reader import TerrainDataset
@@ -47,7 +47,7 @@ class Foreign(ColourModel):
 
 @pytest.fixture(autouse=True)
 def _models(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(registry, "_REGISTERED", {})
+    monkeypatch.setattr(part_lookup, "_REGISTERED", {})
     monkeypatch.setattr("benchnav.models.quality.output.DPI", 30)
     for name, model in (
         ("colours", ColourModel), ("vague", Vague), ("quantiles", Quantiles), ("foreign", Foreign),
