@@ -194,7 +194,7 @@ def read_conditions(runs: Sequence[Run]) -> list[Compared]:
                     maps=dataset["maps"][value["split"]],
                     episodes=rows.assign(time_budget_s=budgets),
                     code=_codes(run.about, name, rows["code"].unique()),
-                    about=dataset.get("about", {}).get(value["split"], ""),
+                    map_properties=dataset.get("about", {}).get(value["split"], ""),
                 )
             )
     return compared
