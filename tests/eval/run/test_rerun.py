@@ -250,7 +250,7 @@ def test_all_that_is_no_longer_there_is_told_before_anything_is_run(
     (tmp_path / "tiny.h5").unlink()
     with pytest.raises(
         ConfigError,
-        match=r"that .*run was made with, got a lack: .*dataset.*tiny\.h5.*mine\.py",
+        match=r"all inputs of .*run, got missing ones: .*dataset.*tiny\.h5.*mine\.py",
     ):
         repeat(run, tmp_path / "again")
     assert not (tmp_path / "again").exists()
