@@ -620,7 +620,7 @@ def test_units_of_other_code_are_taken_when_asked_for_and_marked(
     assert codes[0] == first["code"].iloc[0] != codes[5]
     about = open_run(folder).about
     assert set(about["codes"]) == set(codes.values())
-    line = f"1 of 2 units were made by other code (planner {mine}:Mine); column `code` tells which rows"
+    line = f"1 of 2 units were made by other code (planner {mine}:Mine); column `code` indicates which rows"
     assert about["reused"] == line
     report = write_report(folder)
     assert f"warning: {line}" in report.warnings
