@@ -280,7 +280,7 @@ def test_a_hypothesis_on_what_is_left_out_is_refused(
         risks=("mean", "single-class"), hypotheses=({"one": one, "other": other, "metric": "success"},),
     )  # fmt: skip
     if words:
-        with pytest.raises(ConfigError, match=f"names one that cannot: .*{words}"):
+        with pytest.raises(ConfigError, match=f"names one that cannot be run: .*{words}"):
             check_suite(suite, elsewhere=False)
     else:
         assert len(check_suite(suite, elsewhere=False).hypotheses["tests"]) == 1

@@ -822,7 +822,7 @@ def test_what_a_user_should_know_is_said(dataset_path: Path, tmp_path: Path) -> 
     data = factories.tiny_dataset(tmp_path / "four.h5", other)
     finish(replace(suite, data=str(data)), tmp_path / "run", say=said.append)
     assert any(
-        "ground above 0.3" in line and "free ground is above 0.1" in line
+        "with λ above 0.3" in line and "free cells have λ above 0.1" in line
         for line in said
     )
     assert any("class" in line and "paper-v1" in line for line in said)
