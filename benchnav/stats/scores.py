@@ -1,8 +1,7 @@
 """Scores of several contestants on the same maps: intervals, paired tests, the best.
 
-A score is any function of sums over maps, so that means, roots, ratios and distances
-are treated in the same way. The statistical unit is the map, or the group of maps if a
-dataset has groups.
+A score is any function of sums over maps, such as a mean, root, ratio or distance. The
+statistical unit is the map, or the group of maps if a dataset has groups.
 
 - Intervals are percentile bootstrap intervals over maps, sorted by their sums.
 - Tests exchange the two contestants on each map (`flips.exchange_p`).
