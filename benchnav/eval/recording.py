@@ -197,7 +197,7 @@ class Recording(Ground):
         return min(self.plan.step, last) if self.own_plans else last
 
     def plan_at(self, time_s: float) -> DrawnPlan:
-        """Return the last plan up to a time; an empty plan if there is none before it."""
+        """Return the last plan up to a time; an empty plan before the first."""
         due = time_s / self.dt_s + 1e-6
         plans = [plan for plan in self.own_plans if plan.step <= due]
         return plans[-1] if plans else DrawnPlan(step=0, lines={})
