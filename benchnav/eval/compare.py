@@ -125,7 +125,7 @@ def compare_runs(
     notes += [f"Different code: {line}." for line in code_lines]
     caveat_lines: list[str] = []
     for run in runs:
-        caveat_lines += caveats(_concerning(conditions, run.about))
+        caveat_lines += caveats(_concerning(conditions, run.manifest))
     notes += dict.fromkeys(caveat_lines)
     return table, replace(shown, notes=tuple(notes))
 
@@ -137,7 +137,7 @@ def _find_quantity(runs: Sequence[Run], name: str) -> Quantity:
         ConfigError: If a run does not have the metric.
     """
     for run in runs:
-        known_quantities = quantities(further_quantities(run.about))
+        known_quantities = quantities(further_quantities(run.manifest))
         check_known(f"`metric`, of {run.folder},", name, known_quantities)
     return known_quantities[name]
 
@@ -185,14 +185,14 @@ def read_conditions(runs: Sequence[Run]) -> list[Compared]:
             split = value["split"]
             rows = episodes[condition_id]
             budgets = time_budgets(rows, value["world"])
-            dataset = run.about["datasets"][labels["data"]]
+            dataset = run.manifest["datasets"][labels["data"]]
             properties = dataset.get("about", {})
             entry = Compared(
                 labels=labels,
                 value=value,
                 maps=dataset["maps"][split],
                 episodes=rows.assign(time_budget_s=budgets),
-                code=_codes(run.about, name, rows["code"].unique()),
+                code=_codes(run.manifest, name, rows["code"].unique()),
                 map_properties=properties.get(split, ""),
             )
             compared.append(entry)

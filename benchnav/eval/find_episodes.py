@@ -130,7 +130,7 @@ def propose(folder: Path) -> tuple[dict[str, list[str]], dict[str, int]]:
     rows = rows[is_on_map]
     first_id = rows["condition"].iloc[0]
     # Conditions of the first hypothesis come first.
-    tests = run.about.get("hypotheses", {}).get("tests", ())
+    tests = run.manifest.get("hypotheses", {}).get("tests", ())
     tested = [condition for test in tests for condition in (test["one"], test["other"])]
     ordered = list(dict.fromkeys([*tested, *rows["condition"]]))
     rows = rows.sort_values(

@@ -96,7 +96,7 @@ class Results:
     @property
     def notes(self) -> list[str]:
         """Warnings, and combinations that were left out."""
-        return [*self._rows.notes(), *caveats(self._rows.run.about)]
+        return [*self._rows.notes(), *caveats(self._rows.run.manifest)]
 
     @property
     def summary(self) -> pd.DataFrame:

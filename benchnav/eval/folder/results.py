@@ -33,7 +33,7 @@ class Results:
     """Rows of a run, and the number of its finished units.
 
     Args:
-        run: the run; if it is not finished, `about` has the `codes` of finished units.
+        run: the run; if it is not finished, its manifest has the `codes` of finished units.
         episodes: one row per episode.
         finished: number of units with rows.
         units: number of units of the run.
@@ -59,7 +59,7 @@ class Results:
     def conditions(self) -> dict[str, Any]:
         """Entries of `run.json` of conditions that have rows, by id, in its order."""
         with_rows = set(self.episodes["condition"])
-        entries = self.run.about["conditions"]
+        entries = self.run.manifest["conditions"]
         return {i: entry for i, entry in entries.items() if i in with_rows}
 
     def notes(self) -> list[str]:
@@ -78,7 +78,7 @@ class Results:
             if len(self.without) > _NAMED:
                 named += f" and {len(self.without) - _NAMED} more"
             lines.append(f"{self.mark}, no episode yet: {named}")
-        n_codes = len(self.run.about["codes"])
+        n_codes = len(self.run.manifest["codes"])
         if n_codes > 1:
             lines.append(
                 f"{self.mark}, made by {n_codes} versions of the code; column `code` "
@@ -121,9 +121,9 @@ def read_results(folder: Path, partial: bool = False) -> Results:
     for condition_id, name in zip(run.conditions, names, strict=True):
         if condition_id not in with_rows:
             without.append(name)
-    about = {**run.about, "codes": _codes(finished), "reused": ""}
+    manifest = {**run.manifest, "codes": _codes(finished), "reused": ""}
     return Results(
-        run=replace(run, about=about),
+        run=replace(run, manifest=manifest),
         episodes=episodes,
         finished=len(finished),
         units=len(all_units),
@@ -148,7 +148,7 @@ def code_of(run: Run, digest: str) -> Mapping[str, Any]:
         run: a run, finished or not.
         digest: digest of the code.
     """
-    codes = run.about.get("codes", {})
+    codes = run.manifest.get("codes", {})
     if digest not in codes:  # of a unit that is not yet in the table
         makings = [making for _, making in newest_units(run) if making is not None]
         codes = _codes(makings)
@@ -158,5 +158,5 @@ def code_of(run: Run, digest: str) -> Mapping[str, Any]:
 
 def _codes(finished: list[Finished]) -> dict[str, Any]:
     """Return the codes of finished units by digest."""
-    codes = [making.about["code"] for making in finished]
+    codes = [making.metadata["code"] for making in finished]
     return {code_digest(code): code for code in codes}

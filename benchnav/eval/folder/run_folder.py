@@ -57,13 +57,13 @@ class Run:
 
     Args:
         folder: path of the folder.
-        about: contents of its `run.json`.
+        manifest: contents of its `run.json`.
         conditions: conditions by id, each with its extent.
         shard: shard of the run that the folder contains; None for a whole run.
     """
 
     folder: Path
-    about: dict[str, Any]
+    manifest: dict[str, Any]
     conditions: dict[str, tuple[Condition, Extent]]
     shard: Shard | None = None
 
@@ -101,7 +101,7 @@ def _run_of(folder: Path, manifest: dict[str, Any]) -> Run:
         draws = tuple(tuple(draw) for draw in entry["draws"])
         conditions[condition_id] = condition_from(entry), Extent(draws=draws)
     shard = Shard(**manifest["shard"]) if "shard" in manifest else None
-    return Run(folder=folder, about=manifest, conditions=conditions, shard=shard)
+    return Run(folder=folder, manifest=manifest, conditions=conditions, shard=shard)
 
 
 def _format_version(manifest: Any) -> int:
@@ -172,7 +172,7 @@ def read_table(folder: Path, name: str) -> pd.DataFrame:
             "runs."
         )
     with damaged(path, "Remove it and give the run's command again."):
-        digests = run.about.get("tables", {})
+        digests = run.manifest.get("tables", {})
         if digests.get(name) != digest_of_path(path):
             raise DamageError("it was changed after benchnav wrote it")
         return pd.read_parquet(path)
@@ -203,7 +203,7 @@ class Finished:
 
     Args:
         path: file of the unit.
-        about: metadata of the file: `unit` (its identity); `key`; `code`; `digests` of
+        metadata: metadata of the file: `unit` (its identity); `key`; `code`; `digests` of
             the maps; `record`; `made`, a random token, which copies retain;
             `traceback`; `errors`; `touched`, the files, packages and variables that
             custom parts read; and digests: `content` of its rows, `steps` of its steps,
@@ -211,7 +211,7 @@ class Finished:
     """
 
     path: Path
-    about: Mapping[str, Any]
+    metadata: Mapping[str, Any]
 
     @property
     def folder(self) -> Path:
@@ -221,20 +221,20 @@ class Finished:
     @property
     def metrics(self) -> set[str]:
         """Columns of its rows in addition to the built-in ones."""
-        return set(self.about["code"].get(METRICS, ()))
+        return set(self.metadata["code"].get(METRICS, ()))
 
     def has(self, unit: Unit) -> bool:
         """Return whether the steps and recordings that `unit` requests were stored.
 
         Steps of another making of the unit do not count.
         """
-        record = self.about["record"]
+        record = self.metadata["record"]
         if RECORDS.index(record) < RECORDS.index(unit.record):
             return False
         if record == "none":
             return True
         steps_metadata = metadata(self.folder / unit.steps_path)
-        return bool(steps_metadata.get("key") == self.about["key"])
+        return bool(steps_metadata.get("key") == self.metadata["key"])
 
     def damage(self) -> list[str]:
         """Return a line for each damaged file of the unit, starting with its path.
@@ -243,19 +243,19 @@ class Finished:
         is no damage.
         """
         lines = damage_of(self.path, str(self.path.relative_to(self.folder)))
-        condition_id, *_ = self.about["unit"]
+        condition_id, *_ = self.metadata["unit"]
         name, _, _ = self.path.name.rpartition("-")
         steps = steps_path(condition_id, name)
         steps_file = self.folder / steps
         steps_metadata = metadata(steps_file)
-        if steps_metadata and steps_metadata.get("key") != self.about["key"]:
+        if steps_metadata and steps_metadata.get("key") != self.metadata["key"]:
             return lines
-        if self.about.get("steps") and steps_file.exists():
+        if self.metadata.get("steps") and steps_file.exists():
             damage = damage_of(steps_file, str(steps))
-            if not damage and steps_metadata.get(CONTENT) != self.about["steps"]:
+            if not damage and steps_metadata.get(CONTENT) != self.metadata["steps"]:
                 damage = [f"{steps}: it holds the steps of another run"]
             lines += damage
-        for path, digest in self.about.get("recordings", {}).items():
+        for path, digest in self.metadata.get("recordings", {}).items():
             if digest_of_path(self.folder / path) not in ("", digest):
                 lines.append(f"{path}: it was changed after benchnav wrote it")
         return lines
@@ -268,8 +268,8 @@ def find_units(folder: Path, unit: Unit) -> list[Finished]:
     identity = _identity(unit)
     makings = []
     for path in newest_first:
-        finished = Finished(path=path, about=metadata(path))
-        if finished.about.get("unit") == identity:
+        finished = Finished(path=path, metadata=metadata(path))
+        if finished.metadata.get("unit") == identity:
             makings.append(finished)
     return makings
 
@@ -348,7 +348,7 @@ def finish_run(
         finished: all units of the run, in the order of the table.
         reused: a line on units of other code; empty without such units.
     """
-    manifest = open_run(folder).about
+    manifest = open_run(folder).manifest
     write_errors(folder, finished)
     tables = [labelled_rows(unit, making) for unit, making in finished]
     rows = pd.concat(tables, ignore_index=True)
@@ -357,9 +357,9 @@ def finish_run(
         pq.write_table(table.replace_schema_metadata(None), partial)
     codes: dict[str, Any] = {}
     for _, making in finished:
-        code = making.about["code"]
+        code = making.metadata["code"]
         entry = codes.setdefault(code_digest(code), {**code, TOUCHED: {}})
-        entry[TOUCHED] |= making.about.get(TOUCHED, {})
+        entry[TOUCHED] |= making.metadata.get(TOUCHED, {})
     results = {
         "codes": codes,
         "reused": reused,
@@ -436,7 +436,7 @@ def _results(rows: pd.DataFrame) -> set[str]:
 
 
 def _trace(unit: Unit, finished: Finished, folder: Path) -> str:
-    unit_metadata = finished.about
+    unit_metadata = finished.metadata
     if not unit_metadata["traceback"] and not unit_metadata["errors"]:
         return ""
     maps = f"maps {unit.maps[0]}–{unit.maps[-1]}"

@@ -40,8 +40,8 @@ def verify_run(folder: Path) -> tuple[list[str], list[str]]:
         return [f"{RUN}: {error}"], []
     files = sorted((folder / "units").glob("*/*.parquet"))
     for path in files:
-        finished = Finished(path=path, about=metadata(path))
-        if "key" not in finished.about:
+        finished = Finished(path=path, metadata=metadata(path))
+        if "key" not in finished.metadata:
             damage.append(f"{path.relative_to(folder)}: it cannot be read")
             continue
         damage += finished.damage()

@@ -81,7 +81,7 @@ def begin(
         return work.conditions, work.conditions, _parts(work.metrics)
     earlier = open_run(folder)
     _check_extends(work, earlier)
-    metrics = list(metrics_of_run(earlier.about))
+    metrics = list(metrics_of_run(earlier.manifest))
     n_metrics = len(metrics)
     for metric in work.metrics:
         metrics = add_metric(metrics, metric)
@@ -99,8 +99,8 @@ def begin(
         say(f"{folder} is extended by {extension}")
         # The table is written again when all requested units are finished.
         (folder / EPISODES).unlink(missing_ok=True)
-    now = _about(earlier.about, work, conditions)
-    if now != earlier.about:
+    now = _about(earlier.manifest, work, conditions)
+    if now != earlier.manifest:
         write_run(folder, now)
     return requested, conditions, _parts(metrics)
 
@@ -166,7 +166,7 @@ def _check_extends(work: Work, earlier: Run) -> None:
         )
     check_resumable(earlier)
     # Other hypotheses would be fixed after the results on which they are tested.
-    fixed = earlier.about.get("hypotheses", {}).get("digest", "none")
+    fixed = earlier.manifest.get("hypotheses", {}).get("digest", "none")
     if work.hypotheses and work.hypotheses["digest"] != fixed:
         raise ConfigError(
             f"Expected the `hypotheses` that were fixed when {folder} was begun "
@@ -185,9 +185,9 @@ def check_resumable(run: Run) -> None:
         ConfigError: If the run has such parts.
     """
     parts: list[str] = []
-    for entry in run.about["conditions"].values():
+    for entry in run.manifest["conditions"].values():
         parts += entry.get("unreproducible", ())
-    for entry in run.about.get("metrics", ()):
+    for entry in run.manifest.get("metrics", ()):
         if "unreproducible" in entry:
             parts.append(f"metric {entry['quantity']['name']}")
     if parts:

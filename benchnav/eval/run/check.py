@@ -115,8 +115,8 @@ def check_suite(suite: Suite, elsewhere: bool) -> Checked:
     for metric in metrics:
         if metric.is_object:
             objects.append(f"metric {metric.quantity.name}")
-    for part in objects:
-        warnings.append(f"not reproducible: {part} is an object of one process")
+    for name in objects:
+        warnings.append(f"not reproducible: {name} is an object of one process")
     dropped = {json.dumps(entry): entry for entry in left_out.values()}
     return Checked(
         conditions={

@@ -39,7 +39,7 @@ def measure_latencies(
         settings: settings of the run.
     """
     run = open_run(folder)
-    entries = run.about["conditions"]
+    entries = run.manifest["conditions"]
     latencies: dict[str, Any] = {}
     missing = []
     for condition_id in run.conditions:
@@ -59,7 +59,7 @@ def measure_latencies(
         if latencies[key]:
             entry["latency"] = latencies[key]
     if missing:
-        write_run(folder, run.about)
+        write_run(folder, run.manifest)
 
 
 def _key(entry: Mapping[str, Any]) -> str:

@@ -98,7 +98,8 @@ def merge_shards(parts: Sequence[Path], folder: Path) -> Iterator[tuple[int, int
 def _check_one_environment(makings: Sequence[Finished]) -> None:
     """Reject units of different code, or whose parts read different files."""
     for earlier, now in pairwise(makings):
-        changed = provenance.code_differences(earlier.about["code"], now.about["code"])
+        before = earlier.metadata["code"]
+        changed = provenance.code_differences(before, now.metadata["code"])
         if changed:
             raise ConfigError(
                 f"Expected shards made by one code, got {earlier.path} and "
@@ -107,7 +108,7 @@ def _check_one_environment(makings: Sequence[Finished]) -> None:
             )
     touched: dict[str, str] = {}
     for making in makings:
-        contents = making.about.get(TOUCHED, {})
+        contents = making.metadata.get(TOUCHED, {})
         changed = unlike(touched, contents)
         if changed:
             raise ConfigError(
@@ -176,17 +177,17 @@ def _unlike(first: Run, second: Run) -> list[str]:
     if any(set(a.draws) != set(b.draws) for (_, a), (_, b) in pairs):
         lines.append("seeds, realisations or maps")
     lines += provenance.dataset_differences(
-        first.about["datasets"], second.about["datasets"]
+        first.manifest["datasets"], second.manifest["datasets"]
     )
     for name in ("hypotheses", "metrics"):
-        if second.about.get(name) != first.about.get(name):
+        if second.manifest.get(name) != first.manifest.get(name):
             lines.append(name)
     return lines
 
 
 def _find(unit: Unit, runs: Sequence[Run]) -> Finished | None:
     """Return a finished unit of some runs; reject one whose rows differ between two."""
-    columns = {metric.quantity.column for metric in metrics_of_run(runs[0].about)}
+    columns = {metric.quantity.column for metric in metrics_of_run(runs[0].manifest)}
     newest = []
     for run in runs:
         makings = find_units(run.folder, unit)
@@ -238,20 +239,21 @@ def _about(runs: Sequence[Run]) -> Mapping[str, Any]:
     It is `run.json` of the first shard, with latencies, warnings and history of all
     shards.
     """
-    manifest = {name: value for name, value in runs[0].about.items() if name != "shard"}
+    manifest = dict(runs[0].manifest)
+    del manifest["shard"]
     entries: dict[str, dict[str, Any]] = {}
     for condition_id in runs[0].conditions:
         entries[condition_id] = {}
         # Entries differ only in latencies, which only shards that measured them have.
         for run in reversed(runs):
-            entries[condition_id] |= run.about["conditions"][condition_id]
+            entries[condition_id] |= run.manifest["conditions"][condition_id]
     manifest["conditions"] = entries
     for name in ("warnings", "dropped", "history"):
-        manifest[name] = provenance.join(*(run.about[name] for run in runs))
+        manifest[name] = provenance.join(*(run.manifest[name] for run in runs))
     manifest["history"] = provenance.extend_history(
         manifest["history"], manifest["suite"]
     )
-    machines = provenance.join([run.about["machine"] for run in runs])
+    machines = provenance.join([run.manifest["machine"] for run in runs])
     if len(machines) > 1:
         described: dict[str, None] = {}
         for machine in machines:

@@ -60,7 +60,7 @@ def find_recording(
         if stored.exists():
             return Recording.load(stored)
     row = _row(folder, unit, unit.maps[member])
-    device = device_of_run(open_run(folder).about)
+    device = device_of_run(open_run(folder).manifest)
     # Without a time limit of planners, since it changes no action.
     settings = Settings(device=device.type)
     with one_thread():
@@ -187,7 +187,7 @@ def _check_unchanged(run: Run, unit: Unit, code_digest: str) -> None:
     """
     condition = unit.condition
     origin = Settings().origins().of(unit)
-    digests = run.about["datasets"][condition.data]["maps"][condition.split]
+    digests = run.manifest["datasets"][condition.data]["maps"][condition.split]
     map_digests = tuple(digests[index] for index in unit.maps)
     if origin.maps[1:] != map_digests:
         raise BenchnavError(

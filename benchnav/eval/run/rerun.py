@@ -73,20 +73,20 @@ def rerun(
     if not overwrite and (folder / RUN).exists():
         _check_repeats(run, folder)
     settings = Settings(
-        planner_limit_s=run.about["planner_limit_s"],
-        device=device_of_run(run.about).type,
+        planner_limit_s=run.manifest["planner_limit_s"],
+        device=device_of_run(run.manifest).type,
     )
     _check_available(run)
-    metrics = metrics_of_run(run.about)
+    metrics = metrics_of_run(run.manifest)
     if jobs != 1 or settings.planner_limit_s:
         conditions = [condition for condition, _ in run.conditions.values()]
         check_everywhere(conditions, metrics)
     work = Work(
-        suite=run.about["suite"],
+        suite=run.manifest["suite"],
         conditions=run.conditions,
-        dropped=tuple(run.about["dropped"]),
-        warnings=tuple(run.about["warnings"]),
-        hypotheses=run.about.get("hypotheses", {}),
+        dropped=tuple(run.manifest["dropped"]),
+        warnings=tuple(run.manifest["warnings"]),
+        hypotheses=run.manifest.get("hypotheses", {}),
         metrics=metrics,
         record="none",
         settings=settings,
@@ -126,7 +126,7 @@ def compare(run_folder: Path, folder: Path) -> tuple[bool, list[str]]:
             conditions |= {i: condition for i, (condition, _) in entries.items()}
         lines += _verdict(conditions, len(first), cells, missing)
     lines += [f"column {name} is in only one of the two tables" for name in columns]
-    lines.append(_environment(run.about, again.about))
+    lines.append(_environment(run.manifest, again.manifest))
     return same, lines
 
 
@@ -161,14 +161,14 @@ def _tokens(folder: Path, run_units: Sequence[Unit]) -> set[str]:
     tokens = set()
     for unit in run_units:
         for finished in find_units(folder, unit):
-            tokens.add(finished.about["made"])
+            tokens.add(finished.metadata["made"])
     return tokens
 
 
 def _check_available(run: Run) -> None:
     """Reject a run that depends on something missing, and list all that is missing."""
     missing: dict[str, None] = {}
-    parts = [metric.part for metric in metrics_of_run(run.about)]
+    parts = [metric.part for metric in metrics_of_run(run.manifest)]
     checks: list[Callable[[], Any]] = [partial(provenance.describe_metrics, parts)]
     for condition, extent in run.conditions.values():
         checks.append(partial(check_split, condition, maps=extent.maps))

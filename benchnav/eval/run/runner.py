@@ -294,7 +294,7 @@ def _missing(
         finished = _counting(makings, unit, origin, reuse_code)
         reason, lines = _why_missing(folder, unit, origin, makings, finished)
         if not reason and is_here and not reuse_code and finished:
-            lines = changes_since(finished.about.get(TOUCHED, {}))
+            lines = changes_since(finished.metadata.get(TOUCHED, {}))
             reason = "changed" if lines else ""
         if not reason and finished and not finished.has(unit):
             reason = "unrecorded"
@@ -339,7 +339,7 @@ def _why_missing(
         return "new", []
     newest = makings[0]
     differences = _differences(newest, origin)
-    columns = lacks_metrics(newest.about["code"], origin.code)
+    columns = lacks_metrics(newest.metadata["code"], origin.code)
     if columns and not differences:
         return "unmeasured", [", ".join(columns)]
     return "other", differences
@@ -347,7 +347,7 @@ def _why_missing(
 
 def _richest(unit: Unit, making: Finished | None) -> Record:
     """Return the higher of the requested record and the one that a making has."""
-    stored = making.about["record"] if making else unit.record
+    stored = making.metadata["record"] if making else unit.record
     return max(unit.record, stored, key=RECORDS.index)
 
 
@@ -362,13 +362,13 @@ def _counting(
     key = origin.key(unit)
     maps = list(origin.maps)
     for making in makings:
-        if making.about["key"] == key:
+        if making.metadata["key"] == key:
             return making
     if not reuse_code:
         return None
     for making in makings:
-        has_metrics = not lacks_metrics(making.about["code"], origin.code)
-        if making.about["digests"] == maps and has_metrics:
+        has_metrics = not lacks_metrics(making.metadata["code"], origin.code)
+        if making.metadata["digests"] == maps and has_metrics:
             return making
     return None
 
@@ -382,8 +382,8 @@ def _counted(
 
 def _differences(finished: Finished, origin: Origin) -> list[str]:
     """Describe the differences between the origin of a finished unit and another."""
-    lines = code_differences(finished.about["code"], origin.code)
-    if finished.about["digests"] != list(origin.maps):
+    lines = code_differences(finished.metadata["code"], origin.code)
+    if finished.metadata["digests"] != list(origin.maps):
         lines.append("maps")
     return lines
 
@@ -397,7 +397,7 @@ def _check_steady(finished: list[Finished], is_here: bool) -> None:
     seen: dict[str, str] = {}
     changed: dict[str, None] = {}
     for making in finished:
-        touched = making.about.get(TOUCHED, {})
+        touched = making.metadata.get(TOUCHED, {})
         changed |= dict.fromkeys(unlike(seen, touched))
         seen |= touched
     if is_here:
@@ -436,8 +436,8 @@ def _finished(
         counted.append((unit, making))
         changed = []
         if reuse_code:
-            changed = changes_since(making.about.get(TOUCHED, {}))
-        if changed or making.about["key"] != origin.key(unit):
+            changed = changes_since(making.metadata.get(TOUCHED, {}))
+        if changed or making.metadata["key"] != origin.key(unit):
             n_reused += 1
             changes |= dict.fromkeys([*_differences(making, origin), *changed])
     if not n_reused:
