@@ -240,7 +240,7 @@ def _about(runs: Sequence[Run]) -> Mapping[str, Any]:
     shards.
     """
     manifest = dict(runs[0].manifest)
-    del manifest["shard"]
+    manifest.pop("shard", None)
     entries: dict[str, dict[str, Any]] = {}
     for condition_id in runs[0].conditions:
         entries[condition_id] = {}
