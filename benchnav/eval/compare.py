@@ -263,7 +263,7 @@ def _unlike_code(conditions: Iterable[Compared], only_parts: bool = False) -> li
     """Describe differences in the code of conditions, one line for each pair of runs.
 
     Args:
-        conditions: the conditions.
+        conditions: conditions whose code is compared.
         only_parts: whether to ignore differences of the environment.
     """
     codes: dict[str, dict[str, dict[str, Any]]] = {}

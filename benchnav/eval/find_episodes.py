@@ -166,7 +166,7 @@ def _find(
     condition has the label.
 
     Args:
-        run: the run.
+        run: opened run folder.
         requested: labels by column.
         episode: seed, realisation and map; if the seed is None, each condition's first.
     """

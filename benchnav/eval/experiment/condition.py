@@ -73,7 +73,7 @@ class Condition:
         scenario: scenario of the test split.
         model: model that predicts traversability.
         risk: risk measure that turns a prediction into λ̂.
-        planner: planner.
+        planner: planner, which chooses actions from λ̂.
         robot: robot dynamics F.
         objective: objective J.
         sensor: appearance sensor.
@@ -265,7 +265,7 @@ def conditions_of(
     """List the conditions of a suite, in the order of tables.
 
     Args:
-        suite: the suite.
+        suite: suite, as a user wrote it.
         scenarios_of: function from the path or id of a dataset to the scenarios of its
             test splits.
 

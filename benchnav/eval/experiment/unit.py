@@ -66,7 +66,7 @@ class Unit:
     """One batch of episodes.
 
     Args:
-        condition: the condition.
+        condition: condition of all episodes.
         seed: root seed.
         realisation: index of the draw of λ.
         maps: indices of maps of the condition's split, all of one block.

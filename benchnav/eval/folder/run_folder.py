@@ -296,7 +296,7 @@ def write_unit(
 
     Args:
         folder: the run folder.
-        unit: the unit.
+        unit: unit that was run.
         origin: origin of its rows.
         rows: one row per episode.
         errors: messages of faults, a line each.

@@ -42,7 +42,7 @@ def write_steps(folder: Path, unit: Unit, key: str, table: pa.Table) -> None:
 
     Args:
         folder: the run folder.
-        unit: the unit.
+        unit: unit that was run.
         key: key of the unit.
         table: from `step_table`.
     """

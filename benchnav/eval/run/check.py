@@ -68,7 +68,7 @@ def check_suite(suite: Suite, elsewhere: bool) -> Checked:
     """Build the conditions of a suite, and reject a suite that cannot be run.
 
     Args:
-        suite: the suite.
+        suite: suite, as a user wrote it.
         elsewhere: whether other processes create parts, too.
 
     Raises:

@@ -29,7 +29,7 @@ def run_on_worker(
 
     Args:
         working_folder: folder from which relative paths start, if the worker has it.
-        unit: the unit.
+        unit: unit to run.
         origin: origin of the unit when the run was begun.
         settings: settings of the run.
 

@@ -40,7 +40,7 @@ def check_determinism(
     first, which distinguishes retained state from external input.
 
     Args:
-        suite: the suite.
+        suite: suite whose conditions are checked.
         say: receives progress, a line at a time.
         planner_limit_s: time limit of each call of a planner; 0 for none.
         device: "cpu", "cuda" or "auto".

@@ -29,7 +29,7 @@ class Recorder:
     """Collects plans and known maps of some episodes of a unit.
 
     Args:
-        unit: the unit.
+        unit: unit whose episodes are recorded.
         problem: the unit's problem.
         simulation: the unit's simulation, with a λ field that is not resampled.
         terrain: the unit's true maps, with the true λ, which no planner receives.

@@ -344,7 +344,7 @@ class _Batch:
     """The episodes that are planned: all at first, fewer after enough have ended.
 
     Args:
-        planner: the planner.
+        planner: planner of all episodes.
         problem: problem of all episodes.
         plan_state: plan state returned by `begin`.
     """

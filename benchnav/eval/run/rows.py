@@ -210,7 +210,7 @@ def step_table(unit: Unit, problem: Problem, episodes: Episodes) -> pa.Table:
     """Tabulate driven paths, one row for each step and one for the last state.
 
     Args:
-        unit: the unit.
+        unit: unit that was run.
         problem: the unit's problem.
         episodes: the unit's episodes.
 

@@ -69,7 +69,7 @@ def run_suite(
     unfinished, the run has no table, which `say` reports.
 
     Args:
-        suite: the suite.
+        suite: suite to run.
         folder: the run folder; a run that it contains is resumed or extended.
         jobs: number of worker processes, or the address of a Dask cluster's scheduler,
             whose workers are used.

@@ -85,7 +85,7 @@ def run_unit(unit: Unit, folder: Path, origin: Origin, settings: Settings) -> No
     """Run one unit on one thread, and write its recordings, its steps and its rows.
 
     Args:
-        unit: the unit.
+        unit: unit to run.
         folder: the run folder.
         origin: origin of the unit when the run was begun.
         settings: settings of the run.
@@ -217,7 +217,7 @@ def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> Built:
     """Create the problem, the simulation and the initial knowledge of a unit.
 
     Args:
-        unit: the unit.
+        unit: unit whose episodes are run.
         origin: origin of the unit, which cached predictions depend on.
         device: device of all computation.
 
@@ -338,7 +338,7 @@ def simulate(
     """Run a unit's episodes, and return them and whether the planner ran compiled.
 
     Args:
-        unit: the unit.
+        unit: unit whose episodes are run.
         built: inputs of its episodes.
         settings: settings with the time limit of planners.
         **options: further arguments of `run_episodes`.

@@ -150,7 +150,7 @@ def by_what(conditions: Sequence[Compared], by: str = "", against: str = "") -> 
     """Return the column by which conditions are compared, a key of `_KEYS`.
 
     Args:
-        conditions: the conditions.
+        conditions: conditions that are compared.
         by: requested column. If empty: the column that contains `against`; `run` if
             runs have common conditions; else `risk`.
         against: a label, or empty.

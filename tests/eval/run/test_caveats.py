@@ -153,7 +153,7 @@ def test_a_merged_run_says_what_its_shards_said(
         ({"planner": "near_optimal"}, "planner 'near_optimal', which is given λ itself, got 'oracle'"),
         ({"planner": "optimal", "robots": ("bicycle",)}, "Expected robot Unicycle for planner 'optimal', got Bicycle"),
         ({"planner": HAZARD, "world": "paper"}, "immobilises robots for `hazard`"),
-        ({"planner": FREE, "models": ("clairvoyant",), "world": "paper"}, "λ that stays for the model 'clairvoyant'"),
+        ({"planner": FREE, "models": ("clairvoyant",), "world": "paper"}, "constant λ for the model 'clairvoyant'"),
         ({"planner": FREE, "risks": ("single-class",), "models": (TWO_MODES,)}, "has no `class_names`"),
     ],
 )  # fmt: skip

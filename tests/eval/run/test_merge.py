@@ -339,7 +339,7 @@ def test_a_merge_that_is_killed_leaves_nothing_and_can_be_given_again(
 
 def test_a_folder_that_is_there_is_not_merged_into(parts: list[Path]) -> None:
     before = sorted(parts[0].rglob("*"))
-    with pytest.raises(ConfigError, match="new folder first"):
+    with pytest.raises(ConfigError, match="the new folder as OUT"):
         list(merge_shards(parts[1:], parts[0]))
     assert sorted(parts[0].rglob("*")) == before
 
