@@ -95,33 +95,31 @@ def plain_lines(kind: str) -> list[str]:
 
 def make_table(kind: str) -> Table:
     """Return the catalogue of a kind as a table."""
+    rows = []
+    for entry in list_entries(kind):
+        rows.append((Bold(entry.name), entry.purpose, "\n".join(entry.options)))
     return Table(
         title=TITLES[kind],
         headings=("name", "purpose", "options"),
-        rows=tuple(
-            (Bold(entry.name), entry.purpose, "\n".join(entry.options))
-            for entry in list_entries(kind)
-        ),
+        rows=tuple(rows),
     )
 
 
 def _describe(kind: str, name: str) -> Entry:
-    """Describe a part; the purpose of one that cannot be imported is the error."""
+    """Describe a part; if it cannot be imported, its purpose is the error."""
     from benchnav.models.base import is_family
 
     try:
         target = registry.find(kind, name).target
+        purpose = _purpose(target)
         if kind == "model" and is_family(target):
             settings: tuple[str, ...] = ()
             if config_class(target):
                 settings = tuple(_option_lines(list_options(target)))
-            purpose = (
-                f"{_purpose(target)} Trained by `benchnav-train fit {name}`; name a "
-                "checkpoint."
-            )
+            purpose += f" Trained by `benchnav-train fit {name}`; name a checkpoint."
             return Entry(name, purpose, settings)
-        options = tuple(_option_lines(registry.options_of(kind, target)))
-        return Entry(name, _purpose(target), options)
+        options = registry.options_of(kind, target)
+        return Entry(name, purpose, tuple(_option_lines(options)))
     except BenchnavError as error:
         return Entry(name, f"cannot be used: {error}")
 
@@ -150,12 +148,11 @@ def _option_lines(
 
 
 def _type_words(kind: Any) -> str:
-    """Return a type as in code: classes without modules, literals and unions by bars."""
+    """Return a type as in code: no modules of classes, bars in literals and unions."""
     words = re.sub(r"(\w+\.)+", "", inspect.formatannotation(kind))
     words = re.sub(r"Literal\[(.*?)\]", lambda match: match[1].replace("'", ""), words)
-    return re.sub(
-        r"^Union\[(.*)\]$", lambda match: match[1].replace(", ", " | "), words
-    )
+    union = re.fullmatch(r"Union\[(.*)\]", words)
+    return union[1].replace(", ", " | ") if union else words
 
 
 def _default(value: Any) -> str:
@@ -179,9 +176,8 @@ def _worlds() -> Iterator[Entry]:
 def _setting_lines(settings: Mapping[str, Any]) -> Iterator[str]:
     for name, value in settings.items():
         if isinstance(value, Mapping):
-            yield from _setting_lines(
-                {f"{name}.{key}": inner for key, inner in value.items()}
-            )
+            nested = {f"{name}.{key}": inner for key, inner in value.items()}
+            yield from _setting_lines(nested)
         else:
             yield f"{name}{_default(value)}"
 
@@ -193,9 +189,10 @@ def _checkpoints() -> Iterator[Entry]:
     for folder in list_checkpoints():
         try:
             config = read_config(folder)
-            classes = len(config.get("class_names") or ())
-            class_note = f", {classes} classes" if classes else ""
-            purpose = f"Checkpoint of the family {config.get('model')} in {folder}{class_note}."
+            family = config.get("model")
+            n_classes = len(config.get("class_names") or ())
+            note = f", {n_classes} classes" if n_classes else ""
+            purpose = f"Checkpoint of the family {family} in {folder}{note}."
         except BenchnavError as error:
             purpose = f"cannot be used: {error}"
         yield Entry(folder.name, purpose)

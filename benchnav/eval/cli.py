@@ -48,7 +48,7 @@ def run_command(
         device: Device of predictions and episodes; auto uses CUDA if there is a GPU.
         reuse_code: Also use finished units of other code, and mark their rows.
         check_determinism: First run a unit of each condition twice, in fresh processes
-            and another order; if rows differ, name them and exit with status 1.
+            and in another order; if rows differ, name them and exit with status 1.
     """
     from benchnav.eval.run.runner import run_suite
     from benchnav.eval.run.unit import Settings
@@ -59,7 +59,7 @@ def run_command(
         0 <= planner_limit_s <= _MAX_LIMIT_S,
         f"`planner_limit_s` in 0–{_MAX_LIMIT_S}, got {planner_limit_s}.",
     )
-    folder = _own_folder(out)
+    folder = _run_folder(out)
     if check_determinism and not _repeats(suite, planner_limit_s, device):
         return 1
     settings = Settings.on(device, planner_limit_s)
@@ -74,17 +74,15 @@ def run_command(
         reuse_code,
     )
     show_progress(steps, "units")
+    command = program("benchnav-eval")
     if not _is_whole(folder):
-        print(
-            f"so far:  {program('benchnav-eval')} report {shlex.quote(str(folder))} "
-            "--partial"
-        )
+        print(f"so far:  {command} report {shlex.quote(str(folder))} --partial")
         return _failed(folder)
     if shard_to_run is None:
         return _finish(folder)
     print(f"shard {shard_to_run} is finished in {folder}")
     print(
-        f"merge:   {program('benchnav-eval')} merge OUT PART …, once all {shard_to_run.of} "
+        f"merge:   {command} merge OUT PART …, once all {shard_to_run.of} "
         "shards are finished"
     )
     return _failed(folder)
@@ -99,8 +97,9 @@ def merge(out: str, parts: list[str]) -> int:
     """
     from benchnav.eval.run.merge import merge_shards
 
-    folder = _own_folder(out)
-    show_progress(merge_shards([Path(part) for part in parts], folder), "units")
+    folder = _run_folder(out)
+    copied = merge_shards([Path(part) for part in parts], folder)
+    show_progress(copied, "units")
     return _finish(folder)
 
 
@@ -125,11 +124,10 @@ def rerun(
     from benchnav.eval.run import rerun
 
     _check_workers(jobs, backend, scheduler)
-    original = _own_folder(folder)
-    repeated = _own_folder(out or f"{original.resolve()}-rerun")
-    show_progress(
-        rerun.rerun(original, repeated, scheduler or jobs, overwrite, _say), "units"
-    )
+    original = _run_folder(folder)
+    repeated = _run_folder(out or f"{original.resolve()}-rerun")
+    steps = rerun.rerun(original, repeated, scheduler or jobs, overwrite, _say)
+    show_progress(steps, "units")
     same, lines = rerun.compare(original, repeated)
     print("\n".join(lines))
     return 0 if same else 1
@@ -143,7 +141,7 @@ def verify(folder: str) -> int:
     """
     from benchnav.eval.folder.verify import verify_run
 
-    damage, notes = verify_run(_own_folder(folder))
+    damage, notes = verify_run(_run_folder(folder))
     for line in notes:
         print(f"note: {line}")
     for line in damage:
@@ -205,13 +203,13 @@ def compare(
     Args:
         labels: Labels of the conditions to compare.
         folders: Folders of finished runs, one or more.
-        against: Label that all others are compared with, such as mean or straight; if
-            empty, all pairs.
+        against: Label with which all others are compared, such as mean or straight; if
+            empty, all pairs are compared.
         by: Column in which the conditions of a pair differ: risk, planner, model,
             objective, robot, sensor, ground, belief, world or run. If empty: the column
             of `against`; run if runs have common conditions; else risk.
-        points: Difference of success in percentage points, for which a note has the
-            required number of maps.
+        points: Difference in success rate in percentage points, for which a note states
+            the required number of maps.
         metric: Name of the metric to compare, such as path_length or energy; if empty,
             success and T_total.
         allow_different: code also compares conditions of different code, with a note
@@ -233,15 +231,14 @@ def compare(
     )
     print_table(shown)
     if out:
-        print(
-            "written:", ", ".join(map(str, write_comparison(Path(out), table, shown)))
-        )
+        paths = write_comparison(Path(out), table, shown)
+        print("written:", ", ".join(map(str, paths)))
     else:
         print("columns: --out NAME writes NAME.md, which explains them")
 
 
-def _own_folder(path: str) -> Path:
-    """Return a run folder by its path; reject one without a name, such as `/`."""
+def _run_folder(path: str) -> Path:
+    """Return the path of a run folder; reject a path without a name, such as `/`."""
     if not Path(path).resolve().name:
         raise ConfigError(f"Expected the path of a run folder, got {path}.")
     return Path(path)
@@ -268,17 +265,16 @@ def _finish(folder: Path) -> int:
 
 
 def _repeats(suite: Suite, planner_limit_s: float, device: str) -> bool:
-    """Return whether the conditions of a suite repeat, and print which do not."""
+    """Return whether all conditions of a suite repeat, and print those that do not."""
     from benchnav.eval.run.determinism import check_determinism
 
     count, lines = check_determinism(suite, _say, planner_limit_s, device)
     for line in lines:
         _say(f"not deterministic: {line}")
-    _say(
-        f"{len(lines)} of {count} conditions differ; nothing was run"
-        if lines
-        else f"all {count} conditions repeat"
-    )
+    if lines:
+        _say(f"{len(lines)} of {count} conditions differ; nothing was run")
+    else:
+        _say(f"all {count} conditions repeat")
     return not lines
 
 
@@ -294,12 +290,11 @@ def _is_whole(folder: Path) -> bool:
     run = open_run(folder)
     if run.shard is None:
         return (folder / EPISODES).exists()
-    shard_units = [
-        finished
+    return all(
+        finished is not None
         for unit, finished in newest_units(run)
         if unit.shard(run.shard.of) == run.shard
-    ]
-    return all(shard_units)
+    )
 
 
 def _report(
@@ -317,32 +312,29 @@ def _report(
     # Errors are raised before anything is printed.
     mark = read_results(folder, unfinished).mark
     custom = [registry.make("figure", figure) for figure in figures]
-    target = out or (folder / PARTIAL if mark else folder)
-    _say(f"writing the report{f' ({mark})' if mark else ''}")
-    written = write_report(
-        folder, partial(record_driven, folder), target, unfinished, custom
-    )
+    run_target = folder / PARTIAL if mark else folder
+    target = out or run_target
+    _say(f"writing the report ({mark})" if mark else "writing the report")
+    record = partial(record_driven, folder)
+    written = write_report(folder, record, target, unfinished, custom)
     print_report(written)
     print(f"report:  {target / PAGE}")
     return 1 if written.faults else 0
 
 
 def _print_recorded(folder: Path) -> None:
-    files = [
-        path
-        for path in (folder / "playback").glob("*")
-        if path.suffix in (".npz", ".rrd")
-    ]
-    episodes = sum(path.suffix == ".npz" for path in files)
-    if episodes:
-        size = sum(path.stat().st_size for path in files) / 1e6
-        print(
-            f"recorded: {episodes} episode{'s' * (episodes > 1)} in "
-            f"{folder / 'playback'}, {size:.1f} MB"
-        )
+    """Print the number and the size of a run's recordings."""
+    playback = folder / "playback"
+    recordings = list(playback.glob("*.npz"))
+    if recordings:
+        files = [*recordings, *playback.glob("*.rrd")]
+        size_mb = sum(path.stat().st_size for path in files) / 1e6
+        noun = "episode" if len(recordings) == 1 else "episodes"
+        print(f"recorded: {len(recordings)} {noun} in {playback}, {size_mb:.1f} MB")
 
 
 def _print_replay(folder: Path) -> None:
+    """Print a command that replays episodes of a run."""
     import yaml
 
     from benchnav.eval.experiment.condition import NOT_USED
@@ -356,11 +348,13 @@ def _print_replay(folder: Path) -> None:
     words = ["replay", str(folder)]
     for name, labels in shown.items():
         values = {labels_[name] for labels_ in all_labels} - {NOT_USED}
-        several = name in ("planner", "scenario") or len(values) > 1
-        if labels != [NOT_USED] and several:
-            text = ",".join(labels)
-            is_plain = yaml.safe_load(f"[{text}]") == labels
-            words += [f"--{name}", text if is_plain else json.dumps(labels)]
+        is_needed = name in ("planner", "scenario") or len(values) > 1
+        if labels == [NOT_USED] or not is_needed:
+            continue
+        text = ",".join(labels)
+        if yaml.safe_load(f"[{text}]") != labels:  # such as a label with a comma
+            text = json.dumps(labels)
+        words += [f"--{name}", text]
     for name, value in draw.items():
         if name == "map" or value:
             words += [f"--{name}", str(value)]
@@ -368,7 +362,7 @@ def _print_replay(folder: Path) -> None:
 
 
 def _failed(folder: Path) -> int:
-    """Return 1, and print a line, if a part failed in some episode of a run."""
+    """Return 1, and print a line, if a part failed in an episode of a run; else 0."""
     from benchnav.eval.folder.run_folder import EPISODES, ERRORS, read_table
     from benchnav.planning.world.outcome import ERROR_OUTCOMES
 
@@ -406,9 +400,9 @@ def main() -> None:
     status = run("benchnav-eval", description, COMMANDS)
     if status == INTERRUPTED and sys.argv[1] in ("run", "rerun"):
         overwrites = any(word.startswith("--overwrite") for word in sys.argv)
+        options = " without --overwrite" if overwrites else ""
         _say(
-            "finished units are kept; to go on, give the same "
-            f"command{' without --overwrite' * overwrites} again"
+            f"finished units are kept; to resume, give the same command{options} again"
         )
     sys.exit(status)
 

@@ -3,7 +3,7 @@
 import json
 import math
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from datetime import timedelta
@@ -69,19 +69,21 @@ def compare_runs(
     Args:
         folders: finished runs.
         by: column in which conditions differ; see `pairs.by_what`.
-        against: label that all others are compared with; if empty, all pairs.
+        against: label with which all others are compared; if empty, all pairs are
+            compared.
         labels: labels that select conditions, by column; a missing column selects all.
-        difference: difference of success whose required number of maps is computed.
+        difference: difference in success rate for which the required number of maps is
+            computed.
         allow_different_code: whether to compare conditions of different code, with a
-            note. Runs compared with each other always may differ in code.
-        metric: name of a metric; if empty, success and T_total.
+            note. Runs that are compared with each other may always differ in code.
+        metric: name of a metric; if empty, success and T_total are compared.
 
     Returns:
         The numbers, and the formatted table.
 
     Raises:
-        ConfigError: If there is nothing to compare, it cannot be paired, or code
-            differs.
+        ConfigError: If there is nothing to compare, conditions cannot be paired, or
+            their code differs.
     """
     if not folders:
         raise ConfigError("Expected one or more run folders, got none.")
@@ -99,16 +101,15 @@ def compare_runs(
         conditions = _once_each(conditions)
     _announce(conditions, by, against, difference)
     pairs = find_pairs(conditions, by, against)
-    unlike = [_unlike_code(pair.members) for pair in pairs]
-    # Versions and machines may differ between rows; the code of a part may not.
+    code_by_pair = [_unlike_code(pair.members) for pair in pairs]
+    # Versions and machines may differ between pairs; the code of a part may not.
     members = {member for pair in pairs for member in pair.members}
-    lines = _unlike_code(members, parts_alone=not any(unlike))
-    if lines and by != "run" and not allow_different_code:
+    code_lines = _unlike_code(members, only_parts=not any(code_by_pair))
+    if code_lines and by != "run" and not allow_different_code:
         raise ConfigError(
             f"Expected conditions that differ only in their {by}, got conditions "
-            "made by different code: "
-            f"{'; '.join(lines)}. Run them with one code, or pass --allow-different "
-            "code, which names it in the table."
+            f"made by different code: {'; '.join(code_lines)}. Run them with one code, "
+            "or pass --allow-different code, which names it in the table."
         )
     if quantity is None:
         table = compare(pairs, difference)
@@ -116,19 +117,17 @@ def compare_runs(
     else:
         table = compare_by(pairs, quantity)
         shown = metric_table(table, quantity, by)
-    table = table.assign(different_code=["; ".join(differing) for differing in unlike])
-    notes = (
-        *_about(pairs, table),
-        *_left_out(pairs, by),
-        *_no_partner(conditions, pairs, by),
-        *shown.notes,
-    )
-    notes += tuple(f"Different code: {line}." for line in lines)
+    table["different_code"] = ["; ".join(lines) for lines in code_by_pair]
+    notes = _common(table)
+    notes += _left_out(pairs, by)
+    notes += _no_partner(conditions, pairs, by)
+    notes += shown.notes
+    notes += [f"Different code: {line}." for line in code_lines]
     caveat_lines: list[str] = []
     for run in runs:
-        caveat_lines += caveats(_concerning(conditions, run.about))
-    notes += tuple(dict.fromkeys(caveat_lines))
-    return table, replace(shown, notes=notes)
+        caveat_lines += caveats(_concerning(conditions, run.manifest))
+    notes += dict.fromkeys(caveat_lines)
+    return table, replace(shown, notes=tuple(notes))
 
 
 def _find_quantity(runs: Sequence[Run], name: str) -> Quantity:
@@ -138,7 +137,7 @@ def _find_quantity(runs: Sequence[Run], name: str) -> Quantity:
         ConfigError: If a run does not have the metric.
     """
     for run in runs:
-        known_quantities = quantities(further_quantities(run.about))
+        known_quantities = quantities(further_quantities(run.manifest))
         check_known(f"`metric`, of {run.folder},", name, known_quantities)
     return known_quantities[name]
 
@@ -159,12 +158,12 @@ def write_comparison(stem: Path, table: pd.DataFrame, shown: Table) -> list[Path
         ".md": to_markdown(shown),
         ".tex": to_latex([shown], _CAPTION, stem.name),
     }
-    written = {
-        stem.with_name(stem.name + suffix): text for suffix, text in texts.items()
-    }
-    for path, text in written.items():
+    paths = []
+    for suffix, text in texts.items():
+        path = stem.with_name(stem.name + suffix)
         write_text(path, text)
-    return list(written)
+        paths.append(path)
+    return paths
 
 
 def read_conditions(runs: Sequence[Run]) -> list[Compared]:
@@ -177,26 +176,26 @@ def read_conditions(runs: Sequence[Run]) -> list[Compared]:
     shared = Counter(condition for run in runs for condition in run.conditions)
     compared = []
     for run, name in zip(runs, names, strict=True):
-        episodes = dict(
-            list(read_table(run.folder, EPISODES).groupby("condition", sort=False))
-        )
-        for condition, (condition_, _) in run.conditions.items():
-            labels = condition_.labels
-            value = condition_.value
-            rows = episodes[condition]
+        table = read_table(run.folder, EPISODES)
+        episodes = dict(list(table.groupby("condition", sort=False)))
+        for condition_id, (condition, _) in run.conditions.items():
+            labels = dict(condition.labels)
+            labels["run"] = name if shared[condition_id] > 1 else NOT_USED
+            value = condition.value
+            split = value["split"]
+            rows = episodes[condition_id]
             budgets = time_budgets(rows, value["world"])
-            dataset = run.about["datasets"][labels["data"]]
-            run_label = name if shared[condition] > 1 else NOT_USED
-            compared.append(
-                Compared(
-                    labels={**labels, "run": run_label},
-                    value=value,
-                    maps=dataset["maps"][value["split"]],
-                    episodes=rows.assign(time_budget_s=budgets),
-                    code=_codes(run.about, name, rows["code"].unique()),
-                    about=dataset.get("about", {}).get(value["split"], ""),
-                )
+            dataset = run.manifest["datasets"][labels["data"]]
+            properties = dataset.get("about", {})
+            entry = Compared(
+                labels=labels,
+                value=value,
+                maps=dataset["maps"][split],
+                episodes=rows.assign(time_budget_s=budgets),
+                code=_codes(run.manifest, name, rows["code"].unique()),
+                map_properties=properties.get(split, ""),
             )
+            compared.append(entry)
     return compared
 
 
@@ -209,41 +208,42 @@ def _announce(
     all_pairs = list(matches(conditions, by, against))
     if len(all_pairs) < _MANY:
         return
-    begin = time.perf_counter()
     sample = list(dict.fromkeys(chain(*all_pairs[:_TIMED])))
+    begin_s = time.perf_counter()
     compare(find_pairs(sample, by, against)[:_TIMED], difference)
-    seconds = (time.perf_counter() - begin) / _TIMED * len(all_pairs)
-    tell(
-        f"benchnav-eval: comparing {len(all_pairs)} pairs takes about "
-        f"{timedelta(seconds=round(seconds))}."
-    )
+    s_per_pair = (time.perf_counter() - begin_s) / _TIMED
+    estimate = timedelta(seconds=round(s_per_pair * len(all_pairs)))
+    tell(f"benchnav-eval: comparing {len(all_pairs)} pairs takes about {estimate}.")
 
 
 def _codes(
     manifest: Mapping[str, Any], run: str, digests: Iterable[str]
 ) -> dict[str, Any]:
-    """Return the code of some rows of a run, by its name, and digest if it has several."""
+    """Return the code of some rows by the run's name, with digests if it has several.
+
+    Args:
+        manifest: contents of `run.json`.
+        run: name of the run.
+        digests: digests of the rows' code.
+    """
+    codes = manifest["codes"]
     if manifest["reused"]:
-        return {
-            f"{run} (code {digest})": manifest["codes"][digest] for digest in digests
-        }
+        return {f"{run} (code {digest})": codes[digest] for digest in digests}
     (digest,) = digests
-    return {run: manifest["codes"][digest]}
+    return {run: codes[digest]}
 
 
 def _names(folders: Sequence[Path]) -> list[str]:
-    """Return short names of runs, the shortest ends of paths that differ."""
+    """Return short names of runs: the shortest ends of their paths that differ."""
     paths = [folder.resolve() for folder in folders]
     if len(set(paths)) < len(paths):
         raise ConfigError(
             f"Expected runs that differ, got {', '.join(map(str, folders))}."
         )
-    parts = next(
-        n
-        for n in range(1, 100)
-        if len({path.parts[-n:] for path in paths}) == len(paths)
-    )
-    return ["/".join(path.parts[-parts:]) for path in paths]
+    n_parts = 1
+    while len({path.parts[-n_parts:] for path in paths}) < len(paths):
+        n_parts += 1
+    return ["/".join(path.parts[-n_parts:]) for path in paths]
 
 
 def _select(
@@ -259,25 +259,26 @@ def _select(
     return conditions
 
 
-def _unlike_code(
-    conditions: Iterable[Compared], parts_alone: bool = False
-) -> list[str]:
-    """Describe how the code of conditions differs, a line for two runs.
+def _unlike_code(conditions: Iterable[Compared], only_parts: bool = False) -> list[str]:
+    """Describe differences in the code of conditions, one line for each pair of runs.
 
-    If `parts_alone`, differences of the environment are ignored.
+    Args:
+        conditions: conditions whose code is compared.
+        only_parts: whether to ignore differences of the environment.
     """
     codes: dict[str, dict[str, dict[str, Any]]] = {}
     for condition in conditions:
         for run, code in condition.code.items():
-            groups = codes.setdefault(run, {})
+            groups = codes.setdefault(run, defaultdict(dict))
             for group, entries in code.items():
-                is_left_out = parts_alone and group == "environment"
-                groups[group] = groups.get(group, {}) | ({} if is_left_out else entries)
-    return [
-        f"{second} differs from {first} in {', '.join(names)}"
-        for first, second in combinations(sorted(codes), 2)
-        if (names := code_differences(codes[first], codes[second]))
-    ]
+                if not only_parts or group != "environment":
+                    groups[group].update(entries)
+    lines = []
+    for first, second in combinations(sorted(codes), 2):
+        names = code_differences(codes[first], codes[second])
+        if names:
+            lines.append(f"{second} differs from {first} in {', '.join(names)}")
+    return lines
 
 
 def _once_each(conditions: Iterable[Compared]) -> list[Compared]:
@@ -303,73 +304,82 @@ def _joined(a: Compared, b: Compared) -> Compared:
     second = b.episodes.drop(columns=list(LABELS))
     cells, _ = differences(first, second)
     if len(cells):
-        unlike = cells.index.droplevel(-1).unique()
+        n_unlike = len(cells.index.droplevel(-1).unique())
         n_common = len(first.merge(second, on=DRAW))
-        reason = "; ".join(_unlike_code((a, b)))
+        reasons = "; ".join(_unlike_code((a, b)))
+        explanation = f" ({reasons})" if reasons else ""
         raise ConfigError(
             "Expected the same rows of a condition in all runs that hold it, got "
-            f"{len(unlike)} of {n_common} episodes of "
-            f"{words} that differ between {runs}{f' ({reason})' if reason else ''}. Leave "
-            "one of the runs out, or "
-            "compare the runs with each other by --by run."
+            f"{n_unlike} of {n_common} episodes of {words} that differ between "
+            f"{runs}{explanation}. Leave one of the runs out, or compare the runs with "
+            "each other by --by run."
         )
-    rows = pd.concat([a.episodes, b.episodes]).drop_duplicates(DRAW, ignore_index=True)
-    longer = max((a.maps, b.maps), key=len)
-    labels = {**a.labels, "run": NOT_USED}
+    rows = pd.concat([a.episodes, b.episodes])
     return replace(
-        a, labels=labels, episodes=rows, maps=longer, code={**a.code, **b.code}
+        a,
+        labels={**a.labels, "run": NOT_USED},
+        episodes=rows.drop_duplicates(DRAW, ignore_index=True),
+        maps=max((a.maps, b.maps), key=len),
+        code={**a.code, **b.code},
     )
 
 
-def _about(pairs: Sequence[Pair], table: pd.DataFrame) -> list[str]:
-    same = [
-        f"{name} {reading_name(name, table[name].iloc[0])}"
-        for name in LABELS
-        if name in table
-        and table[name].nunique() == 1
-        and table[name].iloc[0] != NOT_USED
-    ]
-    if all(table[name].nunique() == 1 for name in ("n_maps", "n_groups", "n_episodes")):
-        maps, groups, episodes = table[["n_maps", "n_groups", "n_episodes"]].iloc[0]
-        same.append(f"{maps} maps")
+def _common(table: pd.DataFrame) -> list[str]:
+    """Return a note on the labels and counts that all pairs have in common."""
+    words = []
+    for name in LABELS:
+        if name not in table or table[name].nunique() != 1:
+            continue
+        label = table[name].iloc[0]
+        if label != NOT_USED:
+            words.append(f"{name} {reading_name(name, label)}")
+    counts = table[["n_maps", "n_groups", "n_episodes"]].drop_duplicates()
+    if len(counts) == 1:
+        maps, groups, episodes = counts.iloc[0]
+        words.append(f"{maps} maps")
         if groups != maps:
-            same.append(f"{groups} groups of maps (the statistical unit)")
-        same.append(f"{episodes} episodes a condition")
-    return [f"All pairs: {', '.join([*same, 'the same draws of λ'])}."]
+            words.append(f"{groups} groups of maps (the statistical unit)")
+        words.append(f"{episodes} episodes a condition")
+    words.append("the same draws of λ")
+    return [f"All pairs: {', '.join(words)}."]
 
 
 def _left_out(pairs: Sequence[Pair], by: str) -> list[str]:
     """Return lines on episodes of a condition that its partner was not run on."""
     lines: dict[str, None] = {}
     for pair in pairs:
-        first_name, second_name = (
-            reading_name(by, label) for label in (pair.one, pair.other)
-        )
-        sides = (first_name, second_name), (second_name, first_name)
+        first = reading_name(by, pair.one)
+        second = reading_name(by, pair.other)
+        sides = (first, second), (second, first)
         for condition, (name, partner) in zip(pair.members, sides, strict=True):
-            compared_draws = condition.episodes[DRAW].merge(
+            merged = condition.episodes[DRAW].merge(
                 pair.episodes[DRAW], how="left", indicator=True
             )
-            rows = compared_draws[compared_draws["_merge"] == "left_only"]
-            draws = [
-                f"seed {seed}"
-                + (f", realisation {realisation}" if realisation else "")
-                + f" on {_maps(sorted(maps))}"
-                for (seed, realisation), maps in rows.groupby(["seed", "realisation"])[
-                    "map"
-                ]
-            ]
-            if draws:
-                remainder = ""
-                if len(draws) > _NAMED:
-                    remainder = f" and {len(draws) - _NAMED} more draws"
-                line = (
-                    f"{len(rows)} of {len(condition.episodes)} episodes of {name} are "
-                    f"left out: {partner} was not run "
-                    f"on them ({'; '.join(draws[:_NAMED])}{remainder})."
-                )
-                lines[line] = None
+            rows = merged[merged["_merge"] == "left_only"]
+            if rows.empty:
+                continue
+            draws = _draws_in_words(rows)
+            remainder = ""
+            if len(draws) > _NAMED:
+                remainder = f" and {len(draws) - _NAMED} more draws"
+            line = (
+                f"{len(rows)} of {len(condition.episodes)} episodes of {name} are "
+                f"left out: {partner} was not run "
+                f"on them ({'; '.join(draws[:_NAMED])}{remainder})."
+            )
+            lines[line] = None
     return _first_of(list(lines), "pairs with episodes left out")
+
+
+def _draws_in_words(rows: pd.DataFrame) -> list[str]:
+    """Return the draws of episodes and their maps in words, one text for each draw."""
+    draws = []
+    for (seed, realisation), maps in rows.groupby(["seed", "realisation"])["map"]:
+        words = f"seed {seed}"
+        if realisation:
+            words += f", realisation {realisation}"
+        draws.append(f"{words} on {_maps(sorted(maps))}")
+    return draws
 
 
 def _maps(maps: Sequence[int]) -> str:
@@ -386,13 +396,13 @@ def _concerning(
     conditions: Sequence[Compared], manifest: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Return `run.json` with only those left-out combinations whose labels are compared."""
-    labels = {
-        name: {condition.labels[name] for condition in conditions} for name in LABELS
-    }
+    compared: set[tuple[str, str]] = set()
+    for condition in conditions:
+        compared.update(condition.labels.items())
     dropped = [
         entry
         for entry in manifest["dropped"]
-        if all(label in labels[name] for name, label in dropped_labels(entry).items())
+        if dropped_labels(entry).items() <= compared
     ]
     return {**manifest, "dropped": dropped}
 
@@ -403,15 +413,15 @@ def _no_partner(
     """Return a line that names the conditions without a pair."""
     paired = {member for pair in pairs for member in pair.members}
     unpaired = [condition for condition in conditions if condition not in paired]
-    varying = [
-        name
-        for name in (*LABELS, "run")
-        if len({condition.labels[name] for condition in conditions}) > 1
-    ]
-    names = [
-        " ".join(label_words(_as_read(condition.labels), varying))
-        for condition in unpaired
-    ]
+    varying = []
+    for name in (*LABELS, "run"):
+        labels = {condition.labels[name] for condition in conditions}
+        if len(labels) > 1:
+            varying.append(name)
+    names = []
+    for condition in unpaired:
+        labels_shown = _as_read(condition.labels)
+        names.append(" ".join(label_words(labels_shown, varying)))
     if not names:
         return []
     return [

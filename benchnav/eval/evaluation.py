@@ -31,26 +31,26 @@ def evaluate(
 ) -> Results:
     """Evaluate each combination of planners, models, risks, … on a dataset's test maps.
 
-    Parts are objects, such as `AStarDWA()` and `CVaR(0.8)`, or names as in suites. An
-    object that other processes cannot create again (a function without a name, a class
-    of a notebook) runs in this process only: the rows of its conditions are marked as
-    not reproducible, and their folder cannot be resumed.
+    Parts are objects, such as `AStarDWA()` and `CVaR(0.8)`, or names as in suites. Some
+    objects cannot be created again by other processes, such as a function without a
+    name or a class of a notebook. They run only in this process, the rows of their
+    conditions are marked as not reproducible, and their run cannot be resumed.
 
     Args:
         terrain: a dataset, by path, id or object; or a recipe, whose test maps are
             generated first.
-        folder: run folder, which is resumed or extended if it contains a run. If None,
+        folder: run folder; a run that it contains is resumed or extended. If None,
             results are stored in a temporary folder as long as the returned object
             exists; see `Results.save`.
         jobs: number of worker processes; it does not affect results.
         device: "cpu", "cuda", or "auto" for CUDA if there is a GPU.
         verbose: whether to show progress and notes on stderr.
-        **experiment: fields of `Suite`: `models`, `planners`,
-            `risks`, `robots`, `objectives`, `sensors`, `grounds`, `beliefs`, `world`
-            (such as `World.stakes()`), `task` (or `rules`, a `Rules`), `scenarios`,
-            `maps`, `seed` or `seeds`, `realisations`, `record`, `conditions`,
-            `hypotheses`, further `metrics` (such as
-            `Energy(power_w=120)`), and custom `figures` for the report.
+        **experiment: fields of `Suite`: `models`, `planners`, `risks`, `robots`,
+            `objectives`, `sensors`, `grounds`, `beliefs`, `world` (such as
+            `World.stakes()`), `task` (or `rules`, a `Rules`), `scenarios`, `maps`,
+            `seed` or `seeds`, `realisations`, `record`, `conditions`, `hypotheses`,
+            further `metrics` (such as `Energy(power_w=120)`), and custom `figures` for
+            the report.
 
     Returns:
         The results of the run.
@@ -73,10 +73,8 @@ def evaluate(
     )
     temporary = None if folder else tempfile.TemporaryDirectory(prefix="benchnav-")
     run_folder = Path(temporary.name, "run") if temporary else Path(str(folder))
-    suite = Suite(
-        data=_path_of(terrain, run_folder),
-        **{name: _as_tuple(value) for name, value in experiment.items()},
-    )
+    fields_ = {name: _as_tuple(value) for name, value in experiment.items()}
+    suite = Suite(data=_path_of(terrain, run_folder), **fields_)
     notes: list[str] = []
     settings = Settings.on(device)
     steps = run_suite(

@@ -39,11 +39,11 @@ def failures_table(folder: Path, episodes: pd.DataFrame) -> pd.DataFrame:
         episodes: rows of the run.
 
     Returns:
-        A row a failure: `condition`, `planner`, `risk`, `model`, `scenario`, `world`,
-        `seed`, `realisation`, `map`, `outcome`, `end_time_s`, `code`; `x_m`, `y_m`,
-        its last position; `end_traversability`, the observed λ in the last step; and
-        `last_traversability`, the mean of observed λ in the last 2 s. The last four are
-        NaN if steps were not stored.
+        One row per failure: `condition`, `planner`, `risk`, `model`, `scenario`,
+        `world`, `seed`, `realisation`, `map`, `outcome`, `end_time_s`, `code`; `x_m`,
+        `y_m`, the robot's last position; `end_traversability`, the observed λ in the
+        last step; and `last_traversability`, the mean of observed λ in the last 2 s.
+        The last four columns are NaN if steps were not stored.
     """
     columns = [
         "condition",
@@ -54,17 +54,18 @@ def failures_table(folder: Path, episodes: pd.DataFrame) -> pd.DataFrame:
         "world",
         *_KEYS[1:],
         "outcome",
+        "end_time_s",
+        "code",
     ]
-    failed = episodes.loc[
-        ~episodes["success"].astype(bool), [*columns, "end_time_s", "code"]
-    ].reset_index(drop=True)
-    read = [*_KEYS, "time_s", "x_m", "y_m", "traversability"]
-    steps = [rows[read] for rows in step_files(folder, set(failed["condition"]))]
+    is_failure = ~episodes["success"].astype(bool)
+    failed = episodes.loc[is_failure, columns].reset_index(drop=True)
+    step_columns = [*_KEYS, "time_s", "x_m", "y_m", "traversability"]
+    files = step_files(folder, set(failed["condition"]))
+    steps = [rows[step_columns] for rows in files]
     if not steps:
         return failed.assign(**dict.fromkeys(_ENDS, np.nan))
-    return failed.merge(
-        _ends(pd.concat(steps, ignore_index=True)), on=_KEYS, how="left"
-    )
+    ends = _ends(pd.concat(steps, ignore_index=True))
+    return failed.merge(ends, on=_KEYS, how="left")
 
 
 def _ends(steps: pd.DataFrame) -> pd.DataFrame:
@@ -74,14 +75,13 @@ def _ends(steps: pd.DataFrame) -> pd.DataFrame:
     """
     groups = steps.groupby(_KEYS, sort=False)
     last = groups[["x_m", "y_m"]].last()
-    has_traversability = steps[steps["traversability"].notna()]
-    end = _traversability_of(has_traversability).last().rename("end_traversability")
+    taken = steps[steps["traversability"].notna()]
+    end = _traversability_of(taken).last()
     from_s = groups["time_s"].transform("max") - _LAST_S
-    is_late = has_traversability["time_s"] >= (
-        from_s.loc[has_traversability.index] - 1e-9
-    )
-    mean = _traversability_of(has_traversability[is_late]).mean()
-    ends = last.join([end, mean.rename("last_traversability")]).reset_index()
+    is_late = taken["time_s"] >= from_s.loc[taken.index] - 1e-9
+    mean = _traversability_of(taken[is_late]).mean()
+    further = [end.rename("end_traversability"), mean.rename("last_traversability")]
+    ends = last.join(further).reset_index()
     return ends.astype(
         {"x_m": np.float64, "y_m": np.float64, "end_traversability": np.float64}
     )
@@ -100,7 +100,7 @@ class FailedLine:
         name: name of the condition.
         failures: rows of `failures_table`, at most `ACROSS`.
         recordings: recordings of these failures.
-        among: number of all failures of the condition.
+        among: number of failures of the condition from which they were chosen.
     """
 
     name: str
@@ -116,7 +116,8 @@ class Sheets:
     Args:
         shown: title and lines of the sheet of each block.
         predicted: λ̂ where failed episodes ended, by condition, shape [N].
-        left_out: why sheets are missing; empty if none is, or nothing failed.
+        left_out: reason for missing sheets; empty if no sheet is missing, or no episode
+            failed.
     """
 
     shown: tuple[tuple[str, tuple[FailedLine, ...]], ...]
@@ -159,15 +160,15 @@ def collect_sheets(
                     continue
                 recorded = of_condition.head(_MAX_FAILURES).reset_index(drop=True)
                 recordings = record_driven(recorded)
+                at_ends = [recording.predicted_at_end for recording in recordings]
+                predicted[condition] = np.array(at_ends)
                 chosen = choose_failures(recorded)
-                predicted[condition] = np.array(
-                    [recording.predicted_at_end for recording in recordings]
-                )
+                is_of_condition = failures["condition"] == condition
                 line = FailedLine(
                     name=row["name"],
                     failures=chosen.reset_index(drop=True),
                     recordings=[recordings[index] for index in chosen.index],
-                    among=int((failures["condition"] == condition).sum()),
+                    among=int(is_of_condition.sum()),
                 )
                 lines.append(line)
         except (BenchnavError, OSError) as error:
@@ -185,8 +186,9 @@ def collect_sheets(
 def _best_and_worst(rows: pd.DataFrame) -> list[dict[Any, Any]]:
     """Return the best and the worst of the conditions of a block with a prediction."""
     seeing = rows[competing(rows) & (rows["model"] != NOT_USED)]
+    best = seeing[seeing["condition"] == seeing["best"]]
     worst = seeing.sort_values("success_rate", kind="stable").head(1)
-    chosen = pd.concat([seeing[seeing["condition"] == seeing["best"]], worst])
+    chosen = pd.concat([best, worst])
     return chosen.drop_duplicates("condition").to_dict("records")
 
 
@@ -195,8 +197,6 @@ def choose_failures(failures: pd.DataFrame) -> pd.DataFrame:
     located = failures[failures["x_m"].notna()]
     turn = located.groupby("outcome", sort=False).cumcount()
     often = -located.groupby("outcome")["outcome"].transform("size")
-    return (
-        located.assign(turn=turn, often=often)
-        .sort_values(["turn", "often"], kind="stable")
-        .head(ACROSS)
-    )
+    keyed = located.assign(turn=turn, often=often)
+    ordered = keyed.sort_values(["turn", "often"], kind="stable")
+    return ordered.head(ACROSS)

@@ -32,8 +32,8 @@ def find_episodes(
     Args:
         folder: a run folder.
         labels: labels of conditions by column; several labels of a column select
-            several conditions, and a missing column takes the first that fits.
-        seed: root seed; if None, the first of the first condition.
+            several conditions. Of a missing column, the first label that fits is taken.
+        seed: root seed; if None, the first seed of the first condition.
         realisation: index of the draw of λ.
         map_index: index of the map in its split.
 
@@ -44,53 +44,64 @@ def find_episodes(
         ConfigError: If the run has no such episode, or episodes are on several maps.
     """
     run = open_run(folder)
-    conditions = [condition for condition, _ in run.conditions.values()]
-    labels_of_run = {}
-    for name in LABELS:
-        labels_ = [condition.labels[name] for condition in conditions]
-        for condition in conditions:
-            labels_ += condition.stands_for.get(name, ())
-        used = [label for label in labels_ if label != NOT_USED]
-        labels_of_run[name] = list(dict.fromkeys(used))
+    labels_of_run = _labels_of(run)
     chosen: dict[str, tuple[Unit, int]] = {}
     for values in itertools.product(*labels.values()):
         requested = dict(zip(labels, values, strict=True))
         unit = _find(run, requested, (seed, realisation, map_index))
         # A blind planner fits any risk setting, but the run must have that setting.
-        unknown = [
-            name
-            for name, label in requested.items()
-            if labels_of_run[name] and label not in labels_of_run[name]
-        ]
+        unknown = []
+        for name, label in requested.items():
+            if labels_of_run[name] and label not in labels_of_run[name]:
+                unknown.append(name)
         if unit is None or unknown:
             words = [f"{name} {label!r}" for name, label in requested.items()]
             words += [f"realisation {realisation}", f"map {map_index}"]
-            words += [] if seed is None else [f"seed {seed}"]
-            hint_text = "".join(
-                hint(requested[name], labels_of_run[name]) for name in unknown[:1]
-            )
-            available = [
-                f"{name} {', '.join(labels)}"
-                for name, labels in labels_of_run.items()
-                if labels
-            ]
-            n_maps = max(extent.maps for _, extent in run.conditions.values())
-            available.append(f"map 0 to {n_maps - 1}")
+            if seed is not None:
+                words.append(f"seed {seed}")
+            similar = ""
+            if unknown:
+                name = unknown[0]
+                similar = hint(requested[name], labels_of_run[name])
             raise ConfigError(
                 f"Expected an episode of the run, got {', '.join(words)}. It has "
-                f"{'; '.join(available)}.{hint_text}"
+                f"{'; '.join(_available(run, labels_of_run))}.{similar}"
             )
         seed = unit.seed
-        chosen.setdefault(unit.condition.id, (unit, unit.maps.index(map_index)))
+        member = unit.maps.index(map_index)
+        chosen.setdefault(unit.condition.id, (unit, member))
     episodes = list(chosen.values())
-    maps = dict.fromkeys(
-        f"{unit.condition.data} {unit.condition.scenario}" for unit, _ in episodes
-    )
+    maps: dict[str, None] = {}
+    for unit, _ in episodes:
+        maps[f"{unit.condition.data} {unit.condition.scenario}"] = None
     if len(maps) > 1:
         raise ConfigError(
             f"Expected conditions on one map to show together, got {', '.join(maps)}."
         )
     return episodes
+
+
+def _labels_of(run: Run) -> dict[str, list[str]]:
+    """Return the labels of a run's conditions by column, without unused ones."""
+    conditions = [condition for condition, _ in run.conditions.values()]
+    labels_of_run = {}
+    for name in LABELS:
+        labels = [condition.labels[name] for condition in conditions]
+        for condition in conditions:
+            labels += condition.stands_for.get(name, ())
+        used = [label for label in labels if label != NOT_USED]
+        labels_of_run[name] = list(dict.fromkeys(used))
+    return labels_of_run
+
+
+def _available(run: Run, labels_of_run: Mapping[str, Sequence[str]]) -> list[str]:
+    """Return the labels and maps of a run in words."""
+    words = []
+    for name, labels in labels_of_run.items():
+        if labels:
+            words.append(f"{name} {', '.join(labels)}")
+    n_maps = max(extent.maps for _, extent in run.conditions.values())
+    return [*words, f"map 0 to {n_maps - 1}"]
 
 
 def propose(folder: Path) -> tuple[dict[str, list[str]], dict[str, int]]:
@@ -100,24 +111,26 @@ def propose(folder: Path) -> tuple[dict[str, list[str]], dict[str, int]]:
         folder: a finished run.
 
     Returns:
-        Labels by column, of one condition, or of two that differ only in their risk
-        setting (those of the first such hypothesis); and `map`, `seed` and
-        `realisation`.
+        Labels by column, and `map`, `seed` and `realisation`. The labels are those of
+        two conditions that differ only in their risk setting and in their outcome
+        (conditions of the first such hypothesis take precedence), or else of one
+        condition.
     """
     run = open_run(folder)
-    all_labels = [condition.labels for condition, _ in run.conditions.values()]
-    # A planner that uses a prediction has more to show.
-    first = next(
-        (labels for labels in all_labels if labels["risk"] != NOT_USED), all_labels[0]
-    )
     if not (folder / GROUND).exists():
-        return {name: [label] for name, label in first.items()}, {"map": 0}
+        all_labels = [condition.labels for condition, _ in run.conditions.values()]
+        # A planner that uses a prediction has more to show.
+        seeing = [labels for labels in all_labels if labels["risk"] != NOT_USED]
+        first, *_ = [*seeing, *all_labels]
+        return _as_lists(first), {"map": 0}
     map_keys = Ground.load(folder / GROUND).about
+    draw = {name: int(map_keys[name]) for name in ("map", "seed", "realisation")}
     rows = read_table(folder, EPISODES)
-    rows = rows[(rows[list(map_keys)] == pd.Series(map_keys)).all(axis=1)]
-    original_first = rows["condition"].iloc[0]
+    is_on_map = (rows[list(map_keys)] == pd.Series(map_keys)).all(axis=1)
+    rows = rows[is_on_map]
+    first_id = rows["condition"].iloc[0]
     # Conditions of the first hypothesis come first.
-    tests = run.about.get("hypotheses", {}).get("tests", ())
+    tests = run.manifest.get("hypotheses", {}).get("tests", ())
     tested = [condition for test in tests for condition in (test["one"], test["other"])]
     ordered = list(dict.fromkeys([*tested, *rows["condition"]]))
     rows = rows.sort_values(
@@ -127,17 +140,21 @@ def propose(folder: Path) -> tuple[dict[str, list[str]], dict[str, int]]:
     for row in rows[rows["risk"] != NOT_USED].to_dict("records"):
         condition, _ = run.conditions[row["condition"]]
         candidates.append((condition.labels, bool(row["success"])))
-    draw = {name: int(map_keys[name]) for name in ("map", "seed", "realisation")}
     columns = [name for name in LABELS if name != "risk"]
     for (a, a_succeeded), (b, b_succeeded) in itertools.combinations(candidates, 2):
         is_same_setting = all(a[name] == b[name] for name in columns)
         if a_succeeded != b_succeeded and is_same_setting:
             pair = {name: list(dict.fromkeys((a[name], b[name]))) for name in LABELS}
             return pair, draw
-    shown = run.conditions[original_first][0].labels
     if candidates:
-        shown = candidates[0][0]
-    return {name: [label] for name, label in shown.items()}, draw
+        labels, _ = candidates[0]
+        return _as_lists(labels), draw
+    condition, _ = run.conditions[first_id]
+    return _as_lists(condition.labels), draw
+
+
+def _as_lists(labels: Mapping[str, str]) -> dict[str, list[str]]:
+    return {name: [label] for name, label in labels.items()}
 
 
 def _find(
@@ -145,28 +162,29 @@ def _find(
 ) -> Unit | None:
     """Return the unit of the first matching condition; prefer one that has rows.
 
-    A condition that does not use a part matches any label if no other condition does.
+    A condition that does not use a part matches any label of that part, unless another
+    condition has the label.
 
     Args:
-        run: the run.
+        run: opened run folder.
         requested: labels by column.
-        episode: seed, realisation and map.
+        episode: seed, realisation and map; if the seed is None, each condition's first.
     """
     seed, realisation, map_index = episode
     is_finished = (run.folder / EPISODES).exists()
     first = None
     for ignored in (set(), {NOT_USED}):
         for condition, extent in run.conditions.values():
-            differing = {
-                condition.labels[name]
-                for name, label in requested.items()
-                if condition.labels[name] != label
-            }
-            wanted_seed = extent.seeds[0] if seed is None else seed
+            differing = set()
+            for name, label in requested.items():
+                if condition.labels[name] != label:
+                    differing.add(condition.labels[name])
             if not differing <= ignored:
                 continue
+            unit_seed = extent.seeds[0] if seed is None else seed
+            draw = (unit_seed, realisation)
             for unit in units({condition.id: (condition, extent)}):
-                if (unit.seed, unit.realisation) != (wanted_seed, realisation):
+                if (unit.seed, unit.realisation) != draw:
                     continue
                 if map_index not in unit.maps:
                     continue

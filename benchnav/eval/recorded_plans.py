@@ -3,7 +3,7 @@
 Letters in shapes: H×W cells, P points.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Sized
 from dataclasses import dataclass
 from typing import Any
 
@@ -40,11 +40,11 @@ class KnownMap:
     Args:
         step: first step at which it is valid.
         predicted: λ̂ under the risk setting, shape [H, W].
-        free: S_free, bool, shape [H, W].
+        free: free mask S_free, bool, shape [H, W].
         mean: E[λ] of the belief, shape [H, W].
         spread: half of the range from the 16 % to the 84 % quantile of λ, shape [H, W].
-        seen: cells whose appearance was observed by then, bool, shape [H, W].
-        sensed: cells whose λ was measured by then, bool, shape [H, W].
+        seen: cells whose appearance has been observed, bool, shape [H, W].
+        sensed: cells whose λ has been measured, bool, shape [H, W].
         outline: outline of the sensors' footprint at that step, (x, y) in metres, shape
             [P, 2]; rows of NaN separate lines.
     """
@@ -61,9 +61,13 @@ class KnownMap:
     @property
     def outlines(self) -> list[np.ndarray]:
         """The lines of the outline, each of shape [P, 2]."""
-        ends = np.flatnonzero(np.isnan(self.outline[:, 0]))
-        lines = [line[~np.isnan(line[:, 0])] for line in np.split(self.outline, ends)]
-        return [line for line in lines if len(line) > 1]
+        is_separator = np.isnan(self.outline[:, 0])
+        lines = []
+        for line in np.split(self.outline, np.flatnonzero(is_separator)):
+            points = line[~np.isnan(line[:, 0])]
+            if len(points) > 1:
+                lines.append(points)
+        return lines
 
 
 def reach_outline(cells: np.ndarray, resolution_m: float) -> np.ndarray:
@@ -74,18 +78,18 @@ def reach_outline(cells: np.ndarray, resolution_m: float) -> np.ndarray:
         resolution_m: edge length of a cell.
     """
     edges = outline(cells, resolution_m)
-    return np.pad(edges, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan).reshape(
-        -1, 2
-    )
+    one_separator = ((0, 0), (0, 1), (0, 0))
+    separated = np.pad(edges, one_separator, constant_values=np.nan)
+    return separated.reshape(-1, 2)
 
 
 def under(prefix: str, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return values whose names start with a prefix, by the rest of their names."""
-    return {
-        name.removeprefix(prefix): value
-        for name, value in values.items()
-        if name.startswith(prefix)
-    }
+    """Return values whose names start with a prefix, by name without the prefix."""
+    chosen = {}
+    for name, value in values.items():
+        if name.startswith(prefix):
+            chosen[name.removeprefix(prefix)] = value
+    return chosen
 
 
 def drawn_plan(step: int, layers: Mapping[str, Tensor]) -> DrawnPlan:
@@ -96,12 +100,13 @@ def drawn_plan(step: int, layers: Mapping[str, Tensor]) -> DrawnPlan:
         layers: from `Plan.lines`, polylines of shape [lines, P, 2] by layer; unused
             points are NaN.
     """
-    lines = {}
+    lines: dict[str, list[np.ndarray]] = {}
     for name, layer in layers.items():
-        finite = [
-            line[np.isfinite(line).all(axis=1)] for line in layer.detach().cpu().numpy()
-        ]
-        lines[name] = [line for line in finite if len(line) > 1]
+        lines[name] = []
+        for line in layer.detach().cpu().numpy():
+            points = line[np.isfinite(line).all(axis=1)]
+            if len(points) > 1:
+                lines[name].append(points)
     return DrawnPlan(step=step, lines=lines)
 
 
@@ -117,54 +122,53 @@ def thinned(plan: DrawnPlan) -> DrawnPlan:
 
 def _spread(count: int, max_count: int) -> np.ndarray:
     """Return up to `max_count` evenly spread indices, including first and last."""
-    return np.linspace(0, count - 1, min(count, max_count)).round().astype(int)
+    n_indices = min(count, max_count)
+    return np.linspace(0, count - 1, n_indices).round().astype(int)
 
 
 def pack_plans(plans: Sequence[DrawnPlan]) -> dict[str, np.ndarray]:
     """Pack plans, in order of steps, into few arrays, which `unpack_plans` reads.
 
     Returns:
-        `plans:steps`; for each layer its points `plans:points/LAYER`, numbers of points
-        of lines `plans:sizes/LAYER`, and of lines of plans `plans:counts/LAYER`.
+        `plans:steps`; and for each layer its points `plans:points/LAYER`, the number of
+        points of each line `plans:sizes/LAYER`, and the number of lines of each plan
+        `plans:counts/LAYER`.
     """
-    arrays: dict[str, np.ndarray] = {
-        "plans:steps": np.array([plan.step for plan in plans], np.int64)
-    }
-    for name in dict.fromkeys(name for plan in plans for name in plan.lines):
+    arrays: dict[str, np.ndarray] = {}
+    arrays["plans:steps"] = np.array([plan.step for plan in plans], np.int64)
+    names = dict.fromkeys(name for plan in plans for name in plan.lines)
+    no_points = np.empty((0, 2), np.float32)
+    for name in names:
         layers = [plan.lines.get(name, ()) for plan in plans]
         lines = [line for layer in layers for line in layer]
-        arrays[f"plans:points/{name}"] = np.concatenate(
-            [np.empty((0, 2), np.float32), *lines]
-        )
-        arrays[f"plans:sizes/{name}"] = np.array(
-            [len(line) for line in lines], np.int64
-        )
-        arrays[f"plans:counts/{name}"] = np.array(
-            [len(layer) for layer in layers], np.int64
-        )
+        arrays[f"plans:points/{name}"] = np.concatenate([no_points, *lines])
+        arrays[f"plans:sizes/{name}"] = _lengths(lines)
+        arrays[f"plans:counts/{name}"] = _lengths(layers)
     return arrays
+
+
+def _lengths(sequences: Iterable[Sized]) -> np.ndarray:
+    return np.array([len(sequence) for sequence in sequences], np.int64)
 
 
 def unpack_plans(arrays: Mapping[str, np.ndarray]) -> list[DrawnPlan]:
     """Return the plans that `pack_plans` packed; names are without `plans:`."""
-    points, sizes, counts = (
-        under(kind, arrays) for kind in ("points/", "sizes/", "counts/")
-    )
-    layers = {
-        name: _cut(_cut(points[name], sizes[name]), counts[name]) for name in points
-    }
-    return [
-        DrawnPlan(
-            step=int(step), lines={name: lines[index] for name, lines in layers.items()}
-        )
-        for index, step in enumerate(arrays["steps"])
-    ]
+    layers = {}
+    for name, points in under("points/", arrays).items():
+        lines = _cut(points, arrays[f"sizes/{name}"])
+        layers[name] = _cut(lines, arrays[f"counts/{name}"])
+    plans = []
+    for index, step in enumerate(arrays["steps"]):
+        lines_by_layer = {name: lines[index] for name, lines in layers.items()}
+        plans.append(DrawnPlan(step=int(step), lines=lines_by_layer))
+    return plans
 
 
 def _cut(values: Any, sizes: np.ndarray) -> list[Any]:
     """Split a sequence into consecutive parts of given sizes."""
     ends = sizes.cumsum()
-    return [values[end - size : end] for end, size in zip(ends, sizes, strict=True)]
+    starts = ends - sizes
+    return [values[start:end] for start, end in zip(starts, ends, strict=True)]
 
 
 def pack_known(known_maps: Sequence[KnownMap]) -> dict[str, np.ndarray]:
@@ -174,35 +178,27 @@ def pack_known(known_maps: Sequence[KnownMap]) -> dict[str, np.ndarray]:
     most cells do not change.
 
     Returns:
-        `known:steps`; `known:NAME` for each field of λ, uint8, and for each mask, bits;
-        the outlines' points `known:outline`, and their numbers `known:sizes`. Empty
-        without maps.
+        `known:steps`; `known:NAME` for each field of λ (uint8) and each mask (bits);
+        the outlines' points `known:outline`, and the number of points of each outline
+        `known:sizes`. Empty if there are no maps.
     """
     if not known_maps:
         return {}
-    arrays: dict[str, np.ndarray] = {
-        "known:steps": np.array([known_map.step for known_map in known_maps], np.int64)
-    }
+    arrays: dict[str, np.ndarray] = {}
+    arrays["known:steps"] = np.array([item.step for item in known_maps], np.int64)
     for name in NUMBERS:
-        levels = (
-            np.stack([getattr(known_map, name) for known_map in known_maps])
-            .astype(np.float32)
-            .clip(0, 1)
-            * _LEVELS
-        )
+        numbers = np.stack([getattr(item, name) for item in known_maps])
+        levels = numbers.astype(np.float32).clip(0, 1) * _LEVELS
+        bytes_ = levels.round().astype(np.uint8)
         # Differences modulo 256 are inverted by sums.
-        arrays[f"known:{name}"] = np.diff(
-            levels.round().astype(np.uint8), axis=0, prepend=np.uint8(0)
-        )
+        arrays[f"known:{name}"] = np.diff(bytes_, axis=0, prepend=np.uint8(0))
     for name in _MASKS:
-        masks = np.stack([getattr(known_map, name) for known_map in known_maps])
+        masks = np.stack([getattr(item, name) for item in known_maps])
         changed = np.diff(masks, axis=0, prepend=False)
         arrays[f"known:{name}"] = np.packbits(changed, axis=-1)
-    outlines = [known_map.outline for known_map in known_maps]
+    outlines = [item.outline for item in known_maps]
     arrays["known:outline"] = np.concatenate(outlines).astype(np.float32)
-    arrays["known:sizes"] = np.array(
-        [len(known_map) for known_map in outlines], np.int64
-    )
+    arrays["known:sizes"] = _lengths(outlines)
     return arrays
 
 
@@ -211,20 +207,14 @@ def unpack_known(arrays: Mapping[str, np.ndarray]) -> tuple[KnownMap, ...]:
     values = dict(arrays)
     width = values[NUMBERS[0]].shape[-1]
     for name in NUMBERS:
-        values[name] = (
-            values[name].cumsum(axis=0, dtype=np.uint8).astype(np.float32) / _LEVELS
-        )
+        levels = values[name].cumsum(axis=0, dtype=np.uint8)
+        values[name] = levels.astype(np.float32) / _LEVELS
     for name in _MASKS:
         changed = np.unpackbits(values[name], axis=-1, count=width)
         values[name] = np.logical_xor.accumulate(changed.astype(bool), axis=0)
     outlines = _cut(values["outline"], values["sizes"])
-    return tuple(
-        KnownMap(
-            step=int(step),
-            outline=lines,
-            **{name: values[name][index] for name in (*NUMBERS, *_MASKS)},
-        )
-        for index, (step, lines) in enumerate(
-            zip(values["steps"], outlines, strict=True)
-        )
-    )
+    known_maps = []
+    for index, (step, lines) in enumerate(zip(values["steps"], outlines, strict=True)):
+        maps = {name: values[name][index] for name in (*NUMBERS, *_MASKS)}
+        known_maps.append(KnownMap(step=int(step), outline=lines, **maps))
+    return tuple(known_maps)

@@ -45,11 +45,11 @@ class Ground:
     Args:
         about: identity: labels of a condition, including `seed`, `realisation` and
             `map`.
-        resolution_m: edge length of a cell.
-        rgb: uint8, shape [3, H, W].
+        resolution_m: edge length of a cell in metres.
+        rgb: colour image, uint8, shape [3, H, W].
         field: λ of all cells in the episode, shape [H, W]; None if λ was resampled.
         immobilising: cells of the field that immobilise a robot, bool, shape [H, W].
-        goal_m: (x, y).
+        goal_m: position of the goal (x, y) in metres, shape [2].
     """
 
     about: Mapping[str, Any]
@@ -68,16 +68,17 @@ class Ground:
         return Grid(height, width, self.resolution_m)
 
     def save(self, path: Path) -> None:
-        """Write an `.npz` file atomically: arrays by name, all else as JSON."""
-        stored = self._stored()
-        arrays: dict[str, Any] = {
-            name: v for name, v in stored.items() if isinstance(v, np.ndarray)
-        }
-        rest = json.dumps(
-            {name: value for name, value in stored.items() if name not in arrays}
-        )
+        """Write an `.npz` file atomically: arrays by name, other values as JSON."""
+        arrays: dict[str, Any] = {}
+        scalars = {}
+        for name, value in self._stored().items():
+            if isinstance(value, np.ndarray):
+                arrays[name] = value
+            else:
+                scalars[name] = value
+        text = np.array(json.dumps(scalars))
         with replacing(path) as partial, open(partial, "wb") as file:
-            np.savez_compressed(file, scalars=np.array(rest), **arrays)
+            np.savez_compressed(file, scalars=text, **arrays)
 
     @classmethod
     def load(cls, path: Path) -> Self:
@@ -87,8 +88,9 @@ class Ground:
             ConfigError: If the file is damaged.
         """
         with damaged(path, cls._REMEDY), np.load(path, allow_pickle=False) as stored:
-            values = dict(stored)
-            return cls._read(json.loads(str(values.pop("scalars"))) | values)
+            arrays = dict(stored)
+            scalars = json.loads(str(arrays.pop("scalars")))
+            return cls._read(scalars | arrays)
 
     def _stored(self) -> dict[str, Any]:
         return {item.name: getattr(self, item.name) for item in fields(self)}
@@ -105,18 +107,18 @@ class Recording(Ground):
     `about` also contains `condition` and `outcome`, all as text.
 
     Args:
-        elevation_m: shape [H, W].
+        elevation_m: elevation in metres, shape [H, W].
         true_mean: E[λ] of the truth, shape [H, W].
         soft: terrain with soft spots that no image shows, bool, shape [H, W].
         predicted: λ̂, the planner's map at the start, shape [H, W].
-        free: S_free of that map, bool, shape [H, W].
+        free: free mask S_free of that map, bool, shape [H, W].
         free_by: map that determines free cells, `risk` or `mean`.
         free_above: threshold that the map must exceed in free cells.
-        dt_s: time step.
-        time_budget_s: T.
+        dt_s: time step in seconds.
+        time_budget_s: time budget T in seconds.
         action_names: name and unit of each action, length A.
-        states: robot states beginning with (x, y, θ), shape [N + 1, S].
-        actions: shape [N, A].
+        states: robot states, each beginning with (x, y, θ), shape [N + 1, S].
+        actions: commanded actions, shape [N, A].
         traversability: observed λ, shape [N].
         plans: plans in order of steps, up to the episode's end.
         layers: optional fields of the map, by name, each of shape [H, W].
@@ -185,27 +187,27 @@ class Recording(Ground):
 
     @property
     def plan(self) -> DrawnPlan:
-        """The plan that figures show: at `MOMENT_S`, or half of a short episode."""
+        """The plan that figures show: at `MOMENT_S`, or at half of a short episode."""
         return self.plan_at(min(MOMENT_S, self.end_s / 2))
 
     @property
     def now(self) -> int:
-        """The step that figures show: that of the plan, or the last without a plan."""
+        """The step that figures show: that of `plan`, or the last if there is no plan."""
         last = len(self.traversability)
         return min(self.plan.step, last) if self.own_plans else last
 
     def plan_at(self, time_s: float) -> DrawnPlan:
-        """Return the last plan drawn by a time; an empty one if no plan was."""
+        """Return the last plan up to a time; an empty plan before the first."""
         due = time_s / self.dt_s + 1e-6
         plans = [plan for plan in self.own_plans if plan.step <= due]
         return plans[-1] if plans else DrawnPlan(step=0, lines={})
 
     def known_at(self, step: int) -> KnownMap | None:
         """Return the knowledge at a step; None if the robot does not learn."""
-        return next(
-            (known_map for known_map in reversed(self.known) if known_map.step <= step),
-            None,
-        )
+        for known_map in reversed(self.known):
+            if known_map.step <= step:
+                return known_map
+        return None
 
     def given_at(self, step: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the planner's λ̂ and S_free at a step, each of shape [H, W]."""
@@ -220,15 +222,15 @@ class Recording(Ground):
         Plans are thinned, except the one that figures show.
         """
         values = super()._stored()
-        shown = self.plan.step
         del values["plans"]
         values |= pack_known(values.pop("known"))
-        values |= {
-            f"layers:{name}": layer for name, layer in values.pop("layers").items()
-        }
-        return values | pack_plans(
-            [plan if plan.step == shown else thinned(plan) for plan in self.own_plans]
-        )
+        for name, layer in values.pop("layers").items():
+            values[f"layers:{name}"] = layer
+        shown = self.plan.step
+        plans = []
+        for plan in self.own_plans:
+            plans.append(plan if plan.step == shown else thinned(plan))
+        return values | pack_plans(plans)
 
     @classmethod
     def _read(cls, values: dict[str, Any]) -> Self:

@@ -34,7 +34,7 @@ def replay(
     """Play back an episode, or several on one map; create missing recordings first.
 
     Several labels of a column, such as --risk mean,cvar:0.9, show their conditions
-    together. A column without a label takes the run's first that fits.
+    together. For a column without a label, the run's first label that fits is taken.
 
     Args:
         labels: Labels of the conditions.
@@ -61,9 +61,8 @@ def replay(
         from benchnav.core.progress import show_progress
         from benchnav.eval.report.playback.video import write_video
 
-        show_progress(
-            write_video(_recordings(run, episodes, out_folder), Path(video)), "frames"
-        )
+        recordings = _recordings(run, episodes, out_folder)
+        show_progress(write_video(recordings, Path(video)), "frames")
         print(f"video:   {video}")
         return 0
     worlds = dict.fromkeys(unit.condition.labels["world"] for unit, _ in episodes)
@@ -80,12 +79,12 @@ def replay(
 
         serve(path)
         return 0
-    shown = (
+    has_display = (
         sys.platform != "linux"
         or "DISPLAY" in os.environ
         or "WAYLAND_DISPLAY" in os.environ
     )
-    if view and shown:
+    if view and has_display:
         command = [sys.executable, "-m", "rerun_cli", str(path)]
         completed = subprocess.run(command, check=False)
         return 1 if completed.returncode else 0
@@ -100,14 +99,12 @@ def replay(
 def program(name: str) -> str:
     """Return the command that starts a program of this environment."""
     path = Path(sys.executable).parent / name
-    if any(
-        Path(folder) == path.parent
-        for folder in os.environ.get("PATH", "").split(os.pathsep)
-    ):
+    search_path = os.environ.get("PATH", "").split(os.pathsep)
+    if path.parent in map(Path, search_path):
         return name
-    return str(
-        path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
-    )
+    if path.is_relative_to(Path.cwd()):
+        path = path.relative_to(Path.cwd())
+    return str(path)
 
 
 def other_folder(run: str, out: str) -> Path:
@@ -121,9 +118,8 @@ def other_folder(run: str, out: str) -> Path:
         ConfigError: If the other folder is another run.
     """
     out_folder = Path(out or run)
-    if (out_folder / "run.json").exists() and out_folder.resolve() != Path(
-        run
-    ).resolve():
+    is_run = (out_folder / "run.json").exists()
+    if is_run and out_folder.resolve() != Path(run).resolve():
         raise ConfigError(
             f"Expected `out` as a folder that holds no other run, got {out}."
         )

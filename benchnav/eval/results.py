@@ -96,7 +96,7 @@ class Results:
     @property
     def notes(self) -> list[str]:
         """Warnings, and combinations that were left out."""
-        return [*self._rows.notes(), *caveats(self._rows.run.about)]
+        return [*self._rows.notes(), *caveats(self._rows.run.manifest)]
 
     @property
     def summary(self) -> pd.DataFrame:
@@ -105,17 +105,18 @@ class Results:
 
     @property
     def hypotheses(self) -> pd.DataFrame:
-        """One row per hypothesis: its claim, the difference with its interval, p, and
-        whether it is supported. Empty if the run has none.
+        """One row per hypothesis: claim, difference with interval, p and verdict.
+
+        Empty if the run has no hypotheses.
         """
         return self._report.tests.copy()
 
     def best(self) -> pd.DataFrame:
-        """Return the conditions that are not significantly worse than the best of a block.
+        """Return the conditions that are not significantly worse than their block's best.
 
-        Conditions are ordered by success rate. The test is the max-T bootstrap test per
-        map; see docs/concepts/statistics.md. If no condition of a block is
-        significantly worse, all its competing conditions are returned.
+        Conditions are ordered by success rate. The test is a max-T bootstrap test over
+        maps; see docs/concepts/statistics.md. If no condition of a block is
+        significantly worse, all competing conditions of the block are returned.
         """
         summary = self._report.summary
         competing = summary[summary["best_alike"].astype(bool)]
@@ -142,24 +143,24 @@ class Results:
         Args:
             by: column in which the conditions of a pair differ, such as "risk"; if
                 empty, the column of `against`, or "risk".
-            against: label that all others are compared with; if empty, all pairs.
-            points: difference of success in percentage points, for which the table
-                counts the maps needed.
+            against: label with which all others are compared; if empty, all pairs are
+                compared.
+            points: difference in success rate in percentage points, for which the table
+                states the required number of maps.
             **labels: labels of the compared conditions, one or several of each column,
                 such as planner="mppi".
 
         Raises:
             ConfigError: If there is nothing to compare, or conditions cannot be paired.
         """
-        selected = {
-            name: [value] if isinstance(value, str) else list(value)
-            for name, value in labels.items()
-        }
-        for name in selected:
+        selected = {}
+        for name, value in labels.items():
             expect(name in LABELS, f"labels among {', '.join(LABELS)}, got {name!r}.")
-        return Comparison(
-            *compare_runs([self.folder], by, against, selected, points / 100)
+            selected[name] = [value] if isinstance(value, str) else list(value)
+        numbers, table = compare_runs(
+            [self.folder], by, against, selected, points / 100
         )
+        return Comparison(numbers, table)
 
     @property
     def plot(self) -> "Plots":
@@ -235,8 +236,8 @@ class Results:
 class Plots:
     """Figures of a run as methods, named as their files with `_` for `-`.
 
-    Calling the object with a figure draws that figure.
-    A figure with several variants, such as `over`, is drawn in all of them, as a list.
+    Calling the object with a figure draws that figure. A figure with several variants,
+    such as `over`, is returned as a list of all variants.
     """
 
     def __init__(self, results: Results) -> None:
@@ -263,10 +264,8 @@ class Plots:
 
     @cached_property
     def _figures(self) -> dict[str, Figure]:
-        return {
-            figure.name.replace("-", "_"): figure
-            for figure in figures_of(self._results._report)
-        }
+        figures = figures_of(self._results._report)
+        return {figure.name.replace("-", "_"): figure for figure in figures}
 
     def __getattr__(self, name: str) -> Any:
         """Return the function that draws a figure."""
@@ -277,11 +276,11 @@ class Plots:
     def _draw(self, name: str) -> Drawing | list[Drawing]:
         """Draw the figure of a name, or all variants of a figure of that name."""
         figures = self._figures
-        matching = [
-            figure
-            for figure_name, figure in figures.items()
-            if name in (figure_name, type(figure).name.replace("-", "_"))
-        ]
+        matching = []
+        for figure_name, figure in figures.items():
+            class_name = type(figure).name.replace("-", "_")
+            if name in (figure_name, class_name):
+                matching.append(figure)
         if not matching:
             raise ConfigError(
                 f"Expected a figure among {', '.join(figures)}, got "

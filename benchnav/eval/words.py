@@ -13,10 +13,8 @@ from benchnav.stats.tables import p_value, short
 from benchnav.viz.style import planner_name, risk_name
 
 # Columns of the summary that count failures of each outcome, and their names in text.
-FAILURE_COUNTS = {
-    f"{outcome.name.lower()}_count": outcome.name.lower().replace("_", " ")
-    for outcome in FAILURES
-}
+_FAILURES = [outcome.name.lower() for outcome in FAILURES]
+FAILURE_COUNTS = {f"{name}_count": name.replace("_", " ") for name in _FAILURES}
 _READ = {"planner": planner_name, "risk": risk_name}
 NOT_YET = "not yet a test"  # of a hypothesis, while its run is not finished
 # Labels that distinguish conditions on one map.
@@ -24,7 +22,7 @@ NAMING = ("planner", "risk", "model", *KNOWLEDGE, "robot", "objective", "world")
 
 
 def differ(labels: Iterable[str]) -> bool:
-    """Return whether labels differ, ignoring those not used."""
+    """Return whether labels differ, apart from labels of unused parts."""
     return len(set(labels) - {NOT_USED}) > 1
 
 
@@ -51,11 +49,13 @@ def naming_labels(summary: pd.DataFrame) -> list[str]:
 
 def blocks(summary: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
     """Return title and rows of each block of a run."""
-    keys = [name for name in BLOCK if name == "scenario" or summary[name].nunique() > 1]
-    return [
-        (", ".join(map(str, key)), rows)
-        for key, rows in summary.groupby(keys, sort=False)
-    ]
+    differing = [name for name in BLOCK if summary[name].nunique() > 1]
+    keys = [name for name in BLOCK if name == "scenario" or name in differing]
+    titled = []
+    for labels, rows in summary.groupby(keys, sort=False):
+        title = ", ".join(map(str, labels))
+        titled.append((title, rows))
+    return titled
 
 
 def condition_name(labels: Mapping[str, Any], several: Collection[str] = ()) -> str:
@@ -66,15 +66,13 @@ def condition_name(labels: Mapping[str, Any], several: Collection[str] = ()) -> 
         several: columns that differ among the conditions shown: `model`, `world`,
             sensors and belief.
     """
-    labels_shown = [
-        labels[name] for name in ("model", *KNOWLEDGE, "world") if name in several
-    ]
-    # A planner given λ has a model but no risk setting; a blind one has neither.
+    columns = [name for name in ("model", *KNOWLEDGE, "world") if name in several]
+    # A planner given λ has a model but no risk setting; a blind planner has neither.
     if labels["risk"] == NOT_USED and "model" not in several:
-        labels_shown.insert(0, labels["model"])
-    return joined(
-        [planner_name(labels["planner"]), *labels_shown, risk_name(labels["risk"])]
-    )
+        columns.insert(0, "model")
+    planner = planner_name(labels["planner"])
+    risk = risk_name(labels["risk"])
+    return joined([planner, *(labels[name] for name in columns), risk])
 
 
 def episode_names(labels: Sequence[Mapping[str, str]]) -> list[str]:
@@ -83,54 +81,57 @@ def episode_names(labels: Sequence[Mapping[str, str]]) -> list[str]:
     Args:
         labels: labels of each episode's condition.
     """
-    several = [
-        name for name in NAMING if differ(row.get(name, NOT_USED) for row in labels)
-    ]
+    several = _differing(labels)
     extra = [name for name in ("robot", "objective") if name in several]
+    names = []
+    for row in labels:
+        further = [row[name] for name in extra]
+        names.append(joined([condition_name(row, several), *further]))
+    return names
+
+
+def _differing(labels: Sequence[Mapping[str, str]]) -> list[str]:
+    """Return the columns of `NAMING` in which conditions differ."""
     return [
-        joined([condition_name(row, several), *(row[name] for name in extra)])
-        for row in labels
+        name for name in NAMING if differ(row.get(name, NOT_USED) for row in labels)
     ]
 
 
 def with_names(summary: pd.DataFrame) -> pd.DataFrame:
     """Return the summary with the `name` of each condition."""
     several = naming_labels(summary)
-    return summary.assign(
-        name=[condition_name(row, several) for row in summary.to_dict("records")]
-    )
+    names = [condition_name(row, several) for row in summary.to_dict("records")]
+    return summary.assign(name=names)
 
 
 def contender_names(labels: Sequence[Mapping[str, str]]) -> list[str]:
-    """Name conditions by the labels that differ; by their planner if none does.
+    """Name conditions by the labels that differ, or by their planner if no label does.
 
     Args:
         labels: labels of each condition.
     """
-    differing = [
-        name for name in NAMING if differ(row.get(name, NOT_USED) for row in labels)
-    ]
+    differing = _differing(labels)
     names = []
     for row in labels:
         shown = {name: reading_name(name, label) for name, label in row.items()}
-        names.append(
-            joined(shown.get(name, NOT_USED) for name in differing) or shown["planner"]
-        )
+        name = joined(shown.get(column, NOT_USED) for column in differing)
+        names.append(name or shown["planner"])
     return names
 
 
 def joined(labels: Iterable[str]) -> str:
-    """Join labels by commas, without those not used."""
+    """Join labels by commas, without labels of unused parts."""
     return ", ".join(label for label in labels if label != NOT_USED)
 
 
 def unit_of_statistics(summary: pd.DataFrame) -> str:
     """Return the statistical unit: "map", or "group" if the dataset has groups."""
-    return "group" if (summary["n_groups"] < summary["n_maps"]).any() else "map"
+    has_groups = summary["n_groups"] < summary["n_maps"]
+    return "group" if has_groups.any() else "map"
 
 
 def maps_in_words(maps: int | str, groups: int | str) -> str:
-    """Return the number of maps in words, and of groups if there are any."""
+    """Return the number of maps in words, and the number of groups if there are any."""
     return f"{maps} maps" if groups == maps else f"{maps} maps in {groups} groups"
 
 
@@ -145,21 +146,21 @@ def failures_in_words(row: Mapping[Any, Any]) -> str:
     Args:
         row: row of the summary.
     """
-    words = (
-        f"{row[column]} {name}"
-        for column, name in FAILURE_COUNTS.items()
-        if row[column]
-    )
+    words = []
+    for column, name in FAILURE_COUNTS.items():
+        if row[column]:
+            words.append(f"{row[column]} {name}")
     return ", ".join(words) or NOT_USED
 
 
 def chosen_in_words(shown: int, total: int) -> str:
-    """Return how the shown conditions were chosen; empty if all are shown."""
-    words = (
+    """Describe the choice of the shown conditions; empty if all are shown."""
+    if shown >= total:
+        return ""
+    return (
         f" Shown are {shown} of {total} conditions, as many successes as failures if "
         "possible."
     )
-    return words if shown < total else ""
 
 
 def outcome_in_words(outcome: str) -> str:
@@ -171,7 +172,8 @@ def p_in_words(p: float) -> str:
     """Return a p-value for text; NaN means that the run is not finished."""
     if np.isnan(p):
         return NOT_YET
-    return f"p {p_value(p)}" if p <= 1e-4 else f"p = {p_value(p)}"
+    sign = "" if p <= 1e-4 else "= "  # `p_value` writes ≤ itself
+    return f"p {sign}{p_value(p)}"
 
 
 def count_range(counts: Collection[int]) -> str:
@@ -190,4 +192,6 @@ def mean_and_std(mean: float, std: float) -> str:
 
 def success_interval_in_words(row: Mapping[Any, Any]) -> str:
     """Return the 95 % interval of a success rate, in per cent."""
-    return f"{100 * row['success_low']:.0f}–{100 * row['success_high']:.0f}"
+    low = 100 * row["success_low"]
+    high = 100 * row["success_high"]
+    return f"{low:.0f}–{high:.0f}"

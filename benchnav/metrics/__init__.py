@@ -1,5 +1,7 @@
-"""Metrics of episodes: each is one column of the episodes' table, with the texts that
-tables, tests and reports show.
+"""Metrics of episodes.
+
+Each metric is one column of the table of episodes, with the texts that tables, tests
+and reports show.
 """
 
 from benchnav.core.public_names import face

@@ -51,19 +51,19 @@ class Episode:
         turn_rate_radps: turn rate that each action gives on terrain of λ = 1, in rad/s,
             shape [N].
         traversability: observed λ of each step, in [0, 1], shape [N].
-        outcome: how it ended, such as `success` or `immobilised`.
+        outcome: name of the outcome, such as `success` or `immobilised`.
         dt_s: time step in seconds.
         time_budget_s: time budget T in seconds.
         reference_time_s: minimum travel time over the grid at 1 m/s, in seconds; NaN if
-            there is none.
+            the dataset lacks it.
         goal_m: position of the goal (x, y) in metres, shape [2].
         goal_radius_m: distance in metres within which a robot has reached the goal.
         stuck_traversability: λ_stuck; a step with λ at or below it counts as stuck.
         robot: transition function F.
-        planning_s: wall time of planning per step, in seconds; that of a batch divided
-            by its episodes, shape [N].
-        preparing_s: wall time of the planner's preparation, in seconds; divided in the
-            same way.
+        planning_s: wall time of planning in each step, in seconds: the time of a batch
+            divided by its number of episodes, shape [N].
+        preparing_s: wall time of the planner's preparation, in seconds: the time of a
+            batch divided by its number of episodes.
         learning: record of learning; None if the robot does not learn.
         rejected_draws: number of λ fields without a feasible path that were rejected
             before the one of this episode.
@@ -128,7 +128,7 @@ class Episode:
 
     @property
     def reference_at_top_speed_s(self) -> float:
-        """Reference time at the robot's top speed, in seconds; NaN if there is none."""
+        """Reference time at the robot's top speed, in seconds; NaN if it is missing."""
         return self.reference_time_s / self.robot.top_speed_mps
 
 
@@ -137,22 +137,22 @@ class MetricError(BenchnavError):
 
 
 class Metric(Specified, ABC):
-    """A number for each episode: one column of the episodes' table.
+    """A number for each episode: one column of the table of episodes.
 
-    The attributes below are class attributes, or properties of an object with options.
+    The attributes below are class attributes, or properties if they depend on options.
     Options are keyword parameters of the constructor.
 
     Attributes:
         name: identifier in suites and commands.
-        column: column in tables of episodes. Wall times begin with `planning_` or
-            `learning_`, so that repeated runs are not compared by them.
+        column: column in tables of episodes. Columns of wall times must begin with
+            `planning_` or `learning_`; comparisons of repeated runs ignore them.
         suffix: unit at the end of the column's name, such as `_s`.
         words: name in sentences; if empty, `name` with spaces.
         unit: unit of differences, margins and tables.
         scale: factor from the column's unit to `unit`.
         heading: heading of its column in the report; if empty, its words and unit.
         meaning: phrase that defines one value.
-        better: `higher`, `lower` or `neither`.
+        better: better direction, `higher`, `lower` or `neither`.
         of_arrivals: whether conditions are compared only over the episodes in which
             both reached the goal.
         min_steps: minimum number of steps; the value of a shorter episode is NaN.
@@ -202,20 +202,21 @@ class Recorded(Metric):
     min_steps = 0
 
     def compute(self, episode: Episode) -> float:
-        """Return the number."""
+        """Return the value of the attribute."""
         value: float = getattr(episode, self.column)
         return value
 
 
 def measure(metric: Metric, episode: Episode) -> float:
-    """Compute a metric that a user may have written.
+    """Compute a metric that a user may have written, and check its value.
 
     Args:
-        metric: metric.
+        metric: metric, shipped or custom.
         episode: finished episode.
 
     Returns:
-        A finite number or NaN.
+        A finite number, or NaN if the episode has fewer than `metric.min_steps` steps
+        or the metric returns NaN.
 
     Raises:
         MetricError: If the metric raises, or returns an invalid value.

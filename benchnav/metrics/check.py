@@ -14,11 +14,7 @@ _STEPS = 12
 
 
 def attribute_faults(metric: Metric) -> list[str]:
-    """Return one message for each invalid attribute of a metric.
-
-    Args:
-        metric: metric.
-    """
+    """Return one message for each invalid attribute of a metric."""
     faults = []
 
     def expect(is_valid: bool, name: str, expectation: str) -> None:

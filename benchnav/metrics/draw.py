@@ -1,4 +1,4 @@
-"""Metrics of the λ field: rejected draws, and a lower bound of the time to the goal."""
+"""Metrics of the λ field: rejected draws, and the lower bound of the time to the goal."""
 
 from benchnav.metrics.base import Recorded
 

@@ -9,11 +9,11 @@ from benchnav.metrics.base import Episode, Metric
 class Energy(Metric):
     """Energy E = ∫ P/λ dt that the drive draws along the path.
 
-    Wheels that turn at the commanded speed u and push with a force F draw F·u. The
-    robot moves at v = λ·u, since slip is 1 − λ. So P = F·v = λ·F·u moves the robot and
-    slip dissipates the remainder: a drive with constant P draws P/λ. Its power is
-    limited: λ counts as at least `min_traversability`, so that the maximum power is
-    P/`min_traversability`. Steps whose action commands no motion draw nothing.
+    Wheels that turn at the commanded speed u and push with a force F draw the power
+    F·u. The robot moves at v = λ·u, since slip is 1 − λ. The power P = F·v = λ·F·u
+    moves the robot, and slip dissipates the remainder. A drive with constant P thus
+    draws P/λ. Its power is limited to P/`min_traversability`: lower λ count as
+    `min_traversability`. Steps whose action commands no motion draw no power.
 
     Args:
         power_w: P, the constant power that moves the robot over terrain, in watts.
@@ -32,7 +32,7 @@ class Energy(Metric):
     of_arrivals = True
 
     def __init__(self, power_w: float = 100.0, min_traversability: float = 0.1) -> None:
-        """Validates the options."""
+        """Validate the options."""
         expect(
             0 < power_w < np.inf,
             f"`power_w` of metric 'energy' above 0 and finite, got {power_w}.",

@@ -48,12 +48,12 @@ class SensedCells(_LearningMetric):
 
 
 class _Ahead(_LearningMetric):
-    """Mean of a column of `ahead` over the updates of an episode."""
+    """Mean of one column of `LearningRecord.ahead` over the updates of an episode."""
 
     index: int
 
     def of(self, record: LearningRecord) -> float:
-        """Return the mean; NaN if nothing was updated."""
+        """Return the mean; NaN without an update."""
         updates = record.ahead[~np.isnan(record.ahead[:, 0])]
         if not len(updates):
             return math.nan

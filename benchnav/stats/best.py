@@ -4,10 +4,10 @@ One max-T test covers all pairs of a block's conditions. It resamples maps with
 replacement for all pairs jointly, which retains the correlation between conditions.
 Each pair's difference is divided by its standard error in the sample (bootstrap-t).
 
-Four pseudo-maps are added to the maps: on two only the first condition of a pair
-succeeds, on two only the second. Without them the variance of a condition that fails
-only on rare maps is underestimated in samples that lack those maps. Unlike a sign-flip
-test, the test does not assume that differences are symmetric.
+Four pseudo-maps are added to the maps: on two of them only the first condition of a
+pair succeeds, on the other two only the second. Without them, the variance of a
+condition that fails only on rare maps is underestimated in samples that lack those
+maps. Unlike a sign-flip test, this test does not assume that differences are symmetric.
 
 The test is stepwise, as in the model confidence set: it removes the condition with the
 largest deficit and compares the remaining ones again. The probability that any
@@ -35,12 +35,12 @@ from benchnav.stats.power import POWER
 # 0.05 either.
 FEWEST_MAPS = 6
 
-# Pseudo-maps on which the first condition of a pair wins; the same number on which it
-# loses.
+# Number of pseudo-maps on which the first condition of a pair wins, and number of those
+# on which it loses.
 _ADDED = 2
 _WON = slice(_ADDED)
 _LOST = slice(_ADDED, None)
-# Samples times conditions per chunk, which fit in a processor's cache.
+# Number of samples times conditions per chunk, so that a chunk fits in the CPU's cache.
 _CHUNK = 150_000
 # Relative tolerance of a statistic in float32 within which two are equal.
 _ROUNDING = 1e-5
@@ -56,18 +56,20 @@ def best_set_p(
         draws: episodes of a condition on each map, one number or of shape [M].
 
     Returns:
-        Two float64 arrays by condition, each of shape [K]. First p, corrected for the
-        number of conditions: 1 for the best, and for all with fewer than `FEWEST_MAPS`
-        maps. Second the minimum detectable difference to the condition with the most
-        successes, with 80 % power at the level of the first step; infinite where no
-        result would be significant.
+        Two float64 arrays by condition, each of shape [K]. The first is p, corrected
+        for the number of conditions; it is 1 for the best, and for all conditions with
+        fewer than `FEWEST_MAPS` maps. The second is the minimum detectable difference
+        to the condition with the most successes, with 80 % power at the level of the
+        first step; infinite if no result would be significant.
     """
     n_maps, n_conditions = wins.shape
     if n_maps < FEWEST_MAPS or n_conditions < 2:
         return np.ones(n_conditions), np.full(n_conditions, np.inf)
     order = np.argsort(-wins.sum(0), kind="stable")
-    values, size = _canonical(wins[:, order], np.broadcast_to(draws, n_maps))
-    observed = _Samples(values.astype(float), size.astype(float), np.ones((1, n_maps)))
+    episodes = np.broadcast_to(draws, n_maps)
+    values, size = _canonical(wins[:, order], episodes)
+    once = np.ones((1, n_maps))  # each map once
+    observed = _Samples(values.astype(float), size.astype(float), once)
     # Sums of whole numbers below 2²⁴ are exact in float32, in any order.
     is_exact = n_maps * int(size.max()) ** 2 < 2**24
     dtype = np.float32 if is_exact else np.float64
@@ -85,15 +87,17 @@ def best_set_p(
             (centre,) = observed.centre(first, others)
             t = samples.t_of(first, others, centre.astype(dtype))
             max_t = np.maximum(max_t, np.abs(t).max(1))
-            exceeding[first] += (max_t >= statistics[step] * (1 - _ROUNDING)).sum()
+            threshold = statistics[step] * (1 - _ROUNDING)
+            exceeding[first] += (max_t >= threshold).sum()
         max_statistics.append(max_t)
     p = (1 + exceeding) / (1 + len(counts))
-    p[removed] = [*np.maximum.accumulate(p[removed[:-1]]), 1.0]
+    stepwise_p = np.maximum.accumulate(p[removed[:-1]])
+    p[removed] = [*stepwise_p, 1.0]
     detectable = np.full(n_conditions, np.inf)
     critical = np.quantile(np.concatenate(max_statistics), 1 - ALPHA)
     # The largest possible difference: one condition always succeeds, the other never.
     extreme = np.stack([size, 0 * size], axis=1).astype(float)
-    largest = _Samples(extreme, size.astype(float), np.ones((1, n_maps)))
+    largest = _Samples(extreme, size.astype(float), once)
     if largest.t_of(0, np.array([1]), 0.0).item() > critical:
         (error,) = observed.error(0, np.arange(1, n_conditions))
         detectable[1:] = (critical + norm.ppf(POWER)) * error
@@ -106,9 +110,9 @@ def _removal_order(
 ) -> tuple[list[int], list[float]]:
     """Return conditions in order of removal, and their statistics except for the last.
 
-    A condition's statistic is the largest t of a remaining condition over it.
+    A condition's statistic is the largest t of a remaining condition against it.
     """
-    # t of the row's condition over the column's.
+    # t of the row's condition against the column's condition.
     t_over = np.full((n_conditions, n_conditions), -np.inf)
     for first in range(n_conditions - 1):
         others = np.arange(first + 1, n_conditions)
@@ -132,7 +136,8 @@ def _removal_order(
 def _canonical(wins: np.ndarray, episodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return wins and episodes by map in sorted order; repeated episodes count once."""
     table = np.column_stack([wins, episodes]).astype(np.int64)
-    table //= max(np.gcd.reduce(table, axis=None), 1)
+    divisor = max(np.gcd.reduce(table, axis=None), 1)
+    table //= divisor
     table = table[np.lexsort(table.T)]
     return table[:, :-1], table[:, -1]
 
@@ -146,8 +151,8 @@ class _Samples:
     Args:
         values: successes by map and condition, shape [M, K].
         size: episodes by map, shape [M].
-        counts: frequencies of maps in each sample, followed by those of pseudo-maps if
-            these are drawn too, shape [R, M] or [R, M + 2 · `_ADDED`].
+        counts: frequencies of maps in each sample, followed by frequencies of
+            pseudo-maps if these are also drawn, shape [R, M] or [R, M + 2 · `_ADDED`].
     """
 
     def __init__(
@@ -158,23 +163,23 @@ class _Samples:
         added_counts = counts[:, n_maps:]
         won = added_counts[:, _WON].sum(1, keepdims=True)
         lost = added_counts[:, _LOST].sum(1, keepdims=True)
+        drawn = won + lost
+        added_square = added_size**2
+        column = size[:, None]
         self.values = values
         self.counts = np.ascontiguousarray(counts[:, :n_maps])
         self.sums = self.counts @ values
         self.added_sums = (won - lost) * added_size
-        self.products = self.counts @ (values * size[:, None])
+        self.products = self.counts @ (values * column)
         self.added_products = self.added_sums * added_size
-        self.size = self.counts @ size[:, None] + (won + lost) * added_size
+        self.size = self.counts @ column + drawn * added_size
         self.size_with_added = self.size + 2 * _ADDED * added_size
-        self.squares = (
-            self.counts @ size[:, None] ** 2
-            + (won + lost) * added_size**2
-            + 2 * _ADDED * added_size**2
-        )
-        self.added_squares = (won + lost + 2 * _ADDED) * added_size**2
+        squares = self.counts @ column**2 + drawn * added_square
+        self.squares = squares + 2 * _ADDED * added_square
+        self.added_squares = (drawn + 2 * _ADDED) * added_square
 
     def centre(self, first: int, others: np.ndarray) -> np.ndarray:
-        """Return differences of rates, with pseudo-maps, shape [R, J].
+        """Return differences of rates, pseudo-maps included, shape [R, J].
 
         Args:
             first: index of the first condition.
@@ -185,7 +190,8 @@ class _Samples:
 
     def error(self, first: int, others: np.ndarray) -> np.ndarray:
         """Return standard errors of the differences in `centre`, shape [R, J]."""
-        squares = self._squared_errors(first, others, self.centre(first, others))
+        centre = self.centre(first, others)
+        squares = self._squared_errors(first, others, centre)
         return np.sqrt(squares) / self.size_with_added
 
     def t_of(
@@ -194,7 +200,8 @@ class _Samples:
         """Return (difference − centre) / standard error, shape [R, J]."""
         # In place, since this dominates the time with many conditions.
         t = self._difference(self.sums, first, others, self.added_sums)
-        errors = self._squared_errors(first, others, t / self.size_with_added)
+        observed_centre = t / self.size_with_added
+        errors = self._squared_errors(first, others, observed_centre)
         np.sqrt(errors, out=errors)
         t *= self.size_with_added / self.size
         t -= centre * self.size_with_added

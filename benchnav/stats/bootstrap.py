@@ -1,6 +1,6 @@
 """Bootstrap samples of maps, for intervals and the best set.
 
-The seed is fixed, so that the same values give the same interval.
+The seed is fixed, so that identical values have identical intervals.
 Source: Efron and Tibshirani (1993), "An Introduction to the Bootstrap", 13.3.
 """
 
@@ -18,10 +18,11 @@ def bootstrap_counts(maps: int, added: int = 0) -> np.ndarray:
 
     Args:
         maps: number of maps M.
-        added: number of pseudo-maps that samples are also drawn from.
+        added: number of pseudo-maps from which samples are also drawn.
 
     Returns:
-        Whole numbers, each row of sum M, float64, read-only, shape [2000, M + added].
+        Whole numbers that sum to M in each row, float64, read-only, shape
+        [2000, M + added].
     """
     population = maps + added
     probabilities = np.full(population, 1 / population)

@@ -2,8 +2,9 @@
 
 All functions take `rows`, a table with one row per episode that both conditions have in
 common. The columns `success`, `total_time_s`, `time_budget_s`, … belong to the first
-condition, those that end in `_other` to the second. `group` is the statistical unit, a
-map or a group of maps. Differences are the first condition minus the second.
+condition, and the columns that end in `_other` to the second. The column `group` is the
+statistical unit, a map or a group of maps. Differences are the first condition minus
+the second.
 Letters in shapes: M maps.
 """
 
@@ -23,18 +24,22 @@ Interval = tuple[float, float, float]
 
 def gain_by_map(rows: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
     """Return differences of success counts, and numbers of episodes, each shape [M]."""
-    gain = rows["success"].astype(int) - rows["success_other"].astype(int)
+    first = rows["success"].astype(int)
+    second = rows["success_other"].astype(int)
+    gain = first - second
     by_unit = gain.groupby(rows["group"].to_numpy())
-    return by_unit.sum().to_numpy(), by_unit.size().to_numpy()
+    gains = by_unit.sum().to_numpy()
+    n_episodes = by_unit.size().to_numpy()
+    return gains, n_episodes
 
 
 def mean_differences(rows: pd.DataFrame, column: str = "total_time_s") -> np.ndarray:
-    """Return `by_map` of the difference of a column, shape [M]."""
+    """Return `by_map` of the difference in a column, shape [M]."""
     return by_map(*_differences(rows, column))
 
 
 def summed_differences(rows: pd.DataFrame, column: str = "total_time_s") -> np.ndarray:
-    """Return `sums_by_map` of the difference of a column, for sign and rank tests.
+    """Return `sums_by_map` of the difference in a column, for sign and rank tests.
 
     The result has shape [M].
     """
@@ -46,17 +51,19 @@ def _differences(
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Return differences by episode, their maps, and the largest magnitude of values."""
     paired = rows[[column, f"{column}_other"]].to_numpy(dtype=float)
+    differences = paired[:, 0] - paired[:, 1]
+    maps = rows["group"].to_numpy()
     scale = float(np.abs(paired).max(initial=0))
-    return paired[:, 0] - paired[:, 1], rows["group"].to_numpy(), scale
+    return differences, maps, scale
 
 
 def interval_of(rows: pd.DataFrame, column: str, confidence: float = 0.95) -> Interval:
-    """Return the mean difference of a column with its interval.
+    """Return the mean difference in a column with its interval.
 
     Args:
-        rows: see the module.
-        column: `success` uses `success_interval`, `total_time_s` uses
-            `time_difference`, others Student's interval.
+        rows: paired episodes; see the module.
+        column: column to compare. `success` has the interval of `success_interval`,
+            `total_time_s` that of `time_difference`, any other Student's interval.
         confidence: nominal coverage.
 
     Returns:
@@ -68,11 +75,13 @@ def interval_of(rows: pd.DataFrame, column: str, confidence: float = 0.95) -> In
     if column == "success":
         gain, draws = gain_by_map(rows)
         if len(gain) < 2:
-            return float(gain.sum() / max(len(rows), 1)), np.nan, np.nan
-        ends = success_interval(gain, draws, confidence)
+            difference = float(gain.sum() / max(len(rows), 1))
+            return difference, np.nan, np.nan
+        interval = success_interval(gain, draws, confidence)
     else:
-        ends = mean_interval(mean_differences(rows, column), confidence)
-    difference, low, high = map(float, ends)
+        differences = mean_differences(rows, column)
+        interval = mean_interval(differences, confidence)
+    difference, low, high = map(float, interval)
     return difference, low, high
 
 
@@ -80,20 +89,21 @@ def difference_p(rows: pd.DataFrame, column: str, direction: str = "") -> float:
     """Return the p-value of a sign-flip test over maps; 1 if there is no episode.
 
     Args:
-        rows: see the module.
+        rows: paired episodes; see the module.
         column: column to compare; the test of `success` is exact.
         direction: `higher` or `lower` for a one-sided test; two-sided if empty.
     """
     if column == "success":
-        return sign_flip_p(gain_by_map(rows)[0].astype(int), direction)
+        gain, _ = gain_by_map(rows)
+        return sign_flip_p(gain.astype(int), direction)
     return mean_flip_p(summed_differences(rows, column), direction)
 
 
 def time_difference(rows: pd.DataFrame, confidence: float = 0.95) -> Interval:
-    """Return the difference of T_total, with the interval of `total_time_interval`.
+    """Return the difference in T_total, with the interval of `total_time_interval`.
 
     Args:
-        rows: see the module.
+        rows: paired episodes; see the module.
         confidence: nominal coverage.
 
     Returns:
@@ -110,15 +120,17 @@ def time_difference(rows: pd.DataFrame, confidence: float = 0.95) -> Interval:
     times_s = pd.concat(success_s)
     # Without any success, a failure costs at most the whole T.
     mean_time_s = times_s.mean() if len(times_s) else 0.0
+    mean_budget_s = pd.concat(budget_s).mean()
     gain, draws = gain_by_map(rows)
     _, low, high = success_interval(gain, draws, confidence)
     failed = rows["success_other"].astype(float) - rows["success"]
+    common_maps = set.intersection(*maps_of_success)
     mean, low_s, high_s = total_time_interval(
         mean_differences(rows),
         by_map(failed.to_numpy(), rows["group"].to_numpy()),
         (-high, -low),
-        pd.concat(budget_s).mean() - mean_time_s,
-        len(set.intersection(*maps_of_success)),
+        mean_budget_s - mean_time_s,
+        len(common_maps),
         confidence,
     )
     return float(mean), float(low_s), float(high_s)
@@ -137,8 +149,10 @@ def in_budgets(rows: pd.DataFrame) -> pd.DataFrame:
     """Return the rows with times as fractions of each condition's T."""
     fractions: dict[str, pd.Series | float] = {}
     for suffix in ("", "_other"):
-        fraction = rows[f"total_time_s{suffix}"] / rows[f"time_budget_s{suffix}"]
-        # T of an episode that began at its goal is NaN; it took no time.
-        fractions[f"total_time_s{suffix}"] = fraction.fillna(0)
-        fractions[f"time_budget_s{suffix}"] = 1.0
+        time_column = f"total_time_s{suffix}"
+        budget_column = f"time_budget_s{suffix}"
+        fraction = rows[time_column] / rows[budget_column]
+        # T of an episode that began at its goal is NaN; the episode took no time.
+        fractions[time_column] = fraction.fillna(0)
+        fractions[budget_column] = 1.0
     return rows.assign(**fractions)

@@ -1,9 +1,9 @@
 """Randomisation tests of paired differences, by sign flips or exchanges on each map.
 
-Under H₀ the two contestants are exchangeable on each map. Up to 13 maps, all
-assignments are counted; beyond, 9 999 random ones with a fixed seed. Maps are sorted by
-their values first, so that p depends neither on the order of maps nor on that of the
-contestants. Maps without a difference do not count.
+Under H₀ the two contestants are exchangeable on each map. With up to 13 maps, all
+assignments are counted; with more, 9 999 random ones with a fixed seed. Maps are first
+sorted by their values, so that p depends neither on the order of maps nor on the order
+of the contestants. Maps without a difference do not count.
 Sources: Fisher (1935), "The Design of Experiments", 21; Phipson and Smyth (2010),
 "Permutation p-values should never be zero", for counting the observed assignment.
 Letters in shapes: M maps; P parts of a difference; R assignments.
@@ -17,9 +17,10 @@ from scipy.stats import binom, rankdata, wilcoxon
 
 # Largest number of maps with an exact test.
 _EXACT = 13
-# Random assignments with more maps.
+# Number of random assignments if there are more maps.
 _DRAWN = 9_999
-# Relative to the largest difference: assignments that tie with the observed one count.
+# Tolerance relative to the largest difference, within which an assignment ties with the
+# observed one and is counted.
 _ROUNDING = 1e-9
 
 
@@ -27,7 +28,8 @@ _ROUNDING = 1e-9
 def _signs(maps: int) -> np.ndarray:
     """Return signs ±1 of all assignments, or of random ones for many maps, [R, M]."""
     if maps <= _EXACT:
-        bits = np.arange(2**maps)[:, None] >> np.arange(maps) & 1
+        assignments = np.arange(2**maps)[:, None]
+        bits = assignments >> np.arange(maps) & 1
     else:
         generator = np.random.default_rng(0)
         bits = generator.integers(0, 2, (_DRAWN, maps), dtype=np.int8)
@@ -49,14 +51,15 @@ def exchange_p(
         second: parts of the second contestant by map, shape [M, P].
         difference: antisymmetric function of two sums of parts, each of shape [..., P];
             returns shape [...].
-        direction: alternative for the first contestant, `higher` or `lower`; if empty,
-            two-sided.
+        direction: alternative for the first contestant, `higher` or `lower`; two-sided
+            if empty.
     """
     gap = first - second
     total = (first + second).sum(0)
     gap = gap[gap.any(1)]
-    leading = (gap != 0).argmax(1)
-    oriented = gap * np.sign(gap[np.arange(len(gap)), leading])[:, None]
+    leading_part = (gap != 0).argmax(1)
+    leading_gap = gap[np.arange(len(gap)), leading_part]
+    oriented = gap * np.sign(leading_gap)[:, None]
     descending = np.lexsort(oriented.T[::-1])[::-1]
     gaps = _signs(len(gap)) @ oriented[descending]
     differences = difference(_half(total, gaps), _half(total, -gaps))
@@ -79,18 +82,24 @@ def _half(total: np.ndarray, gap: np.ndarray) -> np.ndarray:
     A function such as a root would amplify them.
     """
     half = (total + gap) / 2
-    return np.where(np.abs(half) < 1e-12 * np.abs(total), 0, half)
+    tolerance = 1e-12 * np.abs(total)
+    return np.where(np.abs(half) < tolerance, 0, half)
 
 
 def mean_flip_p(differences: np.ndarray, direction: str = "") -> float:
-    """Return the p-value of a mean difference of 0.
+    """Return the p-value of the hypothesis that the mean difference is 0.
 
     Args:
-        differences: by map, with exact ties (see `by_map.alike`), shape [M].
+        differences: difference on each map, with exact ties (see `by_map.alike`), shape
+            [M].
         direction: `higher` or `lower` for a one-sided test; two-sided if empty.
     """
+
+    def difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return (a - b)[..., 0]
+
     column = differences[:, None]
-    return exchange_p(column, 0 * column, lambda a, b: (a - b)[..., 0], direction)
+    return exchange_p(column, 0 * column, difference, direction)
 
 
 def sign_flip_p(gain: np.ndarray, direction: str = "") -> float:
@@ -98,19 +107,22 @@ def sign_flip_p(gain: np.ndarray, direction: str = "") -> float:
 
     Among n maps with the same absolute gain, the number with a positive sign is
     binomial. The distribution of the sum is thus a convolution of one binomial per
-    absolute gain. With one episode per map it is the exact McNemar test.
+    absolute gain. With one episode per map, the test is the exact McNemar test.
 
     Args:
-        gain: count of the first minus that of the second by map, such as successes,
-            whole numbers, shape [M].
+        gain: count of the first condition minus count of the second on each map, such
+            as numbers of successes; whole numbers, shape [M].
         direction: `higher` or `lower` for a one-sided test; two-sided if empty.
     """
-    gain = gain // max(np.gcd.reduce(gain), 1)  # repeated episodes count once
-    sizes, counts = np.unique(np.abs(gain[gain != 0]), return_counts=True)
+    divisor = max(np.gcd.reduce(gain), 1)
+    gain = gain // divisor  # repeated episodes count once
+    nonzero_gain = np.abs(gain[gain != 0])
+    sizes, counts = np.unique(nonzero_gain, return_counts=True)
     probabilities = np.ones(1)
     for size, count in zip(sizes, counts, strict=True):
+        n_positive = np.arange(count + 1)
         spread = np.zeros(2 * size * count + 1)
-        spread[:: 2 * size] = binom.pmf(np.arange(count + 1), count, 0.5)
+        spread[:: 2 * size] = binom.pmf(n_positive, count, 0.5)
         probabilities = np.convolve(probabilities, spread)
     total = np.abs(gain).sum()
     sums = np.arange(-total, total + 1)
@@ -121,22 +133,26 @@ def sign_flip_p(gain: np.ndarray, direction: str = "") -> float:
         is_extreme = sums <= observed
     else:
         is_extreme = np.abs(sums) >= abs(observed)
-    return min(float(probabilities[is_extreme].sum()), 1.0)
+    p = float(probabilities[is_extreme].sum())
+    return min(p, 1.0)
 
 
 def signed_rank_p(differences: np.ndarray) -> float:
     """Return the two-sided p-value of Wilcoxon's signed-rank test; 1 if no map differs.
 
     If at most 13 maps differ, the test is exact even with ties: all sign assignments of
-    the ranks are counted. SciPy returns the same p, but calls a function for each
-    assignment.
+    the ranks are counted. SciPy returns the same p, but is slower, since it calls a
+    function for each assignment.
 
     Args:
-        differences: by map, with exact ties as from `by_map.sums_by_map`, shape [M].
+        differences: difference on each map, with exact ties as from
+            `by_map.sums_by_map`, shape [M].
     """
     differing = differences[differences != 0]
     if len(differing) > _EXACT:
         return float(wilcoxon(differing).pvalue)
+    ranks = rankdata(np.abs(differing))
     # Ranks of ties are multiples of 1/2.
-    twice_ranks = np.rint(2 * rankdata(np.abs(differing))) * np.sign(differing)
-    return sign_flip_p(twice_ranks.astype(np.int64))
+    twice_ranks = np.rint(2 * ranks)
+    signed_ranks = twice_ranks * np.sign(differing)
+    return sign_flip_p(signed_ranks.astype(np.int64))

@@ -20,5 +20,7 @@ def holm(p: np.ndarray) -> np.ndarray:
     """
     order = np.argsort(p)
     factors = np.arange(len(p), 0, -1)
-    corrected = np.maximum.accumulate(p[order] * factors).clip(max=1)
-    return corrected[np.argsort(order)]
+    scaled = p[order] * factors
+    corrected = np.maximum.accumulate(scaled).clip(max=1)
+    original_order = np.argsort(order)
+    return corrected[original_order]

@@ -18,29 +18,32 @@ def wilson_interval(rate: float, n: float) -> tuple[float, float]:
 
     Args:
         rate: fraction of successes, in [0, 1].
-        n: number of independent trials, > 0; an effective number need not be whole.
+        n: number of independent Bernoulli trials, > 0; an effective number need not be
+            whole.
 
     Returns:
         Lower and upper end, in [0, 1].
     """
-    low, high = proportion_confint(rate * n, n, method="wilson")
+    successes = rate * n
+    low, high = proportion_confint(successes, n, method="wilson")
     return float(low), float(high)
 
 
 def design_effect(success: np.ndarray, maps: np.ndarray) -> float:
     """Return the design effect of success: episodes per effective episode.
 
-    It is N / n with the effective number of episodes n = M·k. Here k is the variance of
-    one episode, p(1 − p), over that of the rates of maps. To both, variance is added as
-    if on one map in a hundred all episodes had ended differently. Where k exceeds 1, it
-    is divided by (t/z)² of M − 1 degrees of freedom, but not below 1, because few maps
-    estimate their variance poorly. With one episode per map, or if all episodes end
-    identically, n is M. Repeating the same episodes does not change n.
+    The design effect is N / n, with the effective number of episodes n = M·k. The
+    factor k is the variance of one episode, p(1 − p), divided by the variance of the
+    maps' success rates. Both variances are increased as if all episodes on one map in a
+    hundred had ended differently. If k exceeds 1, it is divided by (t/z)² with M − 1
+    degrees of freedom, but not below 1, because few maps estimate their variance
+    poorly. With one episode per map, or if all episodes end identically, n is M.
+    Repeating the same episodes does not change n.
 
     Sources: Korn and Graubard (1998), "Confidence intervals for proportions with small
     expected number of positive counts estimated from survey data", for n and Student's
-    quantile; Cochran (1977), "Sampling Techniques", 6.3, for the variance where maps
-    have different numbers of episodes. The empirical coverage of the interval is in
+    quantile; Cochran (1977), "Sampling Techniques", 6.3, for the variance if maps have
+    different numbers of episodes. The empirical coverage of the interval is in
     `studies/statistics`, parts `intervals` and `groups`.
 
     Args:
@@ -56,13 +59,20 @@ def design_effect(success: np.ndarray, maps: np.ndarray) -> float:
     if n_maps == 1:
         return float(len(success))
     size = episodes / episodes.mean()
-    residual = size * (np.bincount(index, weights=success) / episodes - rate)
+    rate_by_map = np.bincount(index, weights=success) / episodes
+    residual = size * (rate_by_map - rate)
+    mean_residual_square = (residual**2).mean()
+    mean_size_square = (size**2).mean()
     episode_variance = rate * (1 - rate) + _PSEUDO_FRACTION
-    map_variance = (residual**2).mean() + _PSEUDO_FRACTION * (size**2).mean()
+    map_variance = mean_residual_square + _PSEUDO_FRACTION * mean_size_square
     k = episode_variance / map_variance
     if k > 1:
-        k = max(k * (norm.ppf(0.975) / t.ppf(0.975, n_maps - 1)) ** 2, 1.0)
-    return float(len(success) / (n_maps * k))
+        normal_quantile = norm.ppf(0.975)
+        student_quantile = t.ppf(0.975, n_maps - 1)
+        k *= (normal_quantile / student_quantile) ** 2
+        k = max(k, 1.0)
+    effective_episodes = n_maps * k
+    return float(len(success) / effective_episodes)
 
 
 def success_interval(
@@ -70,14 +80,14 @@ def success_interval(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the difference of success rates, with an adjusted Wald interval.
 
-    Two pseudo-maps are added, on which the conditions differ by ±c. With d the
-    difference on a map, c = (mean d² + 0.01) / (mean |d| + 0.01), as if on one map in a
-    hundred all episodes had ended differently. With one episode per map c is 1, and
-    this is the interval of Bonett and Price with the t quantile instead of the normal
-    one. If no map differs, c is also 1, so that the interval has a width, unlike that
-    of a bootstrap. Repeating the same episodes does not change the interval. If maps
-    have different numbers of episodes, the rate is a ratio of sums. The returned
-    difference is the observed one.
+    Two pseudo-maps are added, on which the conditions differ by c and by −c. If d is
+    the difference on a map, c = (mean d² + 0.01) / (mean |d| + 0.01), as if all
+    episodes on one map in a hundred had ended differently. With one episode per map,
+    c is 1, and this is the interval of Bonett and Price with the t quantile instead of
+    the normal quantile. If no map differs, c is also 1. The interval then has a width,
+    whereas a bootstrap interval has none. Repeating the same episodes does not change
+    the interval. If maps have different numbers of episodes, the rate is a ratio of
+    sums. The returned difference is the observed one.
 
     Sources: Bonett and Price (2012), "Adjusted Wald confidence interval for a
     difference of binomial proportions based on paired data"; Cochran (1977), "Sampling
@@ -97,16 +107,17 @@ def success_interval(
     centre, std = _smoothed(gain, draws)
     quantile = t.ppf((1 + confidence) / 2, n_maps - 1)
     half_width = quantile * std / np.sqrt(n_maps + 2)
-    mean = gain.sum(-1) / np.broadcast_to(draws, gain.shape).sum(-1)
+    n_episodes = np.broadcast_to(draws, gain.shape).sum(-1)
+    mean = gain.sum(-1) / n_episodes
     low = np.maximum(centre - half_width, -1)
     high = np.minimum(centre + half_width, 1)
     return mean, low, high
 
 
 def standard_deviation(gain: np.ndarray, draws: float | np.ndarray) -> np.ndarray:
-    """Return the standard deviation over maps of the difference of success.
+    """Return the standard deviation over maps of the difference in success.
 
-    It includes the two pseudo-maps of `success_interval`.
+    The two pseudo-maps of `success_interval` are included.
 
     Args:
         gain: as in `success_interval`, shape [..., M].
@@ -115,7 +126,8 @@ def standard_deviation(gain: np.ndarray, draws: float | np.ndarray) -> np.ndarra
     Returns:
         Values above 0, shape [...].
     """
-    return _smoothed(gain, draws)[1]
+    _, std = _smoothed(gain, draws)
+    return std
 
 
 def _smoothed(
@@ -124,18 +136,23 @@ def _smoothed(
     """Return mean and standard deviation over maps and the two pseudo-maps."""
     n_maps = gain.shape[-1]
     episodes = np.broadcast_to(draws, gain.shape)
-    total = episodes.sum(-1)
-    size = episodes * (n_maps / total)[..., None]
-    contribution = gain * (n_maps / total)[..., None]
-    mean_square = (gain**2 / episodes).sum(-1) / total
-    mean_size = np.abs(gain).sum(-1) / total
+    n_episodes = episodes.sum(-1)
+    weight = (n_maps / n_episodes)[..., None]
+    size = episodes * weight
+    contribution = gain * weight
+    square_sum = (gain**2 / episodes).sum(-1)
+    mean_square = square_sum / n_episodes
+    mean_size = np.abs(gain).sum(-1) / n_episodes
     c = (mean_square + _PSEUDO_FRACTION) / (mean_size + _PSEUDO_FRACTION)
     added_size = np.sqrt((size**2).mean(-1))  # of a pseudo-map
     total_size = n_maps + 2 * added_size
     centre = contribution.sum(-1) / total_size
     residual = contribution - centre[..., None] * size
-    squares = (residual**2).sum(-1) + 2 * added_size**2 * (c**2 + centre**2)
-    return centre, np.sqrt(squares * (n_maps + 2)) / total_size
+    map_squares = (residual**2).sum(-1)
+    added_squares = 2 * added_size**2 * (c**2 + centre**2)
+    squares = map_squares + added_squares
+    std = np.sqrt(squares * (n_maps + 2)) / total_size
+    return centre, std
 
 
 def mean_interval(
@@ -148,11 +165,13 @@ def mean_interval(
         confidence: nominal coverage.
 
     Returns:
-        Mean, lower and upper end, each of shape [...]. The mean is NaN without maps,
+        Mean, lower and upper end, each of shape [...]. The mean is NaN without maps;
         the ends are NaN with fewer than `LEAST_MAPS` maps.
     """
     n_maps = values.shape[-1]
-    mean = values.mean(-1) if n_maps else np.full(values.shape[:-1], np.nan)
+    mean = np.full(values.shape[:-1], np.nan)
+    if n_maps:
+        mean = values.mean(-1)
     half_width = _half_width(values, n_maps - 1, confidence)
     return mean, mean - half_width, mean + half_width
 
@@ -170,9 +189,9 @@ def total_time_interval(
     A rare failure costs many seconds, and a sample of few maps may not contain any. A
     bootstrap or Student's interval of T_total then underestimates the cost of failures:
     at a success rate of 19 in 20, a bootstrap over 20 maps covers 85 % instead of 95 %.
-    The interval is therefore combined from two by the method of variance estimates
-    recovery: that of the failure rate times the cost of a failure, and Student's
-    interval of the time without that cost.
+    The method of variance estimates recovery (MOVER) therefore combines two intervals:
+    the interval of the failure rate times the cost of a failure, and Student's interval
+    of the time without that cost.
 
     Source: Zou and Donner (2008), "Construction of confidence limits about effect
     measures: a general approach".
@@ -181,10 +200,11 @@ def total_time_interval(
         time_s: mean of T_total by map, where failures count as T, or its difference, in
             seconds, shape [..., M].
         failed: failure rate by map, or its difference, shape [..., M].
-        failed_interval: ends of the interval of its mean, each of shape [...].
+        failed_interval: ends of the interval of the mean of `failed`, each of shape
+            [...].
         penalty_s: cost of a failure compared with a success, in seconds, shape [...].
         arrived: number of maps with a success, shape [...].
-        confidence: nominal coverage, the same as that of `failed_interval`.
+        confidence: nominal coverage, also of `failed_interval`.
 
     Returns:
         Mean, lower and upper end in seconds, each of shape [...]; the ends are NaN with
@@ -192,11 +212,12 @@ def total_time_interval(
     """
     mean = time_s.mean(-1)
     failure_rate = failed.mean(-1)
-    without_cost = time_s - np.expand_dims(penalty_s, -1) * failed
+    cost_s = np.expand_dims(penalty_s, -1) * failed
     freedom = np.maximum(arrived - 1, 1)
-    half_width = _half_width(without_cost, freedom, confidence)
-    below = failure_rate - failed_interval[0]
-    above = failed_interval[1] - failure_rate
+    half_width = _half_width(time_s - cost_s, freedom, confidence)
+    low_rate, high_rate = failed_interval
+    below = failure_rate - low_rate
+    above = high_rate - failure_rate
     low = mean - np.hypot(half_width, penalty_s * below)
     high = mean + np.hypot(half_width, penalty_s * above)
     return mean, low, high
@@ -209,4 +230,5 @@ def _half_width(
     if n_maps < LEAST_MAPS:
         return np.full(values.shape[:-1], np.nan)
     quantile = t.ppf((1 + confidence) / 2, freedom)
-    return quantile * values.std(-1, ddof=1) / np.sqrt(n_maps)
+    std = values.std(-1, ddof=1)
+    return quantile * std / np.sqrt(n_maps)

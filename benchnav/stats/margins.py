@@ -1,6 +1,6 @@
 """Tests of a difference against a margin: non-inferiority, superiority and equivalence.
 
-Each compares the ends of the interval of the difference with the margin (two one-sided
+Each test compares the ends of the difference's interval with the margin (two one-sided
 tests).
 Sources: Schuirmann (1987), "A comparison of the two one-sided tests procedure and the
 power approach for assessing the equivalence of average bioavailability"; Wellek (2010),
@@ -25,13 +25,13 @@ def margin_p(
     """Return the p-value of a hypothesis with a margin; 1 if there is no interval.
 
     Args:
-        interval: function of the confidence; returns the difference and the ends of its
-            interval.
+        interval: function that takes the confidence, and returns the difference and the
+            ends of its interval.
         kind: `non-inferiority`, `superiority` or `equivalence`.
         direction: the better direction, `higher` or `lower`; empty for equivalence.
         margin: above 0, in the unit of the difference.
     """
-    sides = {"higher": (-1.0,), "lower": (1.0,)}.get(direction, (-1.0, 1.0))
+    sides = {"higher": [-1.0], "lower": [1.0]}.get(direction, [-1.0, 1.0])
     bound = -margin if kind == "superiority" else margin
     return max(_side_p(interval, bound, side) for side in sides)
 
@@ -41,15 +41,19 @@ def _side_p(
 ) -> float:
     """Return the p-value of H₀: the difference is beyond the margin on one side.
 
-    That is below −margin (side −1) or above margin (side 1). p is the level at which
-    the end of the one-sided interval equals the margin.
+    Beyond means below −margin (side −1) or above margin (side 1). p is the level at
+    which the end of the one-sided interval equals the margin.
     """
 
     def end(signed: float) -> float:
         """Return the end on the margin's side, or the opposite end if `signed` < 0."""
         _, low, high = interval(abs(signed))
         is_upper = (side > 0) == (signed >= 0)
-        return side * (high if is_upper else low)
+        value = high if is_upper else low
+        return side * value
+
+    def excess(signed: float) -> float:
+        return end(signed) - margin
 
     if np.isnan(end(0.5)):
         return 1.0
@@ -57,5 +61,5 @@ def _side_p(
         return (1 - _MAX) / 2
     if end(-_MAX) > margin:
         return 1.0
-    signed = brentq(lambda confidence: end(confidence) - margin, -_MAX, _MAX)
-    return (1 - float(signed)) / 2
+    signed = float(brentq(excess, -_MAX, _MAX))
+    return (1 - signed) / 2

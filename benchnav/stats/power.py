@@ -1,8 +1,9 @@
 """Minimum detectable differences and numbers of maps for a given power.
 
-The mean difference is taken as normal, which is accurate from about twenty maps on. A
-difference d with standard deviation σ is significant with probability `POWER` if d·√M/σ
-is the quantile of 1 − α/2 plus that of `POWER`.
+The mean difference is assumed to be normally distributed, which is accurate from about
+twenty maps on. A difference d with standard deviation σ over M maps is significant with
+probability `POWER` if d·√M/σ equals the sum of the normal quantiles of 1 − α/2 and of
+`POWER`.
 Source: Chow, Shao and Wang (2008), "Sample Size Calculations in Clinical Research",
 3.1.
 """
@@ -20,8 +21,8 @@ def smallest_difference(std: float, maps: int, alpha: float) -> float:
     Args:
         std: standard deviation over maps of the difference, in its unit.
         maps: number of maps.
-        alpha: level of significance; with a correction over K pairs, that of the first,
-            0.05/K.
+        alpha: level of significance; with Holm's correction over K pairs, the level of
+            its first step, 0.05/K.
 
     Returns:
         A difference in the unit of `std`; infinite if no sign-flip test of this number
@@ -40,8 +41,11 @@ def maps_needed(std: float, difference: float, alpha: float) -> int:
         difference: above 0, in the unit of `std`.
         alpha: as in `smallest_difference`.
     """
-    return math.ceil((_quantiles(alpha) * std / difference) ** 2)
+    root = _quantiles(alpha) * std / difference
+    return math.ceil(root**2)
 
 
 def _quantiles(alpha: float) -> float:
-    return float(norm.ppf(1 - alpha / 2) + norm.ppf(POWER))
+    """Return the sum of the normal quantiles of 1 − α/2 and of `POWER`."""
+    significance = norm.ppf(1 - alpha / 2)
+    return float(significance + norm.ppf(POWER))

@@ -1,11 +1,10 @@
 """Scores of several contestants on the same maps: intervals, paired tests, the best.
 
-A score is any function of sums over maps, so that means, roots, ratios and distances
-are treated in the same way. The statistical unit is the map, or the group of maps where
-a dataset has groups:
+A score is any function of sums over maps, such as a mean, root, ratio or distance. The
+statistical unit is the map, or the group of maps if a dataset has groups.
 
-- intervals are percentile bootstrap intervals over maps, sorted by their sums;
-- tests exchange the two contestants on each map (`flips.exchange_p`);
+- Intervals are percentile bootstrap intervals over maps, sorted by their sums.
+- Tests exchange the two contestants on each map (`flips.exchange_p`).
 - Holm's correction covers all pairs of competing contestants, for each score.
 
 Letters in shapes: M maps; C columns of a sum, such as classes, else 1; P parts.
@@ -35,12 +34,12 @@ class Score:
 
     Args:
         name: name of its columns.
-        parts: names of the sums that it is computed from.
+        parts: names of the sums from which the score is computed.
         of: function with one argument per part, each of shape [..., C]; returns values
             of shape [...].
-        better: better direction; empty if there is none.
-        target: if given, contestants are compared by their distance to this value, and
-            lower is better.
+        better: better direction; empty if no direction is better.
+        target: if given, contestants are compared by the distance of their score to
+            this value, and a lower distance is better.
         heading: heading of its column in tables, in two lines.
         meaning: definition of the column's values.
     """
@@ -60,7 +59,9 @@ class Score:
 
     def judged(self, values: Any) -> Any:
         """Return the compared quantity: the values, or their distance to the target."""
-        return values if self.target is None else abs(values - self.target)
+        if self.target is None:
+            return values
+        return abs(values - self.target)
 
     def value(self, sums: Sums) -> float:
         """Return the score over all maps."""
@@ -74,12 +75,17 @@ class Score:
 
         The score is a function of sums of shape [..., P]; it returns shape [...].
         """
-        columns = [sums[part].reshape(len(sums[part]), -1) for part in self.parts]
-        ends = np.cumsum([part.shape[1] for part in columns])[:-1]
+        columns = []
+        for part in self.parts:
+            values = sums[part]
+            columns.append(values.reshape(len(values), -1))
+        widths = [column.shape[1] for column in columns]
+        ends = np.cumsum(widths)[:-1]
 
         def of(totals: np.ndarray) -> np.ndarray:
+            parts = np.split(totals, ends, axis=-1)
             with np.errstate(divide="ignore", invalid="ignore"):
-                return self.of(*np.split(totals, ends, axis=-1))
+                return self.of(*parts)
 
         return np.hstack(columns), of
 
@@ -89,7 +95,7 @@ def summarise(scores: Sequence[Score], sums: Mapping[str, Sums]) -> pd.DataFrame
 
     Args:
         scores: scores to compute.
-        sums: by contestant and part, over M maps, shape [M] or [M, C].
+        sums: sums by contestant and part, over M maps, each of shape [M] or [M, C].
 
     Returns:
         One row per contestant: `units`, M; and for each score that its sums define,
@@ -98,10 +104,12 @@ def summarise(scores: Sequence[Score], sums: Mapping[str, Sums]) -> pd.DataFrame
     """
     rows = {}
     for contestant, contestant_sums in sums.items():
-        row: dict[str, float] = {"units": len(next(iter(contestant_sums.values())))}
+        first_part = next(iter(contestant_sums.values()))
+        row: dict[str, float] = {"units": len(first_part)}
         for score in _defined(scores, contestant_sums):
             table, of = score.split(contestant_sums)
-            low, high = _bootstrap(table[np.lexsort(table.T)], of)
+            order = np.lexsort(table.T)
+            low, high = _bootstrap(table[order], of)
             row[score.name] = float(of(table.sum(0)))
             row[f"{score.name}_low"] = low
             row[f"{score.name}_high"] = high
@@ -120,7 +128,7 @@ def compare_pairs(
     Args:
         scores: scores to compare.
         sums: as in `summarise`, over the same M maps for each contestant.
-        competing: contestants whose pairs Holm's correction covers.
+        competing: contestants whose pairs are covered by Holm's correction.
         same: name of a sum in which the maps of a pair must agree, such as the number
             of cells.
 
@@ -142,8 +150,8 @@ def compare_pairs(
                 records.append({**labels, **row})
     table = pd.DataFrame(records, columns=_PAIR)
     table = table.astype(dict.fromkeys(_PAIR[3:], float))
-    rivals = table[table["one"].isin(competing) & table["other"].isin(competing)]
-    for _, rows in rivals.groupby("measure"):
+    compete = table["one"].isin(competing) & table["other"].isin(competing)
+    for _, rows in table[compete].groupby("measure"):
         table.loc[rows.index, "p_holm"] = holm(rows["p"].to_numpy())
     return table
 
@@ -155,14 +163,16 @@ def _compare(score: Score, first: Sums, second: Sums) -> dict[str, float]:
     def difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         return score.judged(of(a)) - score.judged(of(b))
 
+    def difference_of_halves(sums: np.ndarray) -> np.ndarray:
+        a, b = np.split(sums, 2, axis=-1)
+        return difference(a, b)
+
     observed = float(difference(first_table.sum(0), second_table.sum(0)))
     if not np.isfinite(observed):
         return {}
     paired = np.hstack([first_table, second_table])
     order = _order_of_pairs(first_table, second_table)
-    low, high = _bootstrap(
-        paired[order], lambda sums: difference(*np.split(sums, 2, axis=-1))
-    )
+    low, high = _bootstrap(paired[order], difference_of_halves)
     p = exchange_p(first_table, second_table, difference)
     return {"difference": observed, "low": low, "high": high, "p": p}
 
@@ -176,7 +186,7 @@ def _defined(scores: Sequence[Score], *sums: Sums) -> list[Score]:
 def _bootstrap(
     table: np.ndarray, of: Callable[[np.ndarray], np.ndarray]
 ) -> tuple[float, float]:
-    """Return the ends of the interval of a function of sums over maps."""
+    """Return the ends of the bootstrap interval of a function of sums over maps."""
     if len(table) < LEAST_MAPS:
         return np.nan, np.nan
     sums = bootstrap_counts(len(table)) @ table
@@ -184,7 +194,7 @@ def _bootstrap(
 
 
 def _order_of_pairs(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return an order of maps that does not depend on the order of the two."""
+    """Return an order of maps that does not change if the two contestants are swapped."""
     total = first + second
     key = np.hstack([total, first - second])
     swapped_key = np.hstack([total, second - first])
@@ -198,18 +208,18 @@ def _order_of_pairs(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 def against_best(
     scores: Sequence[Score], summary: pd.DataFrame, pairs: pd.DataFrame
 ) -> pd.DataFrame:
-    """Find the best contestant by each score, and which are significantly worse.
+    """Find the best contestant by each score, and those that are significantly worse.
 
     Args:
-        scores: scores to use; one without a better direction has no best.
+        scores: scores to use; a score without a better direction is skipped.
         summary: rows from `summarise` of the competing contestants.
         pairs: rows from `compare_pairs`.
 
     Returns:
-        One row per contestant and score: `measure`; `best`; except for the best,
-        `difference` to the best, `low`, `high` and `p_holm` as in `compare_pairs`;
-        `alike`, true if it is not significantly worse; and `marked`, true if it is
-        alike and another contestant is not.
+        One row per contestant and score: `measure`, the score's name; `best`, the best
+        contestant; except for the best, `difference` to the best, `low`, `high` and
+        `p_holm` as in `compare_pairs`; `alike`, true if the contestant is not
+        significantly worse; and `marked`, true if it is alike and another is not.
     """
     swapped = pairs.assign(
         one=pairs["other"],
@@ -221,7 +231,8 @@ def against_best(
     ordered = pd.concat([pairs, swapped])
     tables = []
     for score in scores:
-        if score.name not in summary or not (score.better or score.target is not None):
+        has_best = score.better or score.target is not None
+        if score.name not in summary or not has_best:
             continue
         values = score.judged(summary[score.name].dropna())
         if values.empty:

@@ -18,9 +18,9 @@ class Column:
     Args:
         heading: heading; a line break in it is shown only in a terminal.
         cell: function from a row to its text.
-        meaning: definition of the column, printed below the table; if empty, there is
-            none.
-        title: text before the meaning, if that covers several columns; if empty, the
+        meaning: definition of the column, printed below the table; if empty, nothing is
+            printed.
+        title: text before the meaning if it covers several columns; if empty, the
             heading.
     """
 
@@ -31,12 +31,12 @@ class Column:
 
 
 def table_of(rows: Iterable[Row], columns: Sequence[Column], **options: Any) -> Table:
-    """Return a table of rows.
+    """Format rows as a table.
 
     Args:
-        rows: values by name.
-        columns: columns, those of labels first.
-        options: other fields of `Table`.
+        rows: values of each row by name.
+        columns: columns of the table; columns of labels come first.
+        **options: other fields of `Table`.
     """
     texts = [tuple(column.cell(row) for column in columns) for row in rows]
     explained = []
@@ -53,7 +53,7 @@ def table_of(rows: Iterable[Row], columns: Sequence[Column], **options: Any) -> 
 
 
 def labels_of(*names: str) -> list[Column]:
-    """Return columns that show values unchanged, with their names as headings."""
+    """Return columns that show values as text, with their names as headings."""
     return [Column(name, cell_of(name)) for name in names]
 
 
@@ -68,12 +68,12 @@ def cell_of(name: str, write: Callable[[Any], str] = str) -> Callable[[Row], str
 
 
 def p_value(p: float) -> str:
-    """Format a p-value; the minimum of random sign flips is 0.0001."""
+    """Format a p-value; random sign flips give no p below 0.0001."""
     return "≤ 0.0001" if p <= 1e-4 else f"{p:.2g}"
 
 
 def short(value: float) -> str:
-    """Format a number with one decimal place, unless that is 0."""
+    """Format a number with one decimal place, which is omitted if it is 0."""
     return f"{value:.1f}".removesuffix(".0")
 
 

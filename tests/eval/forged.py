@@ -40,7 +40,7 @@ def forge_rows(folder: Path, rows: pd.DataFrame) -> None:
     _write_rows(
         folder,
         rows.assign(success=rows["outcome"] == "success"),
-        open_run(folder).about,
+        open_run(folder).manifest,
     )
 
 

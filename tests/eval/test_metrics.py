@@ -148,7 +148,7 @@ def test_the_page_and_the_tables_have_a_column_and_its_meaning(finished: Path) -
             "length of the driven path over that of the straight line",
         ):
             assert words in text, (file, words)
-    about = open_run(finished).about
+    about = open_run(finished).manifest
     assert [entry["quantity"]["column"] for entry in about["metrics"]] == [
         "detour",
         "energy_j",

@@ -249,7 +249,7 @@ def test_a_run_without_a_finished_unit_and_a_comparison_are_refused(
     next(steps := run_suite(suite, tmp_path / "begun"))
     steps.close()
     for words, said in (
-        (("report", tmp_path / "begun", "--partial"), "got .* with none of 6"),
+        (("report", tmp_path / "begun", "--partial"), "got .*, where 0 of 6"),
         (("report", running), "--partial"),
         (("compare", running, "--against", "mean"), "Expected a finished run"),
     ):

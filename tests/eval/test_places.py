@@ -96,7 +96,7 @@ def test_a_copy_certifies_nothing(run: Path, tmp_path: Path) -> None:
     ):
         list(rerun(run, again))
     # Nor under another account of the run.
-    write_run(again, {**open_run(again).about, "history": []})
+    write_run(again, {**open_run(again).manifest, "history": []})
     with pytest.raises(ConfigError, match="copies"):
         list(rerun(run, again))
     list(rerun(run, again, overwrite=True))
@@ -212,7 +212,7 @@ def test_all_commands_and_suites_stand_in_the_run_with_when_and_where(
     for seed in (0, 0, 3):
         monkeypatch.setattr(sys, "argv", ["benchnav-eval", "run", "--seed", str(seed)])
         list(run_suite(quick(dataset_path, seed=seed), out))
-    first, second = open_run(out).about["history"]
+    first, second = open_run(out).manifest["history"]
     assert (first["suite"]["seed"], second["suite"]["seed"]) == (0, 3)
     assert second["command"].endswith("--seed 3")
     for entry in (first, second):
@@ -256,7 +256,7 @@ def test_one_condition_has_one_label_for_good(
     rows = pd.read_parquet(out / "episodes.parquet")
     labels = {
         i: entry["labels"]["risk"]
-        for i, entry in open_run(out).about["conditions"].items()
+        for i, entry in open_run(out).manifest["conditions"].items()
     }
     assert dict(zip(rows["condition"], rows["risk"], strict=True)) == labels
     assert set(labels.values()) == {"careful", "cautious"}

@@ -156,7 +156,9 @@ def test_what_is_proposed_are_unlike_outcomes_on_the_map_where_they_differ_most(
         run = open_run(folder)
         patch.setattr(
             "benchnav.eval.find_episodes.open_run",
-            lambda _: replace(run, about=run.about | {"hypotheses": {"tests": tests}}),
+            lambda _: replace(
+                run, manifest=run.manifest | {"hypotheses": {"tests": tests}}
+            ),
         )
         patch.setattr(
             "benchnav.eval.find_episodes.read_table", lambda *_, own=rows: own

@@ -1,1 +1,1 @@
-"""What is asked: suites, their conditions, units of work and hypotheses."""
+"""Experiments: suites, their conditions, units of work and hypotheses."""

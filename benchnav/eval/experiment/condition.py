@@ -1,4 +1,4 @@
-"""Conditions: the cells of an experiment as values, and how a suite lists them.
+"""Conditions: the cells of an experiment as values, listed from a suite.
 
 A condition is a data split, model, risk setting, planner, robot, objective, rules and
 world. Its id is the digest of that value; its labels are for people. Seeds,
@@ -34,8 +34,8 @@ from benchnav.planning.planners.planner import INPUTS
 from benchnav.planning.problem import Task
 from benchnav.planning.world.world import World, read_world
 
-# Sensing and belief. Defaults are left out of ids, so that conditions from before these
-# parts existed keep their ids.
+# Sensing and belief. Defaults are left out of ids, so that conditions of runs made
+# before these parts existed keep their ids.
 KNOWLEDGE: Mapping[str, Mapping[str, Any]] = {
     "sensor": {"part": "full", "options": {}},
     "ground": {"part": "contact", "options": {}},
@@ -56,7 +56,7 @@ LABELS = (
 )
 NOT_USED = "–"
 ANY_RISK = Part(part="mean", label=NOT_USED, kind="risk")
-# Properties of a split that results depend on in addition to its maps:
+# Properties of a split on which results depend in addition to its maps;
 # `TerrainDataset.about_digest` is their digest.
 MEANING = "class table, λ_stuck, resolution or kind of truth"
 # The only input by which a setting affects a planner if no robot learns.
@@ -73,7 +73,7 @@ class Condition:
         scenario: scenario of the test split.
         model: model that predicts traversability.
         risk: risk measure that turns a prediction into λ̂.
-        planner: planner.
+        planner: planner, which chooses actions from λ̂.
         robot: robot dynamics F.
         objective: objective J.
         sensor: appearance sensor.
@@ -82,9 +82,10 @@ class Condition:
         rules: free space, minimum λ̂, goal radius and replanning interval.
         world: draws of λ and immobilising terrain.
         world_label: label of rules and world in tables.
-        blind: whether the planner is blind; then any model and risk measure will do.
-        stands_for: by kind of part, labels of settings that differ only in inputs
-            that the planner does not use and are run as this one.
+        blind: whether the planner is blind, so that model and risk measure change
+            nothing.
+        stands_for: labels of other settings by kind of part: they differ only in inputs
+            that the planner does not use, and are run as this condition.
     """
 
     __repr__ = short_repr
@@ -108,7 +109,8 @@ class Condition:
     def __getstate__(self) -> dict[str, Any]:
         """Return the fields without the cached task.
 
-        Another process may first have to load the task's classes from a file.
+        A process that unpickles the condition may first have to load the task's classes
+        from a file.
         """
         return {item.name: getattr(self, item.name) for item in fields(self)}
 
@@ -129,19 +131,15 @@ class Condition:
 
     @property
     def value(self) -> dict[str, Any]:
-        """All that affects the condition's rows, as plain data without labels."""
-        parts = {}
+        """All settings that affect the condition's rows, as plain data without labels."""
+        value: dict[str, Any] = {"data": self.data, "split": self.split}
         for kind, part in self.parts.items():
             spec = {"part": part.part, "options": dict(part.options)}
             if spec != KNOWLEDGE.get(kind):
-                parts[kind] = spec
-        return {
-            "data": self.data,
-            "split": self.split,
-            **parts,
-            "rules": self.rules.to_dict(),
-            "world": self.world.to_dict(),
-        }
+                value[kind] = spec
+        value["rules"] = self.rules.to_dict()
+        value["world"] = self.world.to_dict()
+        return value
 
     @property
     def id(self) -> str:
@@ -151,16 +149,14 @@ class Condition:
     @property
     def labels(self) -> dict[str, str]:
         """Labels in tables, by column."""
-        parts = {kind: part.label for kind, part in self.parts.items()}
-        parts |= dict.fromkeys(self.stands_for, NOT_USED)
+        labels = {"data": self.data, "scenario": self.scenario}
+        for kind, part in self.parts.items():
+            labels[kind] = part.label
+        labels |= dict.fromkeys(self.stands_for, NOT_USED)
         if self.blind:
-            parts |= dict.fromkeys(("model", "risk", *KNOWLEDGE), NOT_USED)
-        return {
-            "data": self.data,
-            "scenario": self.scenario,
-            **parts,
-            "world": self.world_label,
-        }
+            labels |= dict.fromkeys(("model", "risk", *KNOWLEDGE), NOT_USED)
+        labels["world"] = self.world_label
+        return labels
 
     @property
     def description(self) -> str:
@@ -179,11 +175,11 @@ class Condition:
     @property
     def unreproducible(self) -> tuple[str, ...]:
         """Kind and label of parts that are objects only this process has."""
-        return tuple(
-            f"{kind} {part.label}"
-            for kind, part in self.parts.items()
-            if registry.is_object(kind, part.part)
-        )
+        names = []
+        for kind, part in self.parts.items():
+            if registry.is_object(kind, part.part):
+                names.append(f"{kind} {part.label}")
+        return tuple(names)
 
     @property
     def learns(self) -> bool:
@@ -203,25 +199,23 @@ class Condition:
 
     @property
     def planner_uses(self) -> frozenset[str]:
-        """Names of the inputs that affect the planner in this task, see `Planner.uses`.
+        """Names of the inputs that affect the planner in this task; see `Planner.uses`.
 
         Raises:
             ConfigError: If the planner returns names that are not in `INPUTS`.
         """
         owner = f"`uses` of planner {self.planner.label!r}"
         used = call(owner, self.planner.object.uses, {"task": self.task})
-        expect(
-            isinstance(used, frozenset) and used <= INPUTS,
-            f"{owner} to return a frozenset of {', '.join(sorted(INPUTS))}, got "
-            f"{used!r}.",
-        )
+        is_valid = isinstance(used, frozenset) and used <= INPUTS
+        names = ", ".join(sorted(INPUTS))
+        expect(is_valid, f"{owner} to return a frozenset of {names}, got {used!r}.")
         return used
 
     @property
     def unused(self) -> tuple[str, ...]:
         """Kinds of parts whose setting affects no row of a planner that is not blind.
 
-        If a robot learns, a change of λ̂ decides when its planner receives another map,
+        If a robot learns, changes of λ̂ determine when its planner receives another map,
         so that every setting affects rows.
         """
         if self.blind or self.learns:
@@ -232,11 +226,10 @@ class Condition:
     @property
     def rows_id(self) -> str:
         """Digest of the settings that affect rows; unused settings do not change it."""
-        stand_ins: dict[str, Any] = {
-            "risk": ANY_RISK,
-            "belief": part_of("belief", KNOWLEDGE["belief"], NOT_USED),
-        }
-        return replace(self, **{kind: stand_ins[kind] for kind in self.unused}).id
+        any_belief = part_of("belief", KNOWLEDGE["belief"], NOT_USED)
+        defaults: dict[str, Any] = {"risk": ANY_RISK, "belief": any_belief}
+        unused_parts = {kind: defaults[kind] for kind in self.unused}
+        return replace(self, **unused_parts).id
 
 
 def condition_from(entry: Mapping[str, Any]) -> Condition:
@@ -246,13 +239,14 @@ def condition_from(entry: Mapping[str, Any]) -> Condition:
     parts: dict[str, Any] = {
         kind: part_of(kind, value[kind], labels[kind]) for kind in PART_KINDS
     }
+    world = {"time_budget_s": None} | value["world"]
     stands_for = entry.get("stands_for", {})
     return Condition(
         data=value["data"],
         scenario=value["split"].removeprefix("test/"),
         **parts,
         rules=read(Rules, value["rules"], of("rules")),
-        world=read(World, {"time_budget_s": None} | value["world"], of("world")),
+        world=read(World, world, of("world")),
         world_label=labels["world"],
         blind=labels["model"] == NOT_USED,
         stands_for={kind: tuple(merged) for kind, merged in stands_for.items()},
@@ -271,9 +265,9 @@ def conditions_of(
     """List the conditions of a suite, in the order of tables.
 
     Args:
-        suite: the suite.
-        scenarios_of: returns the scenarios of a dataset's test splits, from its path or
-            id.
+        suite: suite, as a user wrote it.
+        scenarios_of: function from the path or id of a dataset to the scenarios of its
+            test splits.
 
     Raises:
         ConfigError: If a part cannot be created as requested, two parts share a label,
@@ -294,26 +288,32 @@ def conditions_of(
 
 
 def merge_alike(conditions: Iterable[Condition]) -> list[Condition]:
-    """Merge conditions with one `rows_id` into the first, or the one under `mean`."""
+    """Merge conditions that share a `rows_id`.
+
+    Each group is merged into its first condition with the risk setting `mean`, or into
+    its first condition.
+    """
     groups: dict[str, list[Condition]] = defaultdict(list)
     for condition in conditions:
         groups[condition.rows_id].append(condition)
     merged = []
     for group in groups.values():
         of_mean = [condition for condition in group if condition.risk.part == "mean"]
-        merged.append(merge([*of_mean, *group][0], group))
+        representative, *_ = [*of_mean, *group]
+        merged.append(merge(representative, group))
     return merged
 
 
 def merge(representative: Condition, conditions: Sequence[Condition]) -> Condition:
-    """Merge conditions that share a `rows_id` into one that stands for all.
+    """Merge conditions that share a `rows_id` into one that stands for all of them.
 
     Args:
         representative: the condition that is run.
-        conditions: all of them.
+        conditions: all conditions, including `representative`.
 
     Returns:
-        `representative`, labelled as not using what the conditions differ in.
+        `representative`, with `NOT_USED` as the label of parts in which the conditions
+        differ.
     """
     stands_for: dict[str, tuple[str, ...]] = {}
     parts: dict[str, Any] = {}
@@ -332,11 +332,11 @@ def check_labels(conditions: Iterable[Condition]) -> None:
     """Reject two settings under one label, and two labels of one setting.
 
     Args:
-        conditions: conditions, those whose labels take precedence first; a condition
-            may be repeated.
+        conditions: conditions; the labels of earlier ones take precedence, and a
+            condition may be repeated.
 
     Raises:
-        ConfigError: If there are such settings.
+        ConfigError: If there are such settings or labels.
     """
     digests: dict[tuple[str, str], str] = {}
     labels: dict[tuple[str, str], str] = {}
@@ -365,25 +365,25 @@ def check_labels(conditions: Iterable[Condition]) -> None:
 
 
 def _product(listed: Mapping[str, list[Any]], scenarios_of: Any) -> Iterator[Condition]:
-    scenarios = {
-        data: listed["scenarios"] or scenarios_of(data) for data in listed["data"]
-    }
+    """Yield the product of listed values; see `Suite.products`."""
+    scenarios = {}
+    for data in listed["data"]:
+        scenarios[data] = listed["scenarios"] or scenarios_of(data)
     parts: dict[str, list[Part]] = {}
     for kind in PART_KINDS:
         lists = [read_parts(kind, spec) for spec in listed[f"{kind}s"]]
         parts[kind] = list(itertools.chain.from_iterable(lists))
     world_specs = itertools.chain.from_iterable(map(each_mapping, listed["world"]))
-    task_specs = list(itertools.chain.from_iterable(map(each_mapping, listed["task"])))
+    task_specs = itertools.chain.from_iterable(map(each_mapping, listed["task"]))
     worlds = [
         read_world(world, task)
         for world, task in itertools.product(world_specs, task_specs)
     ]
     n_scenarios = sum(map(len, scenarios.values()))
     check_count([n_scenarios, len(worlds), *map(len, parts.values())])
+    ordered_parts = [parts[kind] for kind in _ORDER]
     for data in listed["data"]:
-        settings = itertools.product(
-            scenarios[data], worlds, *(parts[kind] for kind in _ORDER)
-        )
+        settings = itertools.product(scenarios[data], worlds, *ordered_parts)
         for scenario, (world, rules, label), *chosen in settings:
             yield Condition(
                 data=data,
@@ -398,19 +398,15 @@ def _product(listed: Mapping[str, list[Any]], scenarios_of: Any) -> Iterator[Con
 def _as_run_once(condition: Condition) -> Condition:
     """Replace settings that change nothing by a default.
 
-    A blind planner uses no prediction. If λ is known, each risk measure is λ itself and
-    nothing remains to be learnt. A belief that does not learn ignores measured λ.
+    A blind planner uses no prediction. If λ is given, each risk measure is λ itself,
+    and nothing remains to be learnt. A belief that does not learn ignores measured λ.
     """
-    unused = {
-        kind: part_of(kind, default, NOT_USED) for kind, default in KNOWLEDGE.items()
-    }
+    unused: dict[str, Any] = {}
+    for kind, default in KNOWLEDGE.items():
+        unused[kind] = part_of(kind, default, NOT_USED)
     if condition.planner.object.blind or not condition.planner_uses:
-        unused_parts: dict[str, Any] = {
-            **unused,
-            "model": ModelPart(part="oracle", label=NOT_USED),
-            "risk": ANY_RISK,
-        }
-        return replace(condition, blind=True, **unused_parts)
+        any_model = ModelPart(part="oracle", label=NOT_USED)
+        return replace(condition, blind=True, model=any_model, risk=ANY_RISK, **unused)
     if not condition.belief.object.learns:
         condition = replace(condition, ground=unused["ground"])
     if condition.model.part != "clairvoyant":
@@ -423,7 +419,7 @@ def _as_run_once(condition: Condition) -> Condition:
 def label_words(
     labels: Mapping[str, str], names: Iterable[str] = LABELS[1:]
 ) -> list[str]:
-    """Return the labels of some columns, without those not used."""
+    """Return the labels of some columns, without labels of unused parts."""
     return [labels[name] for name in names if labels[name] != NOT_USED]
 
 
@@ -439,7 +435,7 @@ def condition_names(conditions: Sequence[Condition]) -> list[str]:
 
 
 def differences(a: Any, b: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Yield where plain data differ: dotted option name and both values, or None."""
+    """Yield differences of plain data: dotted name and both values, None if missing."""
     if isinstance(a, Mapping) and isinstance(b, Mapping):
         for key in dict.fromkeys([*a, *b]):
             path = f"{name}.{key}".removeprefix(".")

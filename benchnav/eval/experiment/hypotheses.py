@@ -1,8 +1,8 @@
 """Hypotheses that a suite fixes before its first unit is run.
 
-A hypothesis compares two conditions by one metric: they differ, the first is not worse
-by a margin, the first is better by more than a margin, or they are equal to within a
-margin. `benchnav.eval.stats.hypotheses` tests them.
+A hypothesis compares two conditions by one metric. It claims that they differ, that the
+first is not worse by a margin, that the first is better by more than a margin, or that
+they are equal to within a margin. `benchnav.eval.stats.hypotheses` tests hypotheses.
 """
 
 import itertools
@@ -29,12 +29,13 @@ class Hypothesis:
 
     Args:
         one: the condition that the claim is about: labels in a suite, an id in a test.
-        other: the condition that it is compared with, likewise.
+        other: the condition that it is compared with: labels or an id, likewise.
         metric: name of a metric.
         kind: relation that is claimed.
-        direction: of a difference, where `one` lies, two-sided if empty; of
-            non-inferiority and superiority, the better direction, the metric's if empty.
-        margin: margin of all kinds but a difference, in the metric's unit.
+        direction: for a difference, the side on which `one` lies; if empty, the test is
+            two-sided. For non-inferiority and superiority, the better direction; if
+            empty, that of the metric.
+        margin: margin of all kinds except a difference, in the metric's unit.
     """
 
     one: Any
@@ -55,26 +56,18 @@ class Hypothesis:
             quantity: the quantity compared.
         """
         margin = f"{self.margin:g} {quantity.unit}".rstrip()
+        subject = f"{quantity.words} of {first_name}"
         if self.kind == "equivalence":
-            return (
-                f"{quantity.words} of {first_name} and of {second_name} differs by less than "
-                f"{margin}"
-            )
+            return f"{subject} and of {second_name} differs by less than {margin}"
         if self.kind == "non-inferiority":
             worse = "lower" if self.direction == "higher" else "higher"
-            return (
-                f"{quantity.words} of {first_name} is less than {margin} {worse} than "
-                f"that of {second_name}"
-            )
+            return f"{subject} is less than {margin} {worse} than that of {second_name}"
         if self.kind == "superiority":
-            return (
-                f"{quantity.words} of {first_name} is more than {margin} "
-                f"{self.direction} "
-                f"than that of {second_name}"
-            )
+            amount = f"more than {margin} {self.direction}"
+            return f"{subject} is {amount} than that of {second_name}"
         if self.direction:
-            return f"{quantity.words} of {first_name} is {self.direction} than that of {second_name}"
-        return f"{quantity.words} of {first_name} differs from that of {second_name}"
+            return f"{subject} is {self.direction} than that of {second_name}"
+        return f"{subject} differs from that of {second_name}"
 
 
 def digest_of_tests(tests: Sequence[Mapping[str, Any]]) -> str:
@@ -92,12 +85,13 @@ def fix_hypotheses(
     Args:
         specs: hypotheses as the suite lists them.
         conditions: the suite's conditions by id, each with its extent.
-        quantities: quantities that conditions may be compared by, by name.
+        quantities: quantities by which conditions may be compared, by name.
 
     Returns:
-        `tests`, each as plain data: the fields of `Hypothesis`, `names` (of the two
-        conditions in text) and `claim`; `digest` of them; and `episodes` of each
-        condition that they name. Empty if there are no hypotheses.
+        `tests`, each as plain data: the fields of `Hypothesis`, `names` (the names of
+        the two conditions in text) and `claim`; `digest`, their digest; and `episodes`,
+        the number of episodes of each condition that they name. Empty if there are no
+        hypotheses.
 
     Raises:
         ConfigError: If a hypothesis names something missing, or cannot be tested.
@@ -116,7 +110,8 @@ def fix_hypotheses(
     episodes = {}
     for test in tests:
         for condition_id in (test["one"], test["other"]):
-            episodes[condition_id] = conditions[condition_id][1].episodes
+            _, extent = conditions[condition_id]
+            episodes[condition_id] = extent.episodes
     return {"tests": tests, "digest": digest_of_tests(tests), "episodes": episodes}
 
 
@@ -134,11 +129,8 @@ def _read(
     hypothesis = _with_direction(hypothesis, quantity, where)
     first_labels, first = _named(hypothesis.one, "one", where, conditions)
     second_labels, second = _named(hypothesis.other, "other", where, conditions)
-    unnamed = [
-        name
-        for name in LABELS
-        if name not in first_labels and name not in second_labels
-    ]
+    named = {*first_labels, *second_labels}
+    unnamed = [name for name in LABELS if name not in named]
     pairs = _pairs(first, second, unnamed, where)
     if hypothesis.metric == TOTAL_TIME.name and any(map(_differ_in_budget, pairs)):
         raise ConfigError(
@@ -147,8 +139,8 @@ def _read(
             "which failures count. Compare their success, or give the world "
             "`time_budget_s`."
         )
-    # Text names conditions by the labels that the hypothesis names, and by the other
-    # labels that vary between the pairs.
+    # Text names conditions by the labels that the hypothesis names, and by other labels
+    # that vary between the pairs.
     labels = [condition.labels for pair in pairs for condition in pair]
     varying = [name for name in unnamed if _varies(labels, name)]
     tests = []
@@ -181,7 +173,7 @@ def _check_margin(hypothesis: Hypothesis, quantity: Quantity, where: str) -> Non
 def _with_direction(
     hypothesis: Hypothesis, quantity: Quantity, where: str
 ) -> Hypothesis:
-    """Fill in the metric's better direction where the kind needs one."""
+    """Fill in the metric's better direction if the kind of hypothesis needs one."""
     kind = hypothesis.kind
     if kind == "equivalence" and hypothesis.direction:
         raise ConfigError(
@@ -192,9 +184,8 @@ def _with_direction(
         return hypothesis
     if quantity.better == "neither":
         raise ConfigError(
-            f"Expected `direction` of {where}, a test of {kind}, since no way is "
-            f"better for {hypothesis.metric!r}, got "
-            "none. Say higher or lower."
+            f"Expected `direction` of {where}, a test of {kind}, since no direction is "
+            f"better for {hypothesis.metric!r}, got none. Say higher or lower."
         )
     return replace(hypothesis, direction=quantity.better)
 
@@ -222,21 +213,22 @@ def _named(
     if not isinstance(spec, Mapping) or not spec:
         raise ConfigError(
             f"Expected `{side}` of {where} to name a condition by labels, such as "
-            f"{{planner: mppi, risk: mean}}, got "
-            f"{spec!r}."
+            f"{{planner: mppi, risk: mean}}, got {spec!r}."
         )
     matching = list(conditions)
     labels = {name: str(value) for name, value in spec.items()}
     for name, value in labels.items():
         check_known(f"labels in `{side}` of {where}", name, LABELS)
-        options = [label for c in matching for label in _labels_of(c, name)]
-        check_known(f"`{name}` of `{side}` of {where}", value, dict.fromkeys(options))
+        options: dict[str, None] = {}
+        for condition in matching:
+            options |= dict.fromkeys(_labels_of(condition, name))
+        check_known(f"`{name}` of `{side}` of {where}", value, options)
         matching = [c for c in matching if value in _labels_of(c, name)]
     return labels, matching
 
 
 def _labels_of(condition: Condition, name: str) -> tuple[str, ...]:
-    """Return a condition's label in a column, and those of settings it stands for."""
+    """Return the labels in a column of a condition and of settings it stands for."""
     return condition.labels[name], *condition.stands_for.get(name, ())
 
 
@@ -256,8 +248,7 @@ def _pairs(
         if any(getattr(a, name) != getattr(b, name) for a, b in pairs):
             raise ConfigError(
                 f"Expected {where} to compare conditions on the same maps under the "
-                "same λ, got two of another "
-                f"{name}. Name one {name} in both."
+                f"same λ, got two of another {name}. Name one {name} in both."
             )
     return pairs
 
@@ -269,6 +260,7 @@ def _agree(a: Condition, b: Condition, columns: Iterable[str]) -> bool:
 
 
 def _check_one_to_one(pairs: Sequence[_Pair], where: str) -> None:
+    """Reject a condition with several partners."""
     for index, side in enumerate(("other", "one")):
         partners = defaultdict(list)
         for pair in pairs:
@@ -276,13 +268,13 @@ def _check_one_to_one(pairs: Sequence[_Pair], where: str) -> None:
         for labels in partners.values():
             if len(labels) == 1:
                 continue
-            name = next(
-                name for name in LABELS if len({row[name] for row in labels}) > 1
-            )
+            for name in LABELS:
+                values = [row[name] for row in labels]
+                if len(set(values)) > 1:
+                    break
             raise ConfigError(
                 f"Expected {where} to name one condition to compare with another, got "
-                f"{len(labels)} that differ in "
-                f"{name} ({', '.join(row[name] for row in labels)}). Name the "
+                f"{len(labels)} that differ in {name} ({', '.join(values)}). Name the "
                 f"{name} in `{side}`."
             )
 
@@ -293,16 +285,16 @@ def _raise_no_pair(
     for a, b in combinations:
         if a.id != b.id or not a.stands_for:
             continue
-        settings = " and ".join(
-            f"{kind} {', '.join(labels)}" for kind, labels in a.stands_for.items()
-        )
+        settings = []
+        for kind, labels in a.stands_for.items():
+            settings.append(f"{kind} {', '.join(labels)}")
         raise ConfigError(
             f"Expected {where} to compare two conditions, got one: planner "
-            f"{a.labels['planner']!r} does not use "
-            f"{settings}. Leave the hypothesis out."
+            f"{a.labels['planner']!r} does not use {' and '.join(settings)}. Leave the "
+            "hypothesis out."
         )
+    equal = ", ".join(unnamed) or "all else"
     raise ConfigError(
-        f"Expected {where} to name two conditions that are the same in "
-        f"{', '.join(unnamed) or 'all else'}, got "
+        f"Expected {where} to name two conditions that are the same in {equal}, got "
         "none. Name the same labels in `one` and `other`."
     )

@@ -29,7 +29,7 @@ _BOOKKEEPING = (
     "code",
     "time_budget_s",
 )
-# Fields of a metric's description that results and hypotheses depend on.
+# Fields of a metric's description on which results and hypotheses depend.
 _FIXED = ("name", "column", "unit", "scale", "of_arrivals")
 
 
@@ -53,13 +53,12 @@ class NamedMetric:
     @property
     def entry(self) -> dict[str, Any]:
         """The entry of `metrics` in `run.json`."""
-        marked = {"unreproducible": True} if self.is_object else {}
-        return {
-            **self.spec,
-            "label": self.part.label,
-            "quantity": asdict(self.quantity),
-            **marked,
-        }
+        entry = self.spec
+        entry["label"] = self.part.label
+        entry["quantity"] = asdict(self.quantity)
+        if self.is_object:
+            entry["unreproducible"] = True
+        return entry
 
     @property
     def is_object(self) -> bool:
@@ -92,7 +91,8 @@ def read_metrics(
                 "Expected `metrics` that a run does not already have, got "
                 f"{part.part!r}. Leave it out."
             )
-        if faults := attribute_faults(metric):
+        faults = attribute_faults(metric)
+        if faults:
             raise ConfigError(
                 f"metric {part.part!r} breaks its contract. {' '.join(faults)}"
             )
@@ -112,8 +112,8 @@ def add_metric(metrics: Sequence[NamedMetric], new: NamedMetric) -> list[NamedMe
     A metric that the run already has keeps its position and takes the new description.
 
     Raises:
-        ConfigError: If another metric, or a column of every run, has its name or
-            column, or it has another name, column or unit than before.
+        ConfigError: If another metric, or a column of every run, has the new metric's
+            name or column; or if the metric's name, column or unit has changed.
     """
     quantity = new.quantity
     taken = [(builtin.name, builtin.column) for builtin in QUANTITIES.values()]

@@ -28,11 +28,11 @@ PART_FIELDS = {
 # Fields of a suite whose product is evaluated.
 _LISTED = ("data", "scenarios", *PART_FIELDS, "world", "task")
 
-# What is stored of episodes in addition to rows; each level includes those before it.
+# Data of episodes stored in addition to rows; each level includes the levels before it.
 Record = Literal["none", "steps", "first", "failures", "all"]
 RECORDS: tuple[Record, ...] = get_args(Record)
 
-# More than any study needs; larger suites are mistakes that would fill memory.
+# More than any study needs: a larger suite is a mistake that would fill memory.
 MAX_EPISODES = 10**8
 MAX_UNITS = 10**6
 MAX_CONDITIONS = 10**5
@@ -63,33 +63,29 @@ class Suite:
             `near` the cells around the robot.
         grounds: Traversability sensors: `contact` measures λ under the robot, `probe`
             also around it.
-        beliefs: How measured λ updates the prediction: `static`, not; `copula`, λ of
-            nearby cells; `classes`, also which of two look-alike classes cells are of.
+        beliefs: Updates of the prediction by measured λ: `static`, no update; `copula`,
+            of λ of nearby cells; `classes`, also of the class of look-alike cells.
         world: Draws of λ: a preset by name, paper or stakes, or {preset: NAME, noise:
-            resampled | stored |
-            frozen, correlation_m: 1.5, kernel: gaussian | matern32, immobile: {below:
-                0.1, for_s: 2},
-            time_budget_s: T or time_budget_ratio: T over the map's reference time}; or
-                a list of several.
+            resampled | stored | frozen, correlation_m: 1.5, kernel: gaussian |
+            matern32, immobile: {below: 0.1, for_s: 2}, time_budget_s: T or
+            time_budget_ratio: T over the map's reference time}; or a list of several.
         task: Changes to the preset's rules: {free_space: {by: risk | mean, above: 0.3},
-            min_traversability: 0.3,
-            goal_radius_m: 1.0, unseen: prior | optimistic | pessimistic,
-                replan_every_s: 0.5}.
-        maps: Maps of each scenario, the first of its split; 0 takes all.
+            min_traversability: 0.3, goal_radius_m: 1.0, unseen: prior | optimistic |
+            pessimistic, replan_every_s: 0.5}.
+        maps: Number of maps of each scenario, from the start of its split; 0 takes all.
         seed: Root seed of all draws.
         seeds: Several root seeds; not together with `seed`.
-        realisations: Draws of λ for each map and seed.
-        record: Stored in addition to rows; each level includes those before it: none;
-            steps of all episodes; recordings for playback of each condition's first
-            map; of failures; of all episodes.
+        realisations: Number of draws of λ for each map and seed.
+        record: Data stored in addition to rows; each level includes the levels before
+            it: none; steps of all episodes; recordings for playback of each condition's
+            first map; of failures; of all episodes.
         conditions: Several products: mappings of the keys above. A missing key takes
-            its value above.
+            the value above.
         hypotheses: Hypotheses, fixed before the first unit is run: mappings of `one`
             and `other`, conditions by their labels, such as {planner: mppi, risk:
             mean}; `metric`: success, T_total, score, traversability, path_length or the
             name of another metric; `kind`: difference, non-inferiority, superiority or
-            equivalence;
-            `direction`: higher or lower; `margin`.
+            equivalence; `direction`: higher or lower; `margin`.
         metrics: Metrics of episodes in addition to the built-in ones, such as
             energy:120.
         figures: Custom figures for the report, after the shipped ones.
@@ -127,17 +123,8 @@ class Suite:
             specs = tuple(_as_plain(kind, spec) for spec in getattr(self, name))
             object.__setattr__(self, name, specs)
         object.__setattr__(self, "model", _as_plain("model", self.model))
-        for name in (
-            "planners",
-            "risks",
-            "robots",
-            "objectives",
-            "sensors",
-            "grounds",
-            "beliefs",
-            "world",
-        ):
-            if not getattr(self, name):
+        for name in (*PART_FIELDS, "world"):
+            if name != "models" and not getattr(self, name):
                 raise ConfigError(f"Expected one or more `{name}`, got none.")
         for name in ("model", "seed"):
             value = getattr(self, name)
@@ -165,7 +152,7 @@ class Suite:
 
     @property
     def plain(self) -> dict[str, Any]:
-        """The suite as plain data, as `run.json` holds it."""
+        """The suite as plain data, as in `run.json`."""
         return dict(plain(self))
 
     @property
@@ -173,8 +160,8 @@ class Suite:
         """Values that each product lists, by field; the suite's values by default.
 
         Raises:
-            ConfigError: If a mapping of `conditions` has an unknown key, or one in the
-                singular and in the plural.
+            ConfigError: If a mapping of `conditions` has an unknown key, or a key both
+                in the singular and in the plural.
         """
         defaults = {key: getattr(self, key) for key in _LISTED}
         defaults["models"] = self.models or self.model
@@ -238,7 +225,7 @@ def check_size(
     maps: int,
     block_maps: int = MAX_EPISODES,
 ) -> None:
-    """Reject a run that is larger than any study, before it is built.
+    """Reject a run that is larger than any study needs, before it is built.
 
     Args:
         conditions: number of conditions.
@@ -256,10 +243,9 @@ def check_size(
     if episodes > MAX_EPISODES or n_units > MAX_UNITS:
         raise ConfigError(
             f"Expected a run of at most {MAX_EPISODES:,} episodes in {MAX_UNITS:,} "
-            f"units, got {episodes:,} episodes in "
-            f"{n_units:,}: {conditions} conditions × {seeds} seeds × {realisations} "
-            f"`realisations` × {maps} `maps`. "
-            "Ask for fewer."
+            f"units, got {episodes:,} episodes in {n_units:,}: {conditions} conditions "
+            f"× {seeds} seeds × {realisations} `realisations` × {maps} `maps`. Request "
+            "fewer."
         )
 
 
@@ -268,8 +254,8 @@ class Labels:
     """Labels that select conditions of a run: one or several of each column.
 
     Args:
-        planner: Planners, separated by commas, such as astar_dwa; a part of a file by
-            the name of its class. The other columns work alike.
+        planner: Planners, separated by commas, such as astar_dwa; a planner in a file
+            by the name of its class. Other columns are given in the same way.
         risk: Risk settings.
         scenario: Scenarios.
         model: Models.

@@ -1,4 +1,4 @@
-"""Sweeps of a suite: an option given a list of values stands for each of them."""
+"""Sweeps of a suite: an option with a list of values yields one part for each value."""
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
@@ -22,7 +22,13 @@ _Chosen = dict[tuple[str, ...], Any]  # values by their path in a mapping
 
 
 def part_of(kind: str, spec: Mapping[str, Any], label: str) -> Part:
-    """Return the part that `part` and `options` describe."""
+    """Return a part from its description.
+
+    Args:
+        kind: one of `registry.KINDS`.
+        spec: mapping with `part` and `options`.
+        label: label of the part.
+    """
     part_class = ModelPart if kind == "model" else Part
     return part_class(
         kind=kind, part=spec["part"], label=label, options=spec["options"]
@@ -91,16 +97,18 @@ def each_part(kind: str, part: Part) -> list[Part]:
     """
     options = registry.options_of(kind, registry.find(kind, part.part).target)
     first = next(iter(options), "")
-    swept = {
-        name: value
-        for name, value in part.options.items()
-        if name in options and not _accepts(kind, part.part, name, options[name], value)
-    }
+    swept = {}
+    for name, value in part.options.items():
+        if name not in options:
+            continue
+        if not _accepts(kind, part.part, name, options[name], value):
+            swept[name] = value
     parts = []
     for chosen in _choices(swept):
         named = {".".join(path): value for path, value in chosen.items()}
         label = registry.label_of(part.label, named, first)
-        parts.append(replace(part, label=label, options=_with(part.options, chosen)))
+        chosen_options = _with(part.options, chosen)
+        parts.append(replace(part, label=label, options=chosen_options))
     return parts
 
 
@@ -130,14 +138,15 @@ def check_count(counts: Iterable[int]) -> None:
     """
     counts = [count for count in counts if count > 1]
     if math.prod(counts) > MAX_CONDITIONS:
-        product_of = " × ".join(map(str, counts))
+        factors = " × ".join(map(str, counts))
         raise ConfigError(
             f"Expected at most {MAX_CONDITIONS:,} settings, got a product of "
-            f"{product_of} values. List fewer."
+            f"{factors} values. List fewer."
         )
 
 
 def _accepts(kind: str, source: str, name: str, option: Any, value: Any) -> bool:
+    """Return whether an option accepts a value as it is, such as a pair of bounds."""
     try:
         read(option.kind, value, of(f"{kind} {source!r}"), name)
     except ConfigError:

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +11,9 @@ from benchnav.core.store import Shard
 from benchnav.eval.experiment.condition import Condition, condition_names
 from benchnav.eval.experiment.suite import Record
 
-BLOCK_MAPS = 50
-# columns by which an episode of a condition is known
-# columns that identify an episode of a condition
-DRAW = [
-    "seed",
-    "realisation",
-    "map",
-]
+BLOCK_MAPS = 50  # maps of a block
+# Columns that identify an episode of a condition.
+DRAW = ["seed", "realisation", "map"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,9 +30,8 @@ class Extent:
     @classmethod
     def product(cls, seeds: Iterable[int], realisations: int, maps: int) -> "Extent":
         """Return the extent of the same maps under each seed and realisation."""
-        return cls(
-            draws=tuple((seed, r, maps) for seed in seeds for r in range(realisations))
-        )
+        draws = [(seed, r, maps) for seed in seeds for r in range(realisations)]
+        return cls(draws=tuple(draws))
 
     @property
     def seeds(self) -> tuple[int, ...]:
@@ -58,8 +52,10 @@ class Extent:
         """Return the union of two extents."""
         n_maps: dict[tuple[int, int], int] = {}
         for seed, realisation, maps in (*self.draws, *other.draws):
-            n_maps[seed, realisation] = max(maps, n_maps.get((seed, realisation), 0))
-        return Extent(draws=tuple((*key, maps) for key, maps in n_maps.items()))
+            draw = (seed, realisation)
+            n_maps[draw] = max(maps, n_maps.get(draw, 0))
+        draws = [(*draw, maps) for draw, maps in n_maps.items()]
+        return Extent(draws=tuple(draws))
 
 
 Conditions = Mapping[str, tuple[Condition, Extent]]  # by id, each with its extent
@@ -70,11 +66,11 @@ class Unit:
     """One batch of episodes.
 
     Args:
-        condition: the condition.
+        condition: condition of all episodes.
         seed: root seed.
         realisation: index of the draw of λ.
         maps: indices of maps of the condition's split, all of one block.
-        record: what is stored in addition to rows: the `steps` of all episodes;
+        record: data that are stored in addition to rows: the `steps` of all episodes;
             recordings of the condition's `first` map, of `failures`, or of `all`.
         leads: whether this is the first unit of its condition.
         metrics: metrics in addition to the built-in ones.
@@ -97,10 +93,12 @@ class Unit:
         """Return the shard that contains the unit if a run has `of` shards.
 
         The shard depends only on the unit and `of`, so that extending a run moves no
-        unit. Blocks, realisations and seeds of a condition go to the shards in turn,
-        from the shard that the condition's id (a digest) selects.
+        unit to another shard. Blocks, realisations and seeds of a condition are
+        assigned to the shards in turn, from the shard that the condition's id (a
+        digest) selects.
         """
-        turn = int(self.condition.id, 16) + self.seed + self.realisation + self.block
+        first = int(self.condition.id, 16)
+        turn = first + self.seed + self.realisation + self.block
         return Shard(index=turn % of + 1, of=of)
 
     @property
@@ -120,30 +118,39 @@ class Unit:
         digits, `_` and `-` without a warning, and all else becomes `-`.
         """
         labels = self.condition.labels
-        words = [labels[name] for name in ("planner", "risk", "scenario")]
-        words += [
+        words = [
+            labels["planner"],
+            labels["risk"],
+            labels["scenario"],
             self.condition.id[:8],
             f"{self.seed}",
             f"{self.realisation}",
             f"{self.maps[member]:05d}",
         ]
         cleaned = [re.sub(r"[^A-Za-z0-9_-]+", "-", word) for word in words]
-        return Path("playback", "-".join(cleaned) + suffix)
+        stem = "-".join(cleaned)
+        return Path("playback", f"{stem}{suffix}")
 
     def watched(self) -> list[int]:
         """Return the episodes that may be recorded if all of them fail."""
         return self.recorded([False] * len(self.maps))
 
     def recorded(self, succeeded: Sequence[bool]) -> list[int]:
-        """Return the indices of the recorded episodes, from whether each succeeded."""
-        first = [0] if self.leads else []
-        failed = [member for member, success in enumerate(succeeded) if not success]
-        chosen = {
-            "first": first,
-            "failures": sorted({*first, *failed}),
-            "all": list(range(len(self.maps))),
-        }
-        return chosen.get(self.record, [])
+        """Return the indices of the episodes that are recorded.
+
+        Args:
+            succeeded: whether each episode succeeded.
+        """
+        members = range(len(self.maps))
+        if self.record == "all":
+            return list(members)
+        first = {0} if self.leads else set()
+        if self.record == "first":
+            return list(first)
+        if self.record == "failures":
+            failed = {member for member in members if not succeeded[member]}
+            return sorted(first | failed)
+        return []
 
 
 def steps_path(condition_id: str, name: str) -> Path:
@@ -154,22 +161,20 @@ def steps_path(condition_id: str, name: str) -> Path:
 def units(
     conditions: Conditions, record: Record = "none", metrics: Sequence[Part] = ()
 ) -> list[Unit]:
-    """Split conditions into units of work, ordered so that predictions are shared.
+    """Split conditions into units of work, ordered so that predictions are reused.
 
-    Units of blind planners need no prediction, are the shortest and come last of their
+    Units of blind planners need no prediction, are the shortest and come last in their
     block: a worker's memory is measured after its first unit, and a worker whose memory
     grows much thereafter is replaced, which takes long.
 
     Args:
         conditions: conditions by id, each with its extent.
-        record: what is stored in addition to rows.
+        record: data that are stored in addition to rows.
         metrics: metrics in addition to the built-in ones.
     """
-    units_ = [
-        replace(unit, metrics=tuple(metrics))
-        for condition, extent in conditions.values()
-        for unit in _blocks(condition, extent, record)
-    ]
+    units_: list[Unit] = []
+    for condition, extent in conditions.values():
+        units_ += _blocks(condition, extent, record, tuple(metrics))
     order = {condition_id: index for index, condition_id in enumerate(conditions)}
 
     def run_order(unit: Unit) -> tuple[Any, ...]:
@@ -185,9 +190,12 @@ def units(
 def in_table_order(units_: Iterable[Unit], conditions: Conditions) -> list[Unit]:
     """Return units in the order of tables, regardless of the order of running."""
     order = {condition_id: index for index, condition_id in enumerate(conditions)}
-    return sorted(
-        units_, key=lambda u: (order[u.condition.id], u.seed, u.realisation, u.block)
-    )
+
+    def table_order(unit: Unit) -> tuple[int, ...]:
+        index = order[unit.condition.id]
+        return (index, unit.seed, unit.realisation, unit.block)
+
+    return sorted(units_, key=table_order)
 
 
 def unit_names(units_: Sequence[Unit]) -> Callable[[Unit], str]:
@@ -206,7 +214,10 @@ def unit_names(units_: Sequence[Unit]) -> Callable[[Unit], str]:
         words += [f"{draw} {getattr(unit, draw)}" for draw in draws]
         first = unit.maps[0]
         last = unit.maps[-1]
-        words.append(f"map {first}" if first == last else f"maps {first} to {last}")
+        if first == last:
+            words.append(f"map {first}")
+        else:
+            words.append(f"maps {first} to {last}")
         return ", ".join(words)
 
     return name
@@ -216,17 +227,21 @@ def _n_values(units_: Sequence[Unit], name: str) -> int:
     return len({getattr(unit, name) for unit in units_})
 
 
-def _blocks(condition: Condition, extent: Extent, record: Record) -> Iterator[Unit]:
+def _blocks(
+    condition: Condition, extent: Extent, record: Record, metrics: tuple[Part, ...]
+) -> Iterator[Unit]:
+    """Yield the units of a condition, one per draw and block of maps."""
     leads = True
     for seed, realisation, maps in extent.draws:
         for start in range(0, maps, BLOCK_MAPS):
-            block = tuple(range(start, min(start + BLOCK_MAPS, maps)))
+            end = min(start + BLOCK_MAPS, maps)
             yield Unit(
                 condition=condition,
                 seed=seed,
                 realisation=realisation,
-                maps=block,
+                maps=tuple(range(start, end)),
                 record=record,
                 leads=leads,
+                metrics=metrics,
             )
             leads = False

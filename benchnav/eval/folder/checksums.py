@@ -1,8 +1,8 @@
 """Checksums of files derived from a run: reports, figures, playback, map, tracebacks.
 
-They are in `SHA256SUMS` of the run folder, which `sha256sum --check` also reads.
-`run.json`, units and steps contain their own digests, and `run.json` the digest of the
-table of episodes.
+They are stored in `SHA256SUMS` of the run folder, which `sha256sum --check` also reads.
+Other files need no checksum: `run.json`, units and steps contain their own digests, and
+`run.json` contains the digest of the table of episodes.
 """
 
 import re
@@ -24,10 +24,14 @@ def read_checksums(folder: Path) -> dict[str, str]:
     """
     path = folder / SUMS
     text = path.read_text(errors="replace") if path.is_file() else ""
-    matches = [(line, _LINE.fullmatch(line)) for line in text.splitlines()]
-    return dict(
-        (match[2], match[1]) if match else (line, "") for line, match in matches
-    )
+    checksums = {}
+    for line in text.splitlines():
+        match = _LINE.fullmatch(line)
+        if match:
+            checksums[match[2]] = match[1]
+        else:
+            checksums[line] = ""
+    return checksums
 
 
 def note_checksums(folder: Path, files: Iterable[Path]) -> None:
@@ -40,14 +44,13 @@ def note_checksums(folder: Path, files: Iterable[Path]) -> None:
     if not (folder / RUN).is_file():
         return
     digests = read_checksums(folder)
-    digests |= {
-        path.relative_to(folder).as_posix(): digest_of_path(path) for path in files
-    }
-    lines = [
-        f"{digests[name]}  {name}\n"
-        for name in sorted(digests)
-        if digests[name] and (folder / name).is_file()
-    ]
+    for path in files:
+        name = path.relative_to(folder).as_posix()
+        digests[name] = digest_of_path(path)
+    lines = []
+    for name, digest in sorted(digests.items()):
+        if digest and (folder / name).is_file():
+            lines.append(f"{digest}  {name}\n")
     if lines or (folder / SUMS).exists():
         write_text(folder / SUMS, "".join(lines))
 
@@ -56,5 +59,6 @@ def is_as_noted(folder: Path, file: Path) -> bool:
     """Return whether a file of a run folder agrees with its recorded SHA-256, if any."""
     if not file.is_relative_to(folder):
         return True
-    digest = read_checksums(folder).get(file.relative_to(folder).as_posix())
+    name = file.relative_to(folder).as_posix()
+    digest = read_checksums(folder).get(name)
     return digest is None or digest == digest_of_path(file)

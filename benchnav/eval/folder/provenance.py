@@ -46,8 +46,8 @@ _UNIT = "benchnav.eval.run.unit"
 _MAX_NAMED = 3
 
 Code = dict[str, dict[str, Any]]
-METRICS = "metrics"  # group of code of rows with further metrics
-# Next to the groups of code: what parts read, known only after they have run.
+METRICS = "metrics"  # group of the code of further metrics
+# Stored with the groups of code: what parts read, which is known only after a run.
 TOUCHED = "touched"
 
 
@@ -58,9 +58,9 @@ class Origin:
     Args:
         code: `environment` (versions, processor, device, time limit of planners),
             `modules` of this package with their digests, `parts`, the digests of other
-            code and files, and, if rows have further metrics, `metrics`, see
+            code and files, and, if rows have further metrics, `metrics` from
             `describe_metrics`.
-        maps: digest of the split's properties, and of each map.
+        maps: digest of the split's properties, followed by digests of the maps.
     """
 
     code: Code
@@ -68,8 +68,8 @@ class Origin:
 
     def key(self, unit: Unit) -> str:
         """Return the key of a unit with this origin, 16 hexadecimal digits."""
-        drawn = [unit.condition.id, unit.seed, unit.realisation, unit.maps]
-        return text_digest([*drawn, self.maps, self.code])[:16]
+        identity = [unit.condition.id, unit.seed, unit.realisation, unit.maps]
+        return text_digest([*identity, self.maps, self.code])[:16]
 
 
 def code_digest(code: Code) -> str:
@@ -87,14 +87,13 @@ class Origins:
 
     def __init__(self, planner_limit_s: float, device: str) -> None:
         """Start with an empty cache."""
-        self._environment = {
-            **{name: version(name) for name in PACKAGES},
-            "python": platform.python_version(),
-            "processor": torch.backends.cpu.get_cpu_capability(),
-            "compiles": can_compile(),
-            "device": gpu_name(device) or device,
-            "planner_limit_s": planner_limit_s,
-        }
+        environment: dict[str, Any] = {name: version(name) for name in PACKAGES}
+        environment["python"] = platform.python_version()
+        environment["processor"] = torch.backends.cpu.get_cpu_capability()
+        environment["compiles"] = can_compile()
+        environment["device"] = gpu_name(device) or device
+        environment["planner_limit_s"] = planner_limit_s
+        self._environment = environment
         self._codes: dict[str, Code] = {}
         self._maps: dict[tuple[Any, ...], tuple[str, ...]] = {}  # as in `Origin.maps`
 
@@ -103,17 +102,17 @@ class Origins:
         condition = unit.condition
         code_key = f"{condition.id} {unit.metrics}"
         if code_key not in self._codes:
-            metrics = {METRICS: describe_metrics(unit.metrics)} if unit.metrics else {}
-            self._codes[code_key] = {
-                "environment": self._environment,
-                **describe_parts(condition),
-                **metrics,
-            }
+            code: Code = {"environment": self._environment}
+            code |= describe_parts(condition)
+            if unit.metrics:
+                code[METRICS] = describe_metrics(unit.metrics)
+            self._codes[code_key] = code
         maps_key = condition.data, condition.split, unit.maps
         if maps_key not in self._maps:
             dataset = condition.dataset
+            properties = dataset.about_digest(condition.split)
             digests = map_digests(dataset, condition.split, unit.maps)
-            self._maps[maps_key] = (dataset.about_digest(condition.split), *digests)
+            self._maps[maps_key] = (properties, *digests)
         return Origin(code=self._codes[code_key], maps=self._maps[maps_key])
 
 
@@ -130,12 +129,12 @@ def describe_parts(condition: Condition) -> Code:
         if target.shipped:
             modules.append(target.target.__module__)
         else:
-            parts[f"class of {name}" if folder else name] = text_digest(
-                [target.origin, target.digest]
-            )
-        files = registry.option_files(part)
-        parts |= {f"{text} of {name}": digest for text, digest in files.items()}
-    if statistics := condition.statistics:
+            class_name = f"class of {name}" if folder else name
+            parts[class_name] = text_digest([target.origin, target.digest])
+        for text, digest in registry.option_files(part).items():
+            parts[f"{text} of {name}"] = digest
+    statistics = condition.statistics
+    if statistics:
         parts["statistics of the ground"] = text_digest(statistics.to_json())
     return {"modules": package_modules(modules), "parts": parts}
 
@@ -145,11 +144,9 @@ def describe_metrics(metrics: Iterable[Part]) -> dict[str, Any]:
     described = {}
     for part in metrics:
         target = part.found
-        sources = (
-            package_modules([target.target.__module__])
-            if target.shipped
-            else [target.origin, target.digest]
-        )
+        sources: Any = [target.origin, target.digest]
+        if target.shipped:
+            sources = package_modules([target.target.__module__])
         files = registry.option_files(part)
         described[part.object.column] = {
             "part": part.part,
@@ -166,17 +163,14 @@ def lacks_metrics(code: Mapping[str, Any], expected: Code) -> list[str]:
         code: code of the rows.
         expected: code of rows that have the metrics.
     """
-    return [
-        column
-        for column in expected.get(METRICS, {})
-        if column not in code.get(METRICS, {})
-    ]
+    columns = code.get(METRICS, {})
+    return [column for column in expected.get(METRICS, {}) if column not in columns]
 
 
 def touches(condition: Condition, metrics: Iterable[Part] = ()) -> Touches:
     """Return what custom parts read in this process; see `benchnav.core.touched`."""
-    parts_found = [part.found for part in (*metrics, *condition.parts.values())]
-    return touches_of(found.target for found in parts_found if not found.shipped)
+    sources = [part.found for part in (*metrics, *condition.parts.values())]
+    return touches_of(source.target for source in sources if not source.shipped)
 
 
 def describe_datasets(conditions: Conditions) -> dict[str, Any]:
@@ -185,9 +179,8 @@ def describe_datasets(conditions: Conditions) -> dict[str, Any]:
     for condition, extent in conditions.values():
         dataset = condition.dataset
         split = condition.split
-        entry = described.setdefault(
-            condition.data, {"id": dataset.id, "maps": {}, "about": {}}
-        )
+        empty = {"id": dataset.id, "maps": {}, "about": {}}
+        entry = described.setdefault(condition.data, empty)
         if extent.maps > len(entry["maps"].get(split, ())):
             entry["maps"][split] = map_digests(dataset, split, range(extent.maps))
             entry["about"][split] = dataset.about_digest(split)
@@ -196,61 +189,64 @@ def describe_datasets(conditions: Conditions) -> dict[str, Any]:
 
 def map_digests(dataset: TerrainDataset, split: str, maps: Sequence[int]) -> list[str]:
     """Return digests of some maps of a split, 16 hexadecimal digits each."""
-    return [
-        digest_of([entry.tobytes()])[:16]
-        for entry in dataset.entry_digests(split, maps)
-    ]
+    entries = dataset.entry_digests(split, maps)
+    return [digest_of([entry.tobytes()])[:16] for entry in entries]
 
 
 def code_differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """Describe entries that two codes both have and that differ.
+    """Describe entries that differ between two codes and that both have.
 
     Args:
-        earlier: as `Origin.code`, perhaps with `TOUCHED`.
-        now: likewise.
+        earlier: code as in `Origin.code`; it may also contain `TOUCHED`.
+        now: the other code, likewise.
     """
-    differing: dict[str, list[str]] = {}
-    for group in ("modules", "environment", "parts", METRICS):
-        values = now.get(group, {})
-        differing[group] = [
-            name
-            for name, value in earlier.get(group, {}).items()
-            if values.get(name, value) != value
-        ]
-    modules = differing["modules"]
-    more = ""
-    if len(modules) > _MAX_NAMED:
-        more = f" and {len(modules) - _MAX_NAMED} more of its modules"
     lines = []
+    modules = _differing(earlier, now, "modules")
     if modules:
+        more = ""
+        if len(modules) > _MAX_NAMED:
+            more = f" and {len(modules) - _MAX_NAMED} more of its modules"
         lines.append(f"{', '.join(modules[:_MAX_NAMED])}{more}")
-    for name in differing["environment"]:
+    for name in _differing(earlier, now, "environment"):
         before = earlier["environment"][name]
         lines.append(f"{name} ({before} to {now['environment'][name]})")
-    lines += differing["parts"]
-    lines += [f"metric {column}" for column in differing[METRICS]]
+    lines += _differing(earlier, now, "parts")
+    lines += [f"metric {column}" for column in _differing(earlier, now, METRICS)]
     lines += unlike(earlier.get(TOUCHED, {}), now.get(TOUCHED, {}))
     return lines
+
+
+def _differing(
+    earlier: Mapping[str, Any], now: Mapping[str, Any], group: str
+) -> list[str]:
+    """Return the names of entries of a group that differ and that both codes have."""
+    values = now.get(group, {})
+    return [
+        name
+        for name, value in earlier.get(group, {}).items()
+        if values.get(name, value) != value
+    ]
 
 
 def dataset_differences(
     earlier: Mapping[str, Any], now: Mapping[str, Any]
 ) -> list[str]:
-    """Describe maps that two runs both have and that differ.
+    """Describe maps that differ between two runs and that both have.
 
     Args:
-        earlier: from `describe_datasets`.
-        now: likewise.
+        earlier: datasets of a run, from `describe_datasets`.
+        now: datasets of the other run.
     """
     changed = []
     for data, entry in earlier.items():
         now_entry = now.get(data, {"maps": {}, "about": {}})
         for split, digests in entry["maps"].items():
-            pairs = zip(digests, now_entry["maps"].get(split, digests), strict=False)
-            if any(before != after for before, after in pairs):
+            now_digests = now_entry["maps"].get(split, digests)
+            n_common = min(len(digests), len(now_digests))
+            if list(digests[:n_common]) != list(now_digests[:n_common]):
                 changed.append(f"maps of {data} {split}")
-            meaning = entry["about"][split]
-            if now_entry["about"].get(split, meaning) != meaning:
+            properties = entry["about"][split]
+            if now_entry["about"].get(split, properties) != properties:
                 changed.append(f"{MEANING} of {data} {split}")
     return changed
 
@@ -263,7 +259,7 @@ def describe_machine() -> dict[str, Any]:
 def extend_history(
     earlier: Iterable[Mapping[str, Any]], suite: Mapping[str, Any]
 ) -> list[Mapping[str, Any]]:
-    """Append an entry for this command to a history, unless it is repeated.
+    """Append an entry for this command to a history, unless the command is repeated.
 
     An entry has command, suite, date, machine, version and git commit of this package.
     The commit ends in `+` if files differ from it, and is empty without a repository.
@@ -272,19 +268,21 @@ def extend_history(
         earlier: existing entries.
         suite: suite of this command, as it was written.
     """
+    program, *arguments = sys.argv
     request = {
-        "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        "command": shlex.join([Path(program).name, *arguments]),
         "suite": dict(suite),
         **describe_machine(),
         "benchnav": benchnav.__version__,
         "commit": _commit(),
     }
-    now = {
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        **json.loads(json.dumps(request)),
-    }
-    is_repeated = any({**entry, "date": now["date"]} == now for entry in earlier)
-    return [*earlier, *([] if is_repeated else [now])]
+    date = datetime.now(UTC).isoformat(timespec="seconds")
+    now = {"date": date, **json.loads(json.dumps(request))}
+    history = list(earlier)
+    is_repeated = any({**entry, "date": date} == now for entry in history)
+    if not is_repeated:
+        history.append(now)
+    return history
 
 
 def join(*lists: Iterable[Any]) -> list[Any]:
@@ -306,21 +304,25 @@ def _processor() -> str:
     cpuinfo = Path("/proc/cpuinfo")
     text = cpuinfo.read_text(errors="replace") if cpuinfo.is_file() else ""
     named = re.search(r"^model name\s*: (.+)$", text, re.MULTILINE)
-    return named[1].strip() if named else platform.processor() or platform.machine()
+    if named:
+        return named[1].strip()
+    return platform.processor() or platform.machine()
 
 
 @cache
 def _commit() -> str:
     def git(*words: str) -> str:
         command = ["git", "-C", str(PACKAGE), *words]
-        return subprocess.run(
+        completed = subprocess.run(
             command, capture_output=True, text=True, check=True, timeout=10
-        ).stdout.strip()
+        )
+        return completed.stdout.strip()
 
     try:
         # Fails if the repository is another project's.
         git("ls-files", "--error-unmatch", "__init__.py")
         changed = git("status", "--porcelain", "--", ".")
-        return git("rev-parse", "HEAD") + ("+" if changed else "")
+        mark = "+" if changed else ""
+        return git("rev-parse", "HEAD") + mark
     except (OSError, subprocess.SubprocessError):
         return ""

@@ -1,7 +1,7 @@
-"""Rows of a run: its table if it is finished, else its finished units.
+"""Rows of a run: its table if the run is finished, else its finished units.
 
 Nothing is locked or written, so that a run can be read while another process works on
-it: each unit is one file, written atomically.
+it: each unit is one file, which is written atomically.
 """
 
 from collections.abc import Mapping
@@ -30,11 +30,11 @@ _NAMED = 3
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Results:
-    """Rows of a run, and how many of its units are finished.
+    """Rows of a run, and the number of its finished units.
 
     Args:
-        run: the run; if it is not finished, `about` has the `codes` of finished units.
-        episodes: a row an episode.
+        run: the run; if it is not finished, its manifest has the `codes` of finished units.
+        episodes: one row per episode.
         finished: number of units with rows.
         units: number of units of the run.
         without: names of the conditions without an episode.
@@ -58,10 +58,9 @@ class Results:
     @property
     def conditions(self) -> dict[str, Any]:
         """Entries of `run.json` of conditions that have rows, by id, in its order."""
-        shown = set(self.episodes["condition"])
-        return {
-            i: entry for i, entry in self.run.about["conditions"].items() if i in shown
-        }
+        with_rows = set(self.episodes["condition"])
+        entries = self.run.manifest["conditions"]
+        return {i: entry for i, entry in entries.items() if i in with_rows}
 
     def notes(self) -> list[str]:
         """Return notes for readers of partial results; empty if the run is finished."""
@@ -75,16 +74,14 @@ class Results:
             "for one that is read repeatedly as it grows"
         ]
         if self.without:
-            more = ""
+            named = "; ".join(self.without[:_NAMED])
             if len(self.without) > _NAMED:
-                more = f" and {len(self.without) - _NAMED} more"
+                named += f" and {len(self.without) - _NAMED} more"
+            lines.append(f"{self.mark}, no episode yet: {named}")
+        n_codes = len(self.run.manifest["codes"])
+        if n_codes > 1:
             lines.append(
-                f"{self.mark}, no episode yet: {'; '.join(self.without[:_NAMED])}{more}"
-            )
-        if len(self.run.about["codes"]) > 1:
-            count = len(self.run.about["codes"])
-            lines.append(
-                f"{self.mark}, made by {count} versions of the code; column `code` "
+                f"{self.mark}, made by {n_codes} versions of the code; column `code` "
                 "indicates which rows"
             )
         return lines
@@ -105,27 +102,28 @@ def read_results(folder: Path, partial: bool = False) -> Results:
     if (folder / EPISODES).exists() or not partial:
         return Results(run=run, episodes=read_table(folder, EPISODES))
     all_units = newest_units(run)
-    finished_units = [
-        (unit, making) for unit, making in all_units if making is not None
-    ]
-    finished = [making for _, making in finished_units]
+    finished = []
+    tables = []
+    for unit, making in all_units:
+        if making is not None:
+            finished.append(making)
+            tables.append(labelled_rows(unit, making))
     if not finished:
         raise ConfigError(
-            f"Expected a run with a finished unit, got {folder} with none of "
-            f"{len(all_units)}. Wait for the first, or give "
-            "its `benchnav-eval run` command."
+            f"Expected a run with a finished unit, got {folder}, where 0 of "
+            f"{len(all_units)} units are finished. Wait for the first, or give its "
+            "`benchnav-eval run` command."
         )
-    episodes = pd.concat(
-        [labelled_rows(unit, making) for unit, making in finished_units],
-        ignore_index=True,
-    )
-    shown = set(episodes["condition"])
+    episodes = pd.concat(tables, ignore_index=True)
+    with_rows = set(episodes["condition"])
     names = condition_names([condition for condition, _ in run.conditions.values()])
-    without = [
-        name for i, name in zip(run.conditions, names, strict=True) if i not in shown
-    ]
+    without = []
+    for condition_id, name in zip(run.conditions, names, strict=True):
+        if condition_id not in with_rows:
+            without.append(name)
+    manifest = {**run.manifest, "codes": _codes(finished), "reused": ""}
     return Results(
-        run=replace(run, about={**run.about, "codes": _codes(finished), "reused": ""}),
+        run=replace(run, manifest=manifest),
         episodes=episodes,
         finished=len(finished),
         units=len(all_units),
@@ -136,10 +134,11 @@ def read_results(folder: Path, partial: bool = False) -> Results:
 
 def newest_units(run: Run) -> list[tuple[Unit, Finished | None]]:
     """Return the units of a run in the order of its table, with their newest making."""
-    all_units = in_table_order(units(run.conditions), run.conditions)
-    return [
-        (unit, next(iter(find_units(run.folder, unit)), None)) for unit in all_units
-    ]
+    newest = []
+    for unit in in_table_order(units(run.conditions), run.conditions):
+        makings = find_units(run.folder, unit)
+        newest.append((unit, makings[0] if makings else None))
+    return newest
 
 
 def code_of(run: Run, digest: str) -> Mapping[str, Any]:
@@ -149,16 +148,15 @@ def code_of(run: Run, digest: str) -> Mapping[str, Any]:
         run: a run, finished or not.
         digest: digest of the code.
     """
-    codes = run.about.get("codes", {})
-    if digest not in codes:  # of a unit that no table has yet
-        codes = _codes(
-            [making for _, making in newest_units(run) if making is not None]
-        )
+    codes = run.manifest.get("codes", {})
+    if digest not in codes:  # of a unit that is not yet in the table
+        makings = [making for _, making in newest_units(run) if making is not None]
+        codes = _codes(makings)
     code: Mapping[str, Any] = codes[digest]
     return code
 
 
 def _codes(finished: list[Finished]) -> dict[str, Any]:
-    return {
-        code_digest(making.about["code"]): making.about["code"] for making in finished
-    }
+    """Return the codes of finished units by digest."""
+    codes = [making.metadata["code"] for making in finished]
+    return {code_digest(code): code for code in codes}

@@ -57,13 +57,13 @@ class Run:
 
     Args:
         folder: path of the folder.
-        about: contents of `run.json`.
+        manifest: contents of its `run.json`.
         conditions: conditions by id, each with its extent.
         shard: shard of the run that the folder contains; None for a whole run.
     """
 
     folder: Path
-    about: dict[str, Any]
+    manifest: dict[str, Any]
     conditions: dict[str, tuple[Condition, Extent]]
     shard: Shard | None = None
 
@@ -79,21 +79,12 @@ def open_run(folder: Path) -> Run:
             f"Expected a run folder with {RUN}, got {folder}. Make one with "
             "`benchnav-eval run`."
         )
-    with damaged(
-        folder / RUN, "Take it from a copy, or run the suite again into another folder."
-    ):
+    remedy = "Take it from a copy, or run the suite again into another folder."
+    with damaged(folder / RUN, remedy):
         text = (folder / RUN).read_text()
         version = _format_version(json.loads(text))
         if version == FORMAT_VERSION:
-            manifest = unseal(text)
-            conditions = {}
-            for i, entry in manifest["conditions"].items():
-                draws = tuple(tuple(draw) for draw in entry["draws"])
-                conditions[i] = condition_from(entry), Extent(draws=draws)
-            shard = Shard(**manifest["shard"]) if "shard" in manifest else None
-            return Run(
-                folder=folder, about=manifest, conditions=conditions, shard=shard
-            )
+            return _run_of(folder, unseal(text))
     remedy = "Read it with a newer benchnav: pip install --upgrade benchnav"
     if version < FORMAT_VERSION:
         remedy = "Run its suite again, or read it with benchnav 1.3"
@@ -101,6 +92,16 @@ def open_run(folder: Path) -> Run:
         f"Expected a run folder of format version {FORMAT_VERSION}, got {folder} of "
         f"version {version}. {remedy}."
     )
+
+
+def _run_of(folder: Path, manifest: dict[str, Any]) -> Run:
+    """Return the run that a `run.json` describes."""
+    conditions = {}
+    for condition_id, entry in manifest["conditions"].items():
+        draws = tuple(tuple(draw) for draw in entry["draws"])
+        conditions[condition_id] = condition_from(entry), Extent(draws=draws)
+    shard = Shard(**manifest["shard"]) if "shard" in manifest else None
+    return Run(folder=folder, manifest=manifest, conditions=conditions, shard=shard)
 
 
 def _format_version(manifest: Any) -> int:
@@ -126,12 +127,12 @@ def caveats(manifest: Mapping[str, Any]) -> list[str]:
     Args:
         manifest: contents of `run.json`, at least `warnings` and `dropped`.
     """
-    left_out = [f"left out: {_in_words(entry)}" for entry in manifest["dropped"]]
-    warnings = [
-        *manifest["warnings"],
-        *([manifest["reused"]] if manifest.get("reused") else []),
-    ]
-    return [*(f"warning: {line}" for line in warnings), *left_out]
+    warnings = list(manifest["warnings"])
+    if manifest.get("reused"):
+        warnings.append(manifest["reused"])
+    lines = [f"warning: {line}" for line in warnings]
+    lines += [f"left out: {_in_words(entry)}" for entry in manifest["dropped"]]
+    return lines
 
 
 def dropped_labels(entry: Mapping[str, str]) -> dict[str, str]:
@@ -140,12 +141,12 @@ def dropped_labels(entry: Mapping[str, str]) -> dict[str, str]:
 
 
 def _in_words(entry: Mapping[str, str]) -> str:
-    """Return a combination that was left out, and why, in words."""
-    labels = dropped_labels(entry).items()
-    words = ", ".join(
-        f"{column} {label}" for column, label in labels if label != NOT_USED
-    )
-    return f"{words}: {entry['reason']}"
+    """Return a combination that was left out, and the reason, in words."""
+    words = []
+    for column, label in dropped_labels(entry).items():
+        if label != NOT_USED:
+            words.append(f"{column} {label}")
+    return f"{', '.join(words)}: {entry['reason']}"
 
 
 def read_table(folder: Path, name: str) -> pd.DataFrame:
@@ -167,18 +168,24 @@ def read_table(folder: Path, name: str) -> pd.DataFrame:
         raise ConfigError(
             f"Expected a finished run, got {folder} without {name}. Give its "
             "`benchnav-eval run` command again to "
-            "finish it; `benchnav-eval report --partial` and `replay` read what is "
-            "there."
+            "finish it; `benchnav-eval report --partial` and `replay` read unfinished "
+            "runs."
         )
     with damaged(path, "Remove it and give the run's command again."):
-        if run.about.get("tables", {}).get(name) != digest_of_path(path):
+        digests = run.manifest.get("tables", {})
+        if digests.get(name) != digest_of_path(path):
             raise DamageError("it was changed after benchnav wrote it")
         return pd.read_parquet(path)
 
 
 @contextmanager
 def damaged(path: Path, remedy: str) -> Iterator[None]:
-    """Convert any error of reading a file into a ConfigError of one line."""
+    """Convert any error of reading a file into a ConfigError of one line.
+
+    Args:
+        path: path of the file, for the message.
+        remedy: sentence that says how to replace the file.
+    """
     try:
         yield
     except PermissionError:
@@ -196,14 +203,15 @@ class Finished:
 
     Args:
         path: file of the unit.
-        about: metadata of the file: `unit` (identity), `key`, `code`, `digests` of the
-            maps, `record`, `made` (a random token, which copies retain), `traceback`,
-            `errors`, `touched` (what custom parts read), and the digests `content` of
-            its rows, `steps` of its steps and `recordings` of its recordings by path.
+        metadata: metadata of the file: `unit` (its identity); `key`; `code`; `digests` of
+            the maps; `record`; `made`, a random token, which copies retain;
+            `traceback`; `errors`; `touched`, the files, packages and variables that
+            custom parts read; and digests: `content` of its rows, `steps` of its steps,
+            and `recordings` of its recordings by path.
     """
 
     path: Path
-    about: Mapping[str, Any]
+    metadata: Mapping[str, Any]
 
     @property
     def folder(self) -> Path:
@@ -213,52 +221,57 @@ class Finished:
     @property
     def metrics(self) -> set[str]:
         """Columns of its rows in addition to the built-in ones."""
-        return set(self.about["code"].get(METRICS, ()))
+        return set(self.metadata["code"].get(METRICS, ()))
 
     def has(self, unit: Unit) -> bool:
-        """Return whether the recordings that `unit` requests exist and are its own."""
-        if RECORDS.index(self.about["record"]) < RECORDS.index(unit.record):
+        """Return whether the steps and recordings that `unit` requests were stored.
+
+        Steps of another making of the unit do not count.
+        """
+        record = self.metadata["record"]
+        if RECORDS.index(record) < RECORDS.index(unit.record):
             return False
-        steps = self.folder / unit.steps_path
-        has_own_steps = metadata(steps).get("key") == self.about["key"]
-        return self.about["record"] == "none" or has_own_steps
+        if record == "none":
+            return True
+        steps_metadata = metadata(self.folder / unit.steps_path)
+        return bool(steps_metadata.get("key") == self.metadata["key"])
 
     def damage(self) -> list[str]:
         """Return a line for each damaged file of the unit, starting with its path.
 
-        Steps and recordings count if they belong to this making of the unit; a missing
-        file is no damage.
+        Only steps and recordings of this making of the unit are checked. A missing file
+        is no damage.
         """
         lines = damage_of(self.path, str(self.path.relative_to(self.folder)))
-        steps = steps_path(self.about["unit"][0], self.path.name.rpartition("-")[0])
-        steps_metadata = metadata(self.folder / steps)
-        if steps_metadata and steps_metadata.get("key") != self.about["key"]:
+        condition_id, *_ = self.metadata["unit"]
+        name, _, _ = self.path.name.rpartition("-")
+        steps = steps_path(condition_id, name)
+        steps_file = self.folder / steps
+        steps_metadata = metadata(steps_file)
+        if steps_metadata and steps_metadata.get("key") != self.metadata["key"]:
             return lines
-        if self.about.get("steps") and (self.folder / steps).exists():
-            is_own = steps_metadata.get(CONTENT) == self.about["steps"]
-            damage = damage_of(self.folder / steps, str(steps))
-            if not damage and not is_own:
+        if self.metadata.get("steps") and steps_file.exists():
+            damage = damage_of(steps_file, str(steps))
+            if not damage and steps_metadata.get(CONTENT) != self.metadata["steps"]:
                 damage = [f"{steps}: it holds the steps of another run"]
             lines += damage
-        for name, digest in self.about.get("recordings", {}).items():
-            if digest_of_path(self.folder / name) not in ("", digest):
-                lines.append(f"{name}: it was changed after benchnav wrote it")
+        for path, digest in self.metadata.get("recordings", {}).items():
+            if digest_of_path(self.folder / path) not in ("", digest):
+                lines.append(f"{path}: it was changed after benchnav wrote it")
         return lines
 
 
 def find_units(folder: Path, unit: Unit) -> list[Finished]:
     """Find all makings of a unit, of any code and maps, newest first."""
-    files = sorted(
-        (folder / "units" / unit.condition.id).glob(f"{unit.name}-*.parquet"),
-        key=lambda path: path.stat().st_mtime,
-        reverse=True,
-    )
-    makings = [Finished(path=path, about=metadata(path)) for path in files]
-    return [
-        finished
-        for finished in makings
-        if finished.about.get("unit") == _identity(unit)
-    ]
+    files = (folder / "units" / unit.condition.id).glob(f"{unit.name}-*.parquet")
+    newest_first = sorted(files, key=lambda path: path.stat().st_mtime, reverse=True)
+    identity = _identity(unit)
+    makings = []
+    for path in newest_first:
+        finished = Finished(path=path, metadata=metadata(path))
+        if finished.metadata.get("unit") == identity:
+            makings.append(finished)
+    return makings
 
 
 def unit_path(unit: Unit, key: str) -> Path:
@@ -267,6 +280,7 @@ def unit_path(unit: Unit, key: str) -> Path:
 
 
 def _identity(unit: Unit) -> list[Any]:
+    """Return condition, draw and maps of a unit, as its file stores them."""
     return [unit.condition.id, unit.seed, unit.realisation, *unit.maps]
 
 
@@ -282,14 +296,20 @@ def write_unit(
 
     Args:
         folder: the run folder.
-        unit: the unit.
+        unit: unit that was run.
         origin: origin of its rows.
-        rows: a row an episode.
+        rows: one row per episode.
         errors: messages of faults, a line each.
-        traceback: traceback of the first fault.
+        traceback: traceback of the first fault; empty if there was no fault.
     """
     key = origin.key(unit)
-    recordings = [unit.recording_path(member) for member in range(len(unit.maps))]
+    recordings = {}
+    for member in range(len(unit.maps)):
+        path = unit.recording_path(member)
+        digest = digest_of_path(folder / path)
+        if digest:
+            recordings[path.as_posix()] = digest
+    steps_metadata = metadata(folder / unit.steps_path)
     unit_metadata = {
         "unit": _identity(unit),
         "key": key,
@@ -300,16 +320,11 @@ def write_unit(
         "traceback": traceback,
         "errors": list(errors),
         TOUCHED: touches(unit.condition, unit.metrics),
-        "steps": metadata(folder / unit.steps_path).get(CONTENT, ""),
-        "recordings": {
-            path.as_posix(): digest
-            for path in recordings
-            if (digest := digest_of_path(folder / path))
-        },
+        "steps": steps_metadata.get(CONTENT, ""),
+        "recordings": recordings,
     }
-    table = pa.Table.from_pandas(
-        rows.assign(code=code_digest(origin.code)), preserve_index=False
-    )
+    with_code = rows.assign(code=code_digest(origin.code))
+    table = pa.Table.from_pandas(with_code, preserve_index=False)
     with replacing(folder / unit_path(unit, key)) as partial:
         pq.write_table(with_metadata(table, unit_metadata), partial)
 
@@ -319,7 +334,8 @@ def clear_unit(folder: Path, unit: Unit) -> None:
     (folder / unit.steps_path).unlink(missing_ok=True)
     for member in range(len(unit.maps)):
         for suffix in (".npz", ".rrd"):
-            (folder / unit.recording_path(member, suffix)).unlink(missing_ok=True)
+            path = folder / unit.recording_path(member, suffix)
+            path.unlink(missing_ok=True)
 
 
 def finish_run(
@@ -332,36 +348,32 @@ def finish_run(
         finished: all units of the run, in the order of the table.
         reused: a line on units of other code; empty without such units.
     """
-    manifest = open_run(folder).about
+    manifest = open_run(folder).manifest
     write_errors(folder, finished)
-    rows = pd.concat(
-        [labelled_rows(unit, making) for unit, making in finished], ignore_index=True
-    )
-    table = pa.Table.from_pandas(rows, preserve_index=False).replace_schema_metadata(
-        None
-    )
+    tables = [labelled_rows(unit, making) for unit, making in finished]
+    rows = pd.concat(tables, ignore_index=True)
+    table = pa.Table.from_pandas(rows, preserve_index=False)
     with replacing(folder / EPISODES) as partial:
-        pq.write_table(table, partial)
+        pq.write_table(table.replace_schema_metadata(None), partial)
     codes: dict[str, Any] = {}
     for _, making in finished:
-        code = codes.setdefault(
-            code_digest(making.about["code"]), {**making.about["code"], TOUCHED: {}}
-        )
-        code[TOUCHED] |= making.about.get(TOUCHED, {})
+        code = making.metadata["code"]
+        entry = codes.setdefault(code_digest(code), {**code, TOUCHED: {}})
+        entry[TOUCHED] |= making.metadata.get(TOUCHED, {})
     results = {
         "codes": codes,
         "reused": reused,
         "tables": {EPISODES: digest_of_path(folder / EPISODES)},
     }
-    if {name: manifest.get(name) for name in results} != results:
+    stored = {name: manifest.get(name) for name in results}
+    if stored != results:
         write_run(folder, {**manifest, **results})
 
 
 def write_errors(folder: Path, finished: Iterable[tuple[Unit, Finished]]) -> None:
     """Write `errors.txt` of all units, or remove it if nothing failed."""
-    traces = [
-        text for unit, making in finished if (text := _trace(unit, making, folder))
-    ]
+    texts = [_trace(unit, making, folder) for unit, making in finished]
+    traces = [text for text in texts if text]
     if traces:
         write_text(folder / ERRORS, "\n".join(traces))
     else:
@@ -374,9 +386,8 @@ def unit_rows(finished: Finished) -> pd.DataFrame:
     Raises:
         ConfigError: If its file is damaged.
     """
-    with damaged(
-        finished.path, "Give the run's command again, which runs the unit again."
-    ):
+    remedy = "Give the run's command again, which runs the unit again."
+    with damaged(finished.path, remedy):
         return read_sealed(finished.path).to_pandas()
 
 
@@ -392,22 +403,24 @@ def differences(
 
     Args:
         first: rows of episodes, in any order.
-        second: likewise.
+        second: rows of episodes, in any order.
 
     Returns:
-        The cells that differ, in the order of the first: `first`, `second`, by `KEYS`
-        and column; and the keys of episodes that are in only one table.
+        The cells that differ, in the order of the first table: `first`, `second`, by
+        `KEYS` and column; and the keys of episodes that are in only one table.
     """
-    columns = sorted(_results(first) & _results(second), key=list(first).index)
+    common_columns = _results(first) & _results(second)
+    columns = [name for name in first if name in common_columns]
     first_rows = first.set_index(KEYS)[columns]
     second_rows = second.set_index(KEYS)[columns]
     common = first_rows.index.intersection(second_rows.index, sort=False)
-    cells = first_rows.loc[common].compare(
-        second_rows.loc[common], result_names=("first", "second")
+    unmatched = first_rows.index.symmetric_difference(second_rows.index, sort=False)
+    names = ("first", "second")
+    compared = first_rows.loc[common].compare(
+        second_rows.loc[common], result_names=names
     )
-    lacking = first_rows.index.symmetric_difference(second_rows.index, sort=False)
-    cells = cells.stack(level=0, future_stack=True).dropna(how="all")
-    return cells.reindex(columns=["first", "second"]), lacking
+    cells = compared.stack(level=0, future_stack=True).dropna(how="all")
+    return cells.reindex(columns=list(names)), unmatched
 
 
 def differing_columns(first: pd.DataFrame, second: pd.DataFrame) -> list[str]:
@@ -416,15 +429,14 @@ def differing_columns(first: pd.DataFrame, second: pd.DataFrame) -> list[str]:
 
 
 def _results(rows: pd.DataFrame) -> set[str]:
-    """Return columns of results, without wall times and the digest of the code."""
-    others = (*KEYS, "code", "learning_ms")
-    return {
-        name for name in rows if name not in others and not name.startswith("planning_")
-    }
+    """Return the names of result columns: neither wall times nor digests of code."""
+    excluded = (*KEYS, "code", "learning_ms")
+    names = {name for name in rows if not name.startswith("planning_")}
+    return names.difference(excluded)
 
 
 def _trace(unit: Unit, finished: Finished, folder: Path) -> str:
-    unit_metadata = finished.about
+    unit_metadata = finished.metadata
     if not unit_metadata["traceback"] and not unit_metadata["errors"]:
         return ""
     maps = f"maps {unit.maps[0]}–{unit.maps[-1]}"

@@ -1,6 +1,6 @@
 """Parquet files of a run with digests of their contents, so that changes are detected.
 
-The metadata of a file is JSON text sealed as `run.json` is
+The metadata of a file is JSON text that contains its own digest, like `run.json`
 (`benchnav.core.store.seal`). It includes `content`, the digest of the table.
 """
 
@@ -29,7 +29,8 @@ def content_digest(table: pa.Table) -> str:
     """Return the SHA-256 of a table's columns: names, types and values.
 
     The order of columns does not matter. Columns without any value are ignored, since
-    files of steps receive such columns when a run is extended by another robot.
+    files of steps receive such columns when a run is extended by a robot with other
+    actions.
 
     Args:
         table: a table of numbers, Booleans and text.

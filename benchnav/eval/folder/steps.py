@@ -1,8 +1,7 @@
-"""Steps of episodes: one Parquet file a unit, one partition a condition.
+"""Steps of episodes: one Parquet file per unit, one partition per condition.
 
-The files are `steps/condition=ID/SEED-REALISATION-BLOCK.parquet`.
-
-Any reader of partitioned Parquet takes them: `pandas.read_parquet(run / "steps",
+The files are `steps/condition=ID/SEED-REALISATION-BLOCK.parquet`. Any reader of
+partitioned Parquet reads them, for example `pandas.read_parquet(run / "steps",
 filters=[("condition", "==", id)])`.
 """
 
@@ -26,7 +25,7 @@ from benchnav.eval.folder.sealed import metadata, read_sealed, with_metadata
 STEPS = "steps"
 
 LAST_COLUMN = "traversability"
-# RMSE of E[λ] and mean log score of the belief about the terrain ahead of a robot.
+# RMSE of E[λ], and mean log score of the belief, over the terrain ahead of a robot.
 AHEAD_COLUMNS = ("ahead_rmse", "ahead_log_score")
 # Range and half-angle of the terrain ahead of a robot.
 AHEAD_M = 5.0
@@ -43,7 +42,7 @@ def write_steps(folder: Path, unit: Unit, key: str, table: pa.Table) -> None:
 
     Args:
         folder: the run folder.
-        unit: the unit.
+        unit: unit that was run.
         key: key of the unit.
         table: from `step_table`.
     """
@@ -64,24 +63,24 @@ def align_steps(folder: Path, finished: Iterable[Unit]) -> None:
         folder: the run folder.
         finished: units of the run.
     """
-    paths = [path for unit in finished if (path := folder / unit.steps_path).exists()]
+    paths = [folder / unit.steps_path for unit in finished]
     with damaged(folder / STEPS, _REMEDY):
-        names_by_path = {path: pq.read_schema(path).names for path in paths}
-        all_names = dict.fromkeys(
-            name
-            for names in names_by_path.values()
-            for name in names
-            if name != LAST_COLUMN
-        )
+        names_by_path = {}
+        all_names: dict[str, None] = {}
+        for path in paths:
+            if path.exists():
+                names_by_path[path] = pq.read_schema(path).names
+                all_names |= dict.fromkeys(names_by_path[path])
+        all_names.pop(LAST_COLUMN, None)
+        aligned = [*all_names, LAST_COLUMN]
         for path, names in names_by_path.items():
-            if names == [*all_names, LAST_COLUMN]:
+            if names == aligned:
                 continue
             table = read_sealed(path)
             missing = pa.array(np.full(len(table), np.nan, np.float32))
-            columns = {
-                name: table[name] if name in names else missing
-                for name in [*all_names, LAST_COLUMN]
-            }
+            columns = {}
+            for name in aligned:
+                columns[name] = table[name] if name in names else missing
             _write(path, pa.table(columns), metadata(path))
 
 
@@ -97,11 +96,11 @@ def step_files(
 
     Args:
         folder: the run folder.
-        conditions: ids of conditions; None for all.
+        conditions: ids of conditions; None for all conditions.
 
     Yields:
-        Columns as in `step_table`, and `condition`. Files of a run that is not finished
-        may differ in their columns.
+        Columns as in `step_table`, and `condition`. If the run is not finished, its
+        files may differ in their columns.
 
     Raises:
         ConfigError: If a file is damaged.
@@ -123,7 +122,7 @@ def read_steps(folder: Path, **filters: Any) -> pd.DataFrame:
             …), and `seed`, `realisation`, `map`, `step`. A list selects several values.
 
     Returns:
-        A row a state, in the order of condition, seed, realisation, map and step;
+        One row per state, in the order of condition, seed, realisation, map and step;
         columns as in `step_table`, and `condition`.
 
     Raises:
@@ -139,15 +138,12 @@ def read_steps(folder: Path, **filters: Any) -> pd.DataFrame:
     chosen = {}
     for name, value in filters.items():
         check_known("filters", name, (*LABELS, *_ORDER))
-        values = (
-            list(value)
-            if isinstance(value, list | tuple | set | range | np.ndarray)
-            else [value]
-        )
+        is_several = isinstance(value, list | tuple | set | range | np.ndarray)
+        values = list(value) if is_several else [value]
         if name in LABELS:
-            for i, (condition, _) in run.conditions.items():
+            for condition_id, (condition, _) in run.conditions.items():
                 if condition.labels[name] not in values:
-                    conditions.discard(i)
+                    conditions.discard(condition_id)
         elif name == "condition":
             conditions &= set(values)
         else:
@@ -157,6 +153,9 @@ def read_steps(folder: Path, **filters: Any) -> pd.DataFrame:
         for name, values in chosen.items():
             rows = rows[rows[name].isin(values)]
         files.append(rows)
-    rows = pd.concat(files) if files else next(step_files(folder)).head(0)
+    if not files:
+        files = [next(step_files(folder)).head(0)]
+    rows = pd.concat(files)
     rows = rows.sort_values(_ORDER, kind="stable", ignore_index=True)
-    return rows[[*_ORDER, *(name for name in rows if name not in _ORDER)]]
+    further = [name for name in rows if name not in _ORDER]
+    return rows[[*_ORDER, *further]]

@@ -40,8 +40,8 @@ def verify_run(folder: Path) -> tuple[list[str], list[str]]:
         return [f"{RUN}: {error}"], []
     files = sorted((folder / "units").glob("*/*.parquet"))
     for path in files:
-        finished = Finished(path=path, about=metadata(path))
-        if "key" not in finished.about:
+        finished = Finished(path=path, metadata=metadata(path))
+        if "key" not in finished.metadata:
             damage.append(f"{path.relative_to(folder)}: it cannot be read")
             continue
         damage += finished.damage()
@@ -61,15 +61,13 @@ def verify_run(folder: Path) -> tuple[list[str], list[str]]:
             removed.append(name)
         elif digest_of_path(folder / name) != digest:
             damage.append(f"{name}: it was changed after benchnav wrote it")
-    all_units = units(run.conditions)
-    shard_units = [
-        unit
-        for unit in all_units
-        if run.shard is None or unit.shard(run.shard.of) == run.shard
-    ]
-    missing = sum(not find_units(folder, unit) for unit in shard_units)
-    if missing:
-        notes.append(f"{missing} of {len(shard_units)} units are not finished")
+    run_units = units(run.conditions)
+    if run.shard is not None:
+        of = run.shard.of
+        run_units = [unit for unit in run_units if unit.shard(of) == run.shard]
+    n_missing = sum(not find_units(folder, unit) for unit in run_units)
+    if n_missing:
+        notes.append(f"{n_missing} of {len(run_units)} units are not finished")
     if removed:
         notes.append(
             f"{len(removed)} of {len(checksums)} files in {SUMS} are missing, the "

@@ -113,7 +113,7 @@ def read_report(
         ConfigError: If the folder is not a run folder, or its run is not finished.
     """
     results = read_results(folder, partial)
-    manifest = results.run.about
+    manifest = results.run.manifest
     episodes = results.episodes
     worlds = {
         condition: entry["value"]["world"]

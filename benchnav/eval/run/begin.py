@@ -19,7 +19,7 @@ from benchnav.eval.experiment.condition import (
     differences,
     merge,
 )
-from benchnav.eval.experiment.metrics import add_metric, metrics_of_run
+from benchnav.eval.experiment.metrics import NamedMetric, add_metric, metrics_of_run
 from benchnav.eval.experiment.suite import Record
 from benchnav.eval.experiment.unit import Conditions
 from benchnav.eval.folder import provenance
@@ -44,9 +44,9 @@ class Work(Checked):
 
     Args:
         suite: the suite as it was written, for `run.json`.
-        record: what is stored of episodes in addition to rows.
+        record: data of episodes that are stored in addition to rows.
         settings: settings of units.
-        shard: shard of the units that is run; None for all.
+        shard: shard of the units that is run; None for all units.
         reuse_code: whether to accept finished units of other code.
     """
 
@@ -78,62 +78,67 @@ def begin(
                 "another `out`."
             )
         write_run(folder, _about({}, work, work.conditions))
-        return (
-            work.conditions,
-            work.conditions,
-            tuple(metric.part for metric in work.metrics),
-        )
+        return work.conditions, work.conditions, _parts(work.metrics)
     earlier = open_run(folder)
     _check_extends(work, earlier)
-    metrics = list(metrics_of_run(earlier.about))
+    metrics = list(metrics_of_run(earlier.manifest))
     n_metrics = len(metrics)
     for metric in work.metrics:
         metrics = add_metric(metrics, metric)
     work = replace(work, metrics=tuple(metrics))
-    if new_names := [metric.quantity.name for metric in metrics[n_metrics:]]:
-        say(
-            f"{folder} is extended by "
-            f"{'metric' if len(new_names) == 1 else 'metrics'} {', '.join(new_names)}"
-        )
+    new_names = [metric.quantity.name for metric in metrics[n_metrics:]]
+    if new_names:
+        noun = "metric" if len(new_names) == 1 else "metrics"
+        say(f"{folder} is extended by {noun} {', '.join(new_names)}")
         (folder / EPISODES).unlink(missing_ok=True)
-    conditions = dict(earlier.conditions)
-    requested = {}
-    # What differs from an earlier condition only in what is not used is run as that
-    # one.
-    rows_ids = {
-        condition.rows_id: name for name, (condition, _) in reversed(conditions.items())
-    }
-    for condition_id, (condition, extent) in work.conditions.items():
-        name = (
-            condition_id
-            if condition_id in conditions
-            else rows_ids.get(condition.rows_id, condition_id)
-        )
-        earlier_condition, earlier_extent = conditions.get(name, (condition, extent))
-        merged = merge(
-            condition if condition.id == name else earlier_condition,
-            (earlier_condition, condition),
-        )
-        requested[name] = merged, extent
-        conditions[name] = merged, earlier_extent.union(extent)
+    requested, conditions = _merged(work.conditions, earlier.conditions)
     if conditions != earlier.conditions:
-        new = len(conditions.keys() - earlier.conditions.keys())
-        more = {0: "by more episodes", 1: "by 1 new condition"}.get(
-            new, f"by {new} new conditions"
-        )
-        say(f"{folder} is extended {more}")
+        n_new = len(conditions.keys() - earlier.conditions.keys())
+        few = {0: "more episodes", 1: "1 new condition"}
+        extension = few.get(n_new, f"{n_new} new conditions")
+        say(f"{folder} is extended by {extension}")
         # The table is written again when all requested units are finished.
         (folder / EPISODES).unlink(missing_ok=True)
-    now = _about(earlier.about, work, conditions)
-    if now != earlier.about:
+    now = _about(earlier.manifest, work, conditions)
+    if now != earlier.manifest:
         write_run(folder, now)
-    return requested, conditions, tuple(metric.part for metric in metrics)
+    return requested, conditions, _parts(metrics)
+
+
+def _parts(metrics: Iterable[NamedMetric]) -> tuple[Part, ...]:
+    return tuple(metric.part for metric in metrics)
+
+
+def _merged(new: Conditions, earlier: Conditions) -> tuple[Conditions, Conditions]:
+    """Merge new conditions into those of a run.
+
+    A condition that differs from an earlier one only in unused settings is run as the
+    earlier one.
+
+    Returns:
+        The new conditions as they are run, and all conditions of the run.
+    """
+    conditions = dict(earlier)
+    requested = {}
+    ids_by_rows = {}
+    for condition_id, (condition, _) in reversed(conditions.items()):
+        ids_by_rows[condition.rows_id] = condition_id
+    for condition_id, (condition, extent) in new.items():
+        run_id = condition_id
+        if condition_id not in conditions:
+            run_id = ids_by_rows.get(condition.rows_id, condition_id)
+        old_condition, old_extent = conditions.get(run_id, (condition, extent))
+        representative = condition if condition.id == run_id else old_condition
+        merged = merge(representative, (old_condition, condition))
+        requested[run_id] = merged, extent
+        conditions[run_id] = merged, old_extent.union(extent)
+    return requested, conditions
 
 
 def drop(folder: Path) -> None:
     """Empty a run folder, but keep the folder itself.
 
-    It may be a link, another file system or the working folder.
+    The folder may be a link, another file system or the working folder.
     """
     if is_taken(folder):
         open_run(folder)  # Only a run folder may be emptied.
@@ -146,6 +151,12 @@ def drop(folder: Path) -> None:
 
 
 def _check_extends(work: Work, earlier: Run) -> None:
+    """Reject a run that the requested one cannot extend.
+
+    Raises:
+        ConfigError: If shards or hypotheses differ, the run cannot be resumed, or two
+            settings share a label.
+    """
     folder = earlier.folder
     if earlier.shard != work.shard:
         raise ConfigError(
@@ -154,38 +165,31 @@ def _check_extends(work: Work, earlier: Run) -> None:
             f"{_in_words(earlier.shard)}. Choose another `out`."
         )
     check_resumable(earlier)
-    # Other hypotheses would be written after the results that they are tested on.
-    fixed = earlier.about.get("hypotheses", {}).get("digest", "none")
+    # Other hypotheses would be fixed after the results on which they are tested.
+    fixed = earlier.manifest.get("hypotheses", {}).get("digest", "none")
     if work.hypotheses and work.hypotheses["digest"] != fixed:
         raise ConfigError(
             f"Expected the `hypotheses` that were fixed when {folder} was begun "
             f"(digest {fixed}), got others (digest "
-            f"{work.hypotheses['digest']}). Leave `hypotheses` out to go on, or "
+            f"{work.hypotheses['digest']}). Leave `hypotheses` out to resume, or "
             "choose another `out`."
         )
-    check_labels(
-        condition
-        for conditions_of in (earlier, work)
-        for condition, _ in conditions_of.conditions.values()
-    )
+    entries = [*earlier.conditions.values(), *work.conditions.values()]
+    check_labels([condition for condition, _ in entries])
 
 
 def check_resumable(run: Run) -> None:
-    """Reject a run whose parts were objects of a process.
+    """Reject a run with parts that were objects of one process.
 
     Raises:
-        ConfigError: If it has such parts.
+        ConfigError: If the run has such parts.
     """
-    parts = [
-        part
-        for entry in run.about["conditions"].values()
-        for part in entry.get("unreproducible", ())
-    ]
-    parts += [
-        f"metric {entry['quantity']['name']}"
-        for entry in run.about.get("metrics", ())
-        if "unreproducible" in entry
-    ]
+    parts: list[str] = []
+    for entry in run.manifest["conditions"].values():
+        parts += entry.get("unreproducible", ())
+    for entry in run.manifest.get("metrics", ()):
+        if "unreproducible" in entry:
+            parts.append(f"metric {entry['quantity']['name']}")
     if parts:
         raise ConfigError(
             f"Expected a run that can be run again, got {run.folder}, whose "
@@ -201,7 +205,13 @@ def _in_words(shard: Shard | None) -> str:
 def _about(
     earlier: Mapping[str, Any], work: Work, conditions: Conditions
 ) -> dict[str, Any]:
-    """Return the contents of `run.json`, from an earlier state of it."""
+    """Return the contents of `run.json`.
+
+    Args:
+        earlier: earlier contents; empty for a new run.
+        work: the requested work.
+        conditions: all conditions of the run.
+    """
     earlier_entries = earlier.get("conditions", {})
     entries = {}
     for condition_id, (condition, extent) in conditions.items():
@@ -220,79 +230,72 @@ def _about(
         entries[condition_id] = entry
     hypotheses = earlier.get("hypotheses", work.hypotheses)
     dropped = [*earlier.get("dropped", ()), *work.dropped]
-    metrics = [metric.entry for metric in work.metrics]
-    manifest = {
-        "format": FORMAT,
-        "format_version": FORMAT_VERSION,
-        **({"shard": asdict(work.shard)} if work.shard else {}),
-        "suite": dict(work.suite),
-        **({"hypotheses": hypotheses} if hypotheses else {}),
-        **({"metrics": metrics} if metrics else {}),
-        "conditions": entries,
-        "dropped": _still_dropped(dropped, conditions),
-        "warnings": provenance.join(earlier.get("warnings", ()), work.warnings),
-        **asdict(work.settings),
-        "gpu": gpu_name(work.settings.device),
-        "datasets": provenance.describe_datasets(conditions),
-        "machine": provenance.describe_machine(),
-        "history": provenance.extend_history(earlier.get("history", ()), work.suite),
-        **{
-            name: earlier[name]
-            for name in ("codes", "reused", "tables")
-            if name in earlier
-        },
-    }
+    manifest: dict[str, Any] = {"format": FORMAT, "format_version": FORMAT_VERSION}
+    if work.shard:
+        manifest["shard"] = asdict(work.shard)
+    manifest["suite"] = dict(work.suite)
+    if hypotheses:
+        manifest["hypotheses"] = hypotheses
+    if work.metrics:
+        manifest["metrics"] = [metric.entry for metric in work.metrics]
+    manifest["conditions"] = entries
+    manifest["dropped"] = _still_dropped(dropped, conditions)
+    manifest["warnings"] = provenance.join(earlier.get("warnings", ()), work.warnings)
+    manifest |= asdict(work.settings)
+    manifest["gpu"] = gpu_name(work.settings.device)
+    manifest["datasets"] = provenance.describe_datasets(conditions)
+    manifest["machine"] = provenance.describe_machine()
+    history = earlier.get("history", ())
+    manifest["history"] = provenance.extend_history(history, work.suite)
+    for name in ("codes", "reused", "tables"):
+        if name in earlier:
+            manifest[name] = earlier[name]
     return json.loads(json.dumps(manifest))
 
 
 def _still_dropped(
     dropped: Iterable[dict[str, str]], conditions: Conditions
 ) -> list[dict[str, str]]:
-    """Return the combinations left out that are in no condition, each once.
+    """Return the combinations that were left out and are in no condition, each once.
 
-    A combination may have become a condition after a change of its parts.
+    A combination that was left out may have become a condition after a change of its
+    parts.
     """
-    condition_labels = [
-        set(condition.labels.items()) for condition, _ in conditions.values()
-    ]
-    return provenance.join(
-        entry
-        for entry in dropped
-        if not any(
-            set(dropped_labels(entry).items()) <= labels for labels in condition_labels
-        )
-    )
+    run_labels = [set(condition.labels.items()) for condition, _ in conditions.values()]
+    still_dropped = []
+    for entry in dropped:
+        labels = set(dropped_labels(entry).items())
+        if not any(labels <= of_condition for of_condition in run_labels):
+            still_dropped.append(entry)
+    return provenance.join(still_dropped)
 
 
 def _notes(condition: Condition) -> dict[str, Any]:
-    """Return what tables say about a condition's planner."""
+    """Return notes on a condition's planner, which tables show."""
     planner = condition.planner.object
     task = condition.task
-    merged_notes = [
-        f"One row for {kind} {', '.join(labels)}, which the planner does not use here"
-        for kind, labels in condition.stands_for.items()
-    ]
-    unreproducible = [
-        f"Not reproducible: {part} is an object of one process"
-        for part in condition.unreproducible
-    ]
-    return {
-        "follows": planner.follows(task),
-        "remarks": [*planner.remarks(task), *merged_notes, *unreproducible],
-        **({"unreproducible": condition.unreproducible} if unreproducible else {}),
-        "changed": changed_options(condition.planner),
-    }
+    remarks = list(planner.remarks(task))
+    for kind, labels in condition.stands_for.items():
+        remarks.append(
+            f"One row for {kind} {', '.join(labels)}, which the planner does not use "
+            "here"
+        )
+    for part in condition.unreproducible:
+        remarks.append(f"Not reproducible: {part} is an object of one process")
+    notes: dict[str, Any] = {"follows": planner.follows(task), "remarks": remarks}
+    if condition.unreproducible:
+        notes["unreproducible"] = condition.unreproducible
+    notes["changed"] = changed_options(condition.planner)
+    return notes
 
 
 def changed_options(planner: Part) -> list[str]:
     """Return options that differ from their defaults, as `name = value` with dots."""
     options = registry.options_of("planner", planner.found.target)
-    required = {
-        name: planner.options[name]
-        for name, option in options.items()
-        if option.default is NO_DEFAULT
-    }
-    defaults = registry.complete("planner", replace(planner, options=required)).options
-    return [
-        f"{name} = {now}" for name, _, now in differences(defaults, planner.options)
-    ]
+    required = {}
+    for name, option in options.items():
+        if option.default is NO_DEFAULT:
+            required[name] = planner.options[name]
+    default = registry.complete("planner", replace(planner, options=required))
+    changed = differences(default.options, planner.options)
+    return [f"{name} = {now}" for name, _, now in changed]

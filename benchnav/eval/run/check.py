@@ -65,15 +65,15 @@ class Checked:
 
 
 def check_suite(suite: Suite, elsewhere: bool) -> Checked:
-    """Build the conditions of a suite, and reject what cannot be run.
+    """Build the conditions of a suite, and reject a suite that cannot be run.
 
     Args:
-        suite: the suite.
-        elsewhere: whether parts are created in other processes.
+        suite: suite, as a user wrote it.
+        elsewhere: whether other processes create parts, too.
 
     Raises:
         ConfigError: If a part, scenario or map is missing, no combination can be run,
-            or a hypothesis names one that cannot.
+            or a hypothesis names a combination that cannot be run.
         DatasetError: If the dataset is missing.
     """
     conditions = conditions_of(suite)
@@ -111,11 +111,12 @@ def check_suite(suite: Suite, elsewhere: bool) -> Checked:
         conditions_by_id[condition.id] = condition, extent
     hypotheses = _fix_hypotheses(suite, conditions_by_id, left_out, all_quantities)
     warnings = build_each(runnable, suite.maps)
-    lone = [part for condition in runnable for part in condition.unreproducible]
-    lone += [f"metric {metric.quantity.name}" for metric in metrics if metric.is_object]
-    warnings += [
-        f"not reproducible: {part} is an object of one process" for part in lone
-    ]
+    objects = [part for condition in runnable for part in condition.unreproducible]
+    for metric in metrics:
+        if metric.is_object:
+            objects.append(f"metric {metric.quantity.name}")
+    for name in objects:
+        warnings.append(f"not reproducible: {name} is an object of one process")
     dropped = {json.dumps(entry): entry for entry in left_out.values()}
     return Checked(
         conditions={
@@ -137,8 +138,8 @@ def _fix_hypotheses(
     """Fix the hypotheses of a suite on the conditions that are run.
 
     Raises:
-        ConfigError: If a hypothesis compares a condition that is run with one that is
-            left out, or is invalid.
+        ConfigError: If a hypothesis is invalid, or compares a condition that is run
+            with a combination that is left out.
     """
     try:
         fixed = fix_hypotheses(suite.hypotheses, conditions, all_quantities)
@@ -152,7 +153,7 @@ def _fix_hypotheses(
             raise ConfigError(
                 "Expected hypotheses on conditions that can be run, got "
                 f"{test['claim']!r}, which names one that "
-                f"cannot: {lost[0]['reason']}"
+                f"cannot be run: {lost[0]['reason']}"
             )
     runnable = {i: entry for i, entry in conditions.items() if i not in left_out}
     return fix_hypotheses(suite.hypotheses, runnable, all_quantities)
@@ -162,7 +163,7 @@ def check_split(condition: Condition, maps: int) -> int:
     """Return the number of maps that are run; reject a missing scenario or map.
 
     Args:
-        condition: condition with its data and scenario.
+        condition: condition, whose data and scenario are checked.
         maps: requested number of maps; 0 for all.
     """
     dataset = condition.dataset
@@ -184,28 +185,26 @@ def check_split(condition: Condition, maps: int) -> int:
 
 
 def _remedy(dataset: TerrainDataset, split: str, maps: int) -> str:
-    """Return how to create missing maps, if a shipped recipe has them."""
-    if (
-        dataset.id not in shipped_recipes()
-        or shipped_sizes(dataset.id).get(split, 0) < maps
-    ):
+    """Return a command that creates missing maps, if a shipped recipe has them."""
+    if dataset.id not in shipped_recipes():
         return ""
-    return (
-        f" All maps of {dataset.id} are made with `benchnav-datagen create "
-        f"{dataset.id}`."
-    )
+    if shipped_sizes(dataset.id).get(split, 0) < maps:
+        return ""
+    command = f"benchnav-datagen create {dataset.id}"
+    return f" All maps of {dataset.id} are made with `{command}`."
 
 
 def check_everywhere(
     conditions: Iterable[Condition], metrics: Iterable[NamedMetric] = ()
 ) -> None:
-    """Reject parts that other processes would not find.
+    """Reject parts that other processes cannot load.
 
     Raises:
         ConfigError: If there are such parts.
     """
     parts = [part for condition in conditions for part in condition.parts.values()]
-    for part in (*parts, *(metric.part for metric in metrics)):
+    parts += [metric.part for metric in metrics]
+    for part in parts:
         if not part.found.everywhere:
             raise ConfigError(
                 f"Expected a {part.kind} that other processes can load (for `jobs` > "
@@ -220,7 +219,7 @@ def build_each(conditions: Sequence[Condition], maps: int) -> list[str]:
     """Build conditions on the first map of their splits, without prediction or plan.
 
     Args:
-        conditions: conditions; parts that several have in common are built once.
+        conditions: conditions; parts that several of them have are built once.
         maps: number of maps of each split; 0 for all.
 
     Returns:
@@ -230,9 +229,8 @@ def build_each(conditions: Sequence[Condition], maps: int) -> list[str]:
         BenchnavError: If a condition cannot be run.
     """
     warnings: list[str] = []
-    for condition in _distinct(
-        conditions, "data", "scenario", "world", "rules", "robot"
-    ):
+    world_keys = ("data", "scenario", "world", "rules", "robot")
+    for condition in _distinct(conditions, *world_keys):
         warnings += _check_world(condition, condition.dataset, maps)
     for condition in _distinct(conditions, "data", "scenario", "model", *KNOWLEDGE):
         _ = condition.statistics  # which may be missing
@@ -249,9 +247,8 @@ def _distinct(conditions: Sequence[Condition], *names: str) -> list[Condition]:
     first: dict[str, Condition] = {}
     for condition in conditions:
         value = {**condition.value, "scenario": condition.scenario}
-        first.setdefault(
-            text_digest({name: value.get(name) for name in names}), condition
-        )
+        key = text_digest({name: value.get(name) for name in names})
+        first.setdefault(key, condition)
     return list(first.values())
 
 
@@ -273,28 +270,29 @@ def _check_world(condition: Condition, dataset: TerrainDataset, maps: int) -> li
     split = condition.split
     chosen = range(maps or dataset.map_count(split))
     read = dataset.read(split, chosen, ["start_m", "goal_m", "reference_time_s"])
-    top_speed = task.robot.top_speed_mps
-    budget = world.budget_s(torch.from_numpy(read["reference_time_s"]), top_speed)
-    world.steps(budget, task.robot.dt_s)
+    top_speed_mps = task.robot.top_speed_mps
+    reference_s = torch.from_numpy(read["reference_time_s"])
+    budget_s = world.budget_s(reference_s, top_speed_mps)
+    world.steps(budget_s, task.robot.dt_s)
     # Only imported maps have cells without λ.
     is_imported = any("source" in part for part in dataset.splits[split]["parts"])
-    for start in chosen[::BLOCK_MAPS] if is_imported else chosen[:1]:
-        block_maps = chosen[start : start + BLOCK_MAPS] if is_imported else [0]
-        block = read_maps(dataset, split, block_maps)
+    checked = chosen if is_imported else chosen[:1]
+    for start in checked[::BLOCK_MAPS]:
+        block = read_maps(dataset, split, checked[start : start + BLOCK_MAPS])
         check_known(block.terrain, world)
         if world.noise == "frozen" and start == 0:
-            index = torch.tensor([0])
-            terrain = block.terrain.select(index)
-            places = block.places.select(index)
-            draw_frozen(terrain, world, places, key=0, maps=[0])
+            first = torch.tensor([0])
+            terrain = block.terrain.select(first)
+            endpoints = block.places.select(first)
+            draw_frozen(terrain, world, endpoints, key=0, maps=[0])
     centre_distance_m = np.linalg.norm(read["goal_m"] - read["start_m"], axis=1)
     distance_m = centre_distance_m - task.rules.goal_radius_m
-    late = distance_m / top_speed > budget.numpy()
-    if not late.any():
+    is_late = distance_m / top_speed_mps > budget_s.numpy()
+    if not is_late.any():
         return []
     return [
-        f"in {late.sum()} of {len(late)} maps of {condition.split} a robot of "
-        f"{top_speed:g} m/s cannot reach the goal "
+        f"in {is_late.sum()} of {len(is_late)} maps of {condition.split} a robot of "
+        f"{top_speed_mps:g} m/s cannot reach the goal "
         "within the time budget T"
     ]
 
@@ -302,11 +300,11 @@ def _check_world(condition: Condition, dataset: TerrainDataset, maps: int) -> li
 def _doubts(condition: Condition, dataset: TerrainDataset) -> Iterator[str]:
     """Yield differences between the maps' recipe and the rules of the task."""
     threshold = dataset.recipe.stuck_threshold
-    if condition.rules.free_space.above != threshold:
+    above = condition.rules.free_space.above
+    if above != threshold:
         yield (
-            f"maps of {dataset.id} have a feasible path over ground above "
-            f"{threshold:g}, but free ground is above "
-            f"{condition.rules.free_space.above:g} in this run"
+            f"maps of {dataset.id} have a feasible path over cells with λ above "
+            f"{threshold:g}, but free cells have λ above {above:g} in this run"
         )
     split = dataset.recipe.splits.get(condition.split)
     if split is not None and not split.solvable:

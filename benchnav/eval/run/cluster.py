@@ -1,8 +1,8 @@
 """Units on the workers of a Dask cluster.
 
 Workers write nothing permanent: they return a unit's files as bytes, and the command
-writes them. So workers need no disk in common with it, and a unit that is run twice
-because a worker died is stored once.
+writes these files. Workers therefore need no disk in common with the command, and a
+unit that is run twice because a worker died is stored once.
 """
 
 import multiprocessing
@@ -28,8 +28,8 @@ def run_on_worker(
     """Run a unit on a worker of a cluster, and return its files by path in a run folder.
 
     Args:
-        working_folder: folder that relative paths start from, if the worker has it.
-        unit: the unit.
+        working_folder: folder from which relative paths start, if the worker has it.
+        unit: unit to run.
         origin: origin of the unit when the run was begun.
         settings: settings of the run.
 
@@ -41,18 +41,21 @@ def run_on_worker(
 
     worker = get_worker()
     check_worker(worker, settings)
+    has_folder = working_folder.is_dir()
     with (
-        chdir(working_folder) if working_folder.is_dir() else nullcontext(),
+        chdir(working_folder) if has_folder else nullcontext(),
         TemporaryDirectory(dir=worker.local_directory) as scratch,
     ):
         try:
             run_unit(unit, Path(scratch), origin, settings)
         except BenchnavError as error:
             raise type(error)(f"Worker {worker.address}: {error}") from error
-        files = (path for path in Path(scratch).rglob("*") if path.is_file())
-        return unit, {
-            path.relative_to(scratch).as_posix(): path.read_bytes() for path in files
-        }
+        files = {}
+        for path in Path(scratch).rglob("*"):
+            if path.is_file():
+                name = path.relative_to(scratch).as_posix()
+                files[name] = path.read_bytes()
+        return unit, files
 
 
 def check_worker(worker: Any, settings: Settings) -> None:
@@ -88,7 +91,7 @@ def check_worker(worker: Any, settings: Settings) -> None:
 
 
 def store_files(folder: Path, unit: Unit, files: Mapping[str, bytes]) -> None:
-    """Write a unit's files into a run folder, its rows last: they mark it as finished."""
+    """Write a unit's files into a run folder; its rows, written last, mark it finished."""
     clear_unit(folder, unit)
     for name in sorted(files, key=lambda name: name.startswith("units/")):
         with replacing(folder / name) as partial:

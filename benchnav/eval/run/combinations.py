@@ -26,7 +26,7 @@ def find_left_out(conditions: Iterable[Condition]) -> dict[str, LeftOut]:
         conditions: conditions of a suite.
 
     Returns:
-        Incompatible labels and reason by id, in the order of the conditions.
+        Incompatible labels and the reason, by id, in the order of the conditions.
 
     Raises:
         ConfigError: If a shipped planner rejects its settings in each of its
@@ -34,41 +34,40 @@ def find_left_out(conditions: Iterable[Condition]) -> dict[str, LeftOut]:
     """
     reasons: dict[tuple[Any, ...], str] = {}
     left_out: dict[str, LeftOut] = {}
-    refusals: dict[str, str] = {}  # by planner; empty if some condition is accepted
+    rejections: dict[str, str] = {}  # by planner; empty if any condition is accepted
     for condition in conditions:
         for columns, rule in _RULES.items():
             labels = {column: condition.labels[column] for column in columns}
-            # Includes the part, since all unused parts have one label.
-            key = rule, condition.risk.part, *labels.values()
+            # The part distinguishes risk settings that all have the label `NOT_USED`.
+            key = (rule, condition.risk.part, *labels.values())
             if key not in reasons:
                 reasons[key] = rule(condition)
+            reason = reasons[key]
             if rule is _unprepared:
                 planner = condition.planner.label
-                refusals[planner] = reasons[key] and refusals.get(planner, reasons[key])
-            if reasons[key]:
-                left_out[condition.id] = {**labels, "reason": reasons[key]}
+                earlier = rejections.get(planner, reason)
+                rejections[planner] = earlier if reason else ""
+            if reason:
+                left_out[condition.id] = {**labels, "reason": reason}
                 break
-    for reason in filter(None, refusals.values()):
-        raise ConfigError(reason)  # of the planner's own settings
+    for reason in rejections.values():
+        if reason:  # The planner's settings are invalid in each combination.
+            raise ConfigError(reason)
     return left_out
 
 
 def _unsteered(condition: Condition) -> str:
+    planner = condition.planner
     try:
-        check_steers(
-            condition.planner.object, condition.task.robot, condition.planner.label
-        )
+        check_steers(planner.object, condition.task.robot, planner.label)
     except ConfigError as error:
         return str(error)
     return ""
 
 
 def _plans_once(condition: Condition) -> str:
-    if (
-        condition.blind
-        or not condition.planner.object.plans_once
-        or not condition.learns
-    ):
+    plans_once = not condition.blind and condition.planner.object.plans_once
+    if not plans_once or not condition.learns:
         return ""
     return (
         "Expected belief 'static' and sensor 'full' for planner "
@@ -83,8 +82,7 @@ def _given_truth(condition: Condition) -> str:
         return ""
     return (
         f"Expected model 'clairvoyant' for planner {condition.planner.label!r}, which "
-        "is given λ itself, got "
-        f"{condition.model.label!r}."
+        f"is given λ itself, got {condition.model.label!r}."
     )
 
 
@@ -92,7 +90,7 @@ def _resampled(condition: Condition) -> str:
     if condition.model.part != "clairvoyant" or condition.world.noise != "resampled":
         return ""
     return (
-        "Expected a world with λ that stays for the model 'clairvoyant', got "
+        "Expected a world with constant λ for the model 'clairvoyant', got "
         f"{condition.world_label!r}, which "
         "resamples λ at each step. Take the world stakes, or `world.noise` frozen or "
         "stored."
@@ -104,9 +102,8 @@ def _learns_no_class(condition: Condition) -> str:
         return ""
     return (
         "Expected a belief that does not learn for the risk setting 'single-class', "
-        "got "
-        f"{condition.belief.label!r}: what is learnt of λ is of no class. Take the "
-        "belief static."
+        f"got {condition.belief.label!r}, whose updates have no class. Take the belief "
+        "static."
     )
 
 
@@ -133,24 +130,22 @@ def _unprepared(condition: Condition) -> str:
     if not planner.found.shipped:
         return ""
     traversability = torch.full((1, 4, 4), 0.9)
+    flat = 0 * traversability
     grid = Grid(4, 4, condition.dataset.grid.resolution_m)
-    seen = Observation(
-        torch.zeros(1, 3, 4, 4, dtype=torch.uint8),
-        0 * traversability,
-        0 * traversability,
-        grid,
-    )
+    rgb = torch.zeros(1, 3, 4, 4, dtype=torch.uint8)
+    seen = Observation(rgb, flat, flat, grid)
     ones = torch.ones_like(traversability).unsqueeze(1)
     mixture = TraversabilityMixture(ones, 0.9 * ones, 0 * ones)
-    start = torch.full((1, 2), 0.5 * grid.resolution_m)
-    goal = torch.full((1, 2), 3.5 * grid.resolution_m)
+    start_m = torch.full((1, 2), 0.5 * grid.resolution_m)
+    goal_m = torch.full((1, 2), 3.5 * grid.resolution_m)
 
     def prepare() -> None:
-        state = Static().init(mixture, CovarianceModel(grid=grid, correlation_m=0.0))
+        covariance = CovarianceModel(grid=grid, correlation_m=0.0)
+        state = Static().init(mixture, covariance)
         fields = Fields(Static(), state, (0,))
         prediction = Prediction(seen, mixture, traversability, fields=fields)
         problem = pose_problem(
-            condition.task, prediction, start, goal, 1.0, condition.world.immobile
+            condition.task, prediction, start_m, goal_m, 1.0, condition.world.immobile
         )
         planner.object.init(problem, torch.Generator())
 
@@ -166,7 +161,8 @@ def _unprepared(condition: Condition) -> str:
     return ""
 
 
-# Rules by the columns that they depend on; slow ones come last.
+# Rules by the columns on which they depend; each returns a reason, or "" for compatible
+# parts. Slow rules come last.
 _RULES: Mapping[tuple[str, ...], Callable[[Condition], str]] = {
     ("planner", "robot"): _unsteered,
     ("planner", "sensor", "belief"): _plans_once,

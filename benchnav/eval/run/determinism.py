@@ -1,4 +1,4 @@
-"""Whether rows are identical if repeated in fresh processes and in another order."""
+"""Check that rows are identical if repeated in fresh processes and in another order."""
 
 import random
 from collections.abc import Callable, Sequence
@@ -13,14 +13,13 @@ import pandas as pd
 import torch
 from joblib.externals.loky import ProcessPoolExecutor
 
-from benchnav.core.device import find_device
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import Unit, units
 from benchnav.eval.folder.run_folder import differences, find_units, unit_rows
 from benchnav.eval.run.check import Say, check_suite
 from benchnav.eval.run.unit import Settings, run_unit
 
-# Rows of a unit, and the global generators that were drawn from while it ran.
+# Rows of a unit, and the global generators from which numbers were drawn while it ran.
 _Rows = tuple[pd.DataFrame, tuple[str, ...]]
 
 _GENERATORS: dict[str, Callable[[], bytes]] = {
@@ -36,12 +35,12 @@ def check_determinism(
     """Run the first unit of each condition in two processes and compare the rows.
 
     Rows are compared bit for bit, except planning times. The second process runs units
-    and maps in reverse order, twice, and its second rows count, so that state which
-    parts keep has had time to grow. If rows differ, a third process repeats the first,
-    which distinguishes kept state from external input.
+    and maps in reverse order, twice. Its second rows are compared, so that any state
+    that parts retain has had time to grow. If rows differ, a third process repeats the
+    first, which distinguishes retained state from external input.
 
     Args:
-        suite: the suite.
+        suite: suite whose conditions are checked.
         say: receives progress, a line at a time.
         planner_limit_s: time limit of each call of a planner; 0 for none.
         device: "cpu", "cuda" or "auto".
@@ -53,38 +52,43 @@ def check_determinism(
     Raises:
         BenchnavError: If the suite cannot be run.
     """
-    settings = Settings(
-        planner_limit_s=planner_limit_s, device=find_device(device).type
-    )
+    settings = Settings.on(device, planner_limit_s)
     checked = check_suite(suite, elsewhere=True)
     metrics = [metric.part for metric in checked.metrics]
     chosen = []
     for name, condition in checked.conditions.items():
-        chosen.append(units({name: condition}, metrics=metrics)[0])
+        first_unit, *_ = units({name: condition}, metrics=metrics)
+        chosen.append(first_unit)
     say(
         f"checking that {len(chosen)} conditions repeat, each by its unit of "
         f"{len(chosen[0].maps)} maps"
     )
     first = _run_fresh(chosen, settings)
     backwards = [replace(unit, maps=unit.maps[::-1]) for unit in chosen[::-1]]
-    second = _run_fresh([*backwards, *backwards], settings)[len(chosen) :][::-1]
+    twice = _run_fresh([*backwards, *backwards], settings)
+    second = twice[len(chosen) :][::-1]
     columns = [_differing(a, b) for (a, _), (b, _) in zip(first, second, strict=True)]
-    third = _run_fresh(chosen, settings) if any(columns) else first
+    third = first
+    if any(columns):
+        third = _run_fresh(chosen, settings)
     lines = []
     for unit, names, *runs in zip(chosen, columns, first, second, third, strict=True):
         if names:
-            columns_text = ", ".join(names)
-            line = f"{unit.condition.description}: {columns_text} differ"
-            lines.append(f"{line}; {_cause(*runs)}")
+            description = unit.condition.description
+            words = ", ".join(names)
+            lines.append(f"{description}: {words} differ; {_cause(*runs)}")
     return len(chosen), lines
 
 
 def _cause(first: _Rows, second: _Rows, third: _Rows) -> str:
     """Return why rows of a unit differ between two runs; `third` repeats `first`."""
-    generators = sorted({*first[1], *second[1], *third[1]})
+    first_rows, first_generators = first
+    _, second_generators = second
+    third_rows, third_generators = third
+    generators = sorted({*first_generators, *second_generators, *third_generators})
     if generators:
         return f"a part draws from the global generator of {' and '.join(generators)}"
-    if _differing(first[0], third[0]):
+    if _differing(first_rows, third_rows):
         return (
             "a part depends on something outside, such as a clock, entropy or the "
             "order of threads"
@@ -96,9 +100,12 @@ def _cause(first: _Rows, second: _Rows, third: _Rows) -> str:
 
 
 def _differing(a: pd.DataFrame, b: pd.DataFrame) -> list[str]:
+    """Return the columns in which rows differ, and `episodes` if some are missing."""
     cells, missing = differences(a, b)
     columns = list(dict.fromkeys(cells.index.get_level_values(-1)))
-    return [*columns, "episodes"] if len(missing) else columns
+    if len(missing):
+        columns.append("episodes")
+    return columns
 
 
 def _run_fresh(chosen: Sequence[Unit], settings: Settings) -> list[_Rows]:
@@ -117,11 +124,11 @@ def _run_units(
 
 def _run_unit(unit: Unit, settings: Settings) -> _Rows:
     origin = settings.origins().of(unit)
-    before = {name: state() for name, state in _GENERATORS.items()}
-    with TemporaryDirectory() as folder:
-        run_unit(replace(unit, record="none"), Path(folder), origin, settings)
-        rows = unit_rows(find_units(Path(folder), unit)[0])
-    drawn_from = [
-        name for name, state in _GENERATORS.items() if state() != before[name]
-    ]
-    return rows, tuple(drawn_from)
+    states = {name: state() for name, state in _GENERATORS.items()}
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        run_unit(replace(unit, record="none"), folder, origin, settings)
+        finished, *_ = find_units(folder, unit)
+        rows = unit_rows(finished)
+    changed = [name for name, state in _GENERATORS.items() if state() != states[name]]
+    return rows, tuple(changed)

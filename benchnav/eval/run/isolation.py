@@ -1,8 +1,8 @@
-"""A planner in a child process, so that one that hangs can be stopped.
+"""A planner in a child process, so that a planner that hangs can be stopped.
 
-The simulation stays in the parent: only the planner's calls cross, each with a time
-limit. The child first loads the parts of planner, robot and objective by name, so that
-their classes can be unpickled.
+The simulation stays in the parent process: only the planner's calls are sent to the
+child, each with a time limit. The child first loads planner, robot and objective by
+name, so that their classes can be unpickled.
 """
 
 import multiprocessing
@@ -23,7 +23,7 @@ from benchnav.planning.planners.planner import Plan, Planner
 from benchnav.planning.problem import Problem
 from benchnav.planning.sensing.sensor import Step
 
-# Starting a process, importing PyTorch and compiling are not the planner's time.
+# Starting a process, importing PyTorch and compiling do not count as planning time.
 _START_S = 120.0
 _CLOSE_S = 5.0
 
@@ -31,7 +31,8 @@ _CLOSE_S = 5.0
 class PlannerProcessError(BenchnavError):
     """A planner timed out, raised, or its process ended.
 
-    If it raised, the message is the last line of its traceback, which is the note.
+    If the planner raised, the message is the last line of its traceback, and the error
+    has the traceback as a note.
     """
 
 
@@ -40,8 +41,8 @@ class IsolatedPlanner(Planner[int]):
 
     Args:
         condition: condition that has the planner.
-        limit_s: time limit of each call; `init` and the first `plan` have two minutes
-            more, to compile.
+        limit_s: time limit of each call in seconds; `init`, `revise` and the first
+            `plan` have two minutes more, to compile.
     """
 
     compiled: bool | None = None

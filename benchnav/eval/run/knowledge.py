@@ -1,8 +1,8 @@
 """Knowledge of the robots of a unit during episodes, and their planner's problem.
 
 `benchnav.planning.sensing.knowledge` defines the knowledge. This module passes changes
-of λ̂ to the planner, and scores the belief over the terrain ahead of the robots. Letters
-in shapes: B episodes, S state dimensions, H×W cells.
+of λ̂ to the planner, and scores the belief over the terrain ahead of the robots.
+Letters in shapes: B episodes, S state dimensions, H×W cells.
 """
 
 import math
@@ -25,8 +25,8 @@ from benchnav.planning.sensing.knowledge import Knowledge, Truth, call
 from benchnav.planning.sensing.learner import Learner
 from benchnav.planning.world.outcome import Outcome
 
-_MIN_CHANGE = 0.02  # maximum change of λ̂ on a map from which its planner replans
-_MIN_LOG_SCORE = -10.0  # log score of λ with probability 0
+_MIN_CHANGE = 0.02  # change of λ̂ in some cell above which a planner replans
+_MIN_LOG_SCORE = -10.0  # lower limit, also for λ with probability 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,8 +36,9 @@ class Learning:
     Args:
         learner: sensors, belief and risk measure.
         start: knowledge at the start of the episodes.
-        truth: truth of B episodes, only for sensors and privileged models.
-        field_at: returns λ of all cells at a step, [B, H, W]; None if λ does not change.
+        truth: truth of B episodes, which only sensors and privileged models receive.
+        field_at: function from a step to λ of all cells, shape [B, H, W]; None if λ
+            does not change.
     """
 
     learner: Learner
@@ -55,10 +56,11 @@ class Knowing:
 
     Attributes:
         revisions: number of changes of each episode's map, int64, shape [B].
-        seen_cells: number of cells each robot saw by its last update, int64, shape [B].
-        sensed_cells: number of cells whose λ each robot measured by then, int64,
+        seen_cells: number of cells that each robot has seen by its last update, int64,
             shape [B].
-        ahead: by step, RMSE of E[λ] and mean log score of the belief over the cells
+        sensed_cells: number of cells whose λ each robot has measured by its last
+            update, int64, shape [B].
+        ahead: RMSE of E[λ] and mean log score of the belief, by step, over the cells
             ahead of each robot whose λ was not measured, shape [B, 2]; NaN without
             such cells.
         known: knowledge of the remaining episodes.
@@ -71,7 +73,7 @@ class Knowing:
         self._problem = problem
         self._truth = learning.truth
         self.known = learning.start
-        self._every = steps_in(problem.task.rules.replan_every_s, problem.dt_s)
+        self._interval = steps_in(problem.task.rules.replan_every_s, problem.dt_s)
         self._at_goal = cells_at_goal(
             problem.grid, problem.goal_m, problem.goal_radius_m
         )
@@ -91,15 +93,15 @@ class Knowing:
 
     def is_due(self, step: int) -> bool:
         """Return whether knowledge is updated in a step."""
-        return step % self._every == 0
+        return step % self._interval == 0
 
     def learn(self, step: int, robot_state: Tensor, running: Tensor) -> Problem | None:
-        """Sense, and update the knowledge if that is due.
+        """Sense, and update the knowledge if an update is due.
 
         Args:
-            step: steps taken so far.
+            step: number of steps taken so far.
             robot_state: a copy of the states of the remaining robots, shape [B, S].
-            running: mask of these episodes that continue, bool, shape [B].
+            running: mask of the remaining episodes that continue, bool, shape [B].
 
         Returns:
             The current problem, which starts at the robots' states; None if the planner
@@ -108,34 +110,37 @@ class Knowing:
         Raises:
             KnowledgeError: If a sensor, the belief, the model or the risk measure fails.
         """
-        learning = self._learning
+        field_at = self._learning.field_at
+        learner = self._learning.learner
         due = self.is_due(step)
         # Drawing λ of all cells is slow, and between updates only a belief that learns
         # receives it.
-        if learning.field_at is not None and (due or learning.learner.belief.learns):
-            self._truth = replace(
-                self._truth, field=learning.field_at(step)[self.members]
-            )
+        if field_at is not None and (due or learner.belief.learns):
+            field = field_at(step)[self.members]
+            self._truth = replace(self._truth, field=field)
         # An ended episode senses nothing, even while it remains in the batch.
         observing = running if due else torch.zeros_like(running)
-        self.known = learning.learner.sense(
+        self.known = learner.sense(
             self.known, self._truth, robot_state, step, observing, running
         )
         if not due:
             return None
-        running_members = self.members[running]
-        self.seen_cells[running_members] = self.known.seen[running].flatten(1).sum(1)
-        self.sensed_cells[running_members] = (
-            self.known.ever_sensed[running].flatten(1).sum(1)
-        )
-        knowledge, changed = learning.learner.update(self.known, self._truth)
-        self.known = knowledge
+        self._count_cells(running)
+        self.known, changed = learner.update(self.known, self._truth)
         if bool(changed.any()):
             return self._updated_problem(robot_state, running)
         return None
 
+    def _count_cells(self, running: Tensor) -> None:
+        """Count the cells that the robots of running episodes have seen and measured."""
+        members = self.members[running]
+        seen = self.known.seen[running]
+        sensed = self.known.ever_sensed[running]
+        self.seen_cells[members] = seen.flatten(1).sum(1)
+        self.sensed_cells[members] = sensed.flatten(1).sum(1)
+
     def _updated_problem(self, robot_state: Tensor, running: Tensor) -> Problem | None:
-        """Return the problem with new maps where running episodes changed enough."""
+        """Return the problem with the new maps of episodes whose map changed enough."""
         knowledge = self.known
         problem = self._problem
         free = knowledge.free | self._at_goal
@@ -145,32 +150,22 @@ class Knowing:
         if not bool(is_updated.any()):
             return None
         self.revisions[self.members[is_updated]] += 1
+        # Other episodes keep their maps, so that no episode depends on its batch.
         update_mask = is_updated[:, None, None]
         indices = is_updated.nonzero()[:, 0]
         fields = problem.fields
         if isinstance(fields, Fields):
-            belief = self._learning.learner.belief
             believed = knowledge.belief_state
             if not bool((is_updated | ~running).all()):
-                state = fields.state
-
-                def merge() -> Any:
-                    changed = belief.select(knowledge.belief_state, indices)
-                    return belief.put(state, indices, changed)
-
-                believed = call(Outcome.BELIEF_ERROR, merge)
+                believed = self._merged_belief(fields.state, indices)
             fields = replace(fields, state=believed)
+        distribution = self._learning.learner.distribution(knowledge)
         self._problem = replace(
             problem,
-            # Other episodes keep their maps, so that none depends on its batch.
             observation=put_if_alike(
                 problem.observation, indices, knowledge.observation
             ),
-            distribution=put_if_alike(
-                problem.distribution,
-                indices,
-                self._learning.learner.distribution(knowledge),
-            ),
+            distribution=put_if_alike(problem.distribution, indices, distribution),
             risk_map=torch.where(update_mask, knowledge.risk_map, problem.risk_map),
             free=torch.where(update_mask, free, problem.free),
             start=robot_state,
@@ -178,10 +173,44 @@ class Knowing:
         )
         return self._problem
 
+    def _merged_belief(self, state: Any, indices: Tensor) -> Any:
+        """Return a belief state with the current beliefs of some episodes."""
+        belief = self._learning.learner.belief
+        current = self.known.belief_state
+
+        def merge() -> Any:
+            changed = belief.select(current, indices)
+            return belief.put(state, indices, changed)
+
+        return call(Outcome.BELIEF_ERROR, merge)
+
     def look_ahead(self, step: int, robot_state: Tensor, running: Tensor) -> None:
         """Score the belief over the cells ahead of the robots; arguments as in `learn`."""
-        grid = self._problem.grid
         knowledge = self.known
+        is_ahead = self._cells_ahead(robot_state)
+        cells = is_ahead & ~knowledge.ever_sensed & running[:, None, None]
+        shape = (len(self.revisions), 2)
+        scores = torch.full(shape, torch.nan, device=robot_state.device)
+        if bool(cells.any()):
+            learner = self._learning.learner
+            value = self._truth.field[cells]
+            error = learner.at(knowledge, cells).mean()[0] - value
+            distribution = learner.distribution(knowledge).at(cells)
+            score = distribution.log_prob(value[None])[0]
+            square = error.square().double()
+            bounded_score = score.double().clamp(min=_MIN_LOG_SCORE)
+            values = torch.stack((square, bounded_score), 1)
+            index = cells.nonzero()[:, 0]
+            count = torch.bincount(index, minlength=len(cells))
+            sums = values.new_zeros(len(cells), 2).index_add_(0, index, values)
+            means = sums / count[:, None]
+            rmse = means[:, 0].sqrt()
+            scores[self.members] = torch.stack((rmse, means[:, 1]), 1).float()
+        self.ahead[step] = scores
+
+    def _cells_ahead(self, robot_state: Tensor) -> Tensor:
+        """Return a mask of the cells ahead of each robot, bool, shape [B, H, W]."""
+        grid = self._problem.grid
         row, column = (
             torch.arange(size, device=robot_state.device) for size in grid.shape
         )
@@ -190,64 +219,40 @@ class Knowing:
         away_y = y - robot_state[:, 1, None, None]
         turn = torch.atan2(away_y, away_x) - robot_state[:, 2, None, None]
         turn = torch.atan2(turn.sin(), turn.cos())
-        is_ahead = (torch.hypot(away_x, away_y) <= AHEAD_M) & (
-            turn.abs() <= math.radians(AHEAD_DEG)
-        )
-        cells = is_ahead & ~knowledge.ever_sensed & running[:, None, None]
-        scores = torch.full(
-            (len(self.revisions), 2), torch.nan, device=robot_state.device
-        )
-        if bool(cells.any()):
-            value = self._truth.field[cells]
-            error = self._learning.learner.at(knowledge, cells).mean()[0] - value
-            distribution = self._learning.learner.distribution(knowledge).at(cells)
-            score = distribution.log_prob(value[None])[0]
-            members_of_cells = cells.nonzero()[:, 0]
-            count = torch.bincount(members_of_cells, minlength=len(cells))
-            sums = torch.stack(
-                (error.square().double(), score.double().clamp(min=_MIN_LOG_SCORE)), 1
-            )
-            means = torch.zeros(
-                len(cells), 2, dtype=torch.float64, device=sums.device
-            ).index_add_(0, members_of_cells, sums)
-            means = means / count[:, None]
-            scores[self.members] = torch.stack(
-                (means[:, 0].sqrt(), means[:, 1]), 1
-            ).float()
-        self.ahead[step] = scores
+        is_near = torch.hypot(away_x, away_y) <= AHEAD_M
+        return is_near & (turn.abs() <= math.radians(AHEAD_DEG))
 
     def maps_of(self, step: int, members: Iterable[int]) -> dict[int, KnownMap]:
         """Return the known maps of some of the remaining episodes, by index."""
-        indices = {
-            int(member): index for index, member in enumerate(self.members.tolist())
+        indices = {member: index for index, member in enumerate(self.members.tolist())}
+        return {
+            member: self._known_map(step, indices[member])
+            for member in members
+            if member in indices
         }
-        learner = self._learning.learner
+
+    def _known_map(self, step: int, index: int) -> KnownMap:
+        """Return the known map of a remaining episode."""
+        grid = self._problem.grid
         knowledge = self.known
-        maps = {}
-        for member in members:
-            if member not in indices:
-                continue
-            index = indices[member]
-            cells = torch.zeros_like(knowledge.free)
-            cells[index] = True
-            believed = learner.at(knowledge, cells)
+        cells = torch.zeros_like(knowledge.free)
+        cells[index] = True
+        believed = self._learning.learner.at(knowledge, cells)
 
-            def of_member(values: Tensor, index: int = index) -> np.ndarray:
-                return values[index].cpu().numpy()
+        def of_episode(values: Tensor) -> np.ndarray:
+            return values[index].cpu().numpy()
 
-            def on_grid(values: Tensor) -> np.ndarray:
-                return values.reshape(self._problem.grid.shape).float().cpu().numpy()
+        def on_grid(values: Tensor) -> np.ndarray:
+            return values.reshape(grid.shape).float().cpu().numpy()
 
-            maps[member] = KnownMap(
-                step=step,
-                predicted=of_member(knowledge.risk_map),
-                free=of_member(knowledge.free | self._at_goal),
-                mean=on_grid(believed.mean()),
-                spread=on_grid(believed.spread()),
-                seen=of_member(knowledge.seen),
-                sensed=of_member(knowledge.ever_sensed),
-                outline=reach_outline(
-                    of_member(knowledge.footprint), self._problem.grid.resolution_m
-                ),
-            )
-        return maps
+        footprint = of_episode(knowledge.footprint)
+        return KnownMap(
+            step=step,
+            predicted=of_episode(knowledge.risk_map),
+            free=of_episode(knowledge.free | self._at_goal),
+            mean=on_grid(believed.mean()),
+            spread=on_grid(believed.spread()),
+            seen=of_episode(knowledge.seen),
+            sensed=of_episode(knowledge.ever_sensed),
+            outline=reach_outline(footprint, grid.resolution_m),
+        )

@@ -1,8 +1,9 @@
 """Planning time of one step of one robot, which a batch does not show.
 
-For each planner, robot, objective and way of learning of a run, one episode is run on
-one thread, without its end. The first step prepares and may compile, and is not
-counted; each later step is, including whatever the planner replans in it.
+For each combination of planner, robot, objective, sensors and belief of a run, the
+first steps of one episode are run on one thread. The first step prepares and may
+compile, so that it is not counted. Each later step is counted, including any replanning
+in it.
 """
 
 import time
@@ -28,8 +29,9 @@ def measure_latencies(
     """Measure planning times of conditions, and write missing ones into `run.json`.
 
     Each condition gets `median_ms`, `p95_ms` and `max_ms` over `steps` steps.
-    Conditions of one planner, robot, objective and way of learning share one
-    measurement, on the first map of the first of them. A planner that fails gets none.
+    Conditions of one planner, robot, objective, sensors and belief share one
+    measurement, on the first map of the first of them. A planner that fails has no
+    measurement.
 
     Args:
         folder: the run folder.
@@ -37,22 +39,27 @@ def measure_latencies(
         settings: settings of the run.
     """
     run = open_run(folder)
-    entries = run.about["conditions"]
-    chosen_ids = [i for i in run.conditions if i in chosen]
+    entries = run.manifest["conditions"]
     latencies: dict[str, Any] = {}
-    for i in chosen_ids:
-        if "latency" in entries[i]:
-            latencies[_key(entries[i])] = entries[i]["latency"]
-    missing = [i for i in chosen_ids if "latency" not in entries[i]]
+    missing = []
+    for condition_id in run.conditions:
+        if condition_id not in chosen:
+            continue
+        entry = entries[condition_id]
+        if "latency" in entry:
+            latencies[_key(entry)] = entry["latency"]
+        else:
+            missing.append(condition_id)
     for condition_id in missing:
         entry = entries[condition_id]
         key = _key(entry)
         if key not in latencies:
-            latencies[key] = _measure(*run.conditions[condition_id], settings)
+            condition, extent = run.conditions[condition_id]
+            latencies[key] = _measure(condition, extent, settings)
         if latencies[key]:
             entry["latency"] = latencies[key]
     if missing:
-        write_run(folder, run.about)
+        write_run(folder, run.manifest)
 
 
 def _key(entry: Mapping[str, Any]) -> str:
@@ -65,14 +72,14 @@ def _measure(
 ) -> dict[str, Any] | None:
     seed, realisation, _ = extent.draws[0]
     unit = Unit(condition=condition, seed=seed, realisation=realisation, maps=(0,))
-    warm: list[float] = []
+    begin_s = 0.0  # time after the first step
 
     def stop(step: int) -> bool:
+        nonlocal begin_s
         if step == 1:
-            warm.append(time.perf_counter())
-        return step > _MAX_STEPS or (
-            step > 2 and time.perf_counter() - warm[0] > _MAX_S
-        )
+            begin_s = time.perf_counter()
+        is_late = step > 2 and time.perf_counter() - begin_s > _MAX_S
+        return step > _MAX_STEPS or is_late
 
     with one_thread():
         try:
@@ -81,15 +88,12 @@ def _measure(
             episodes, _ = simulate(unit, built, settings, stop=stop)
         except Exception:  # The condition's rows report the fault.
             return None
-    counted = 1e3 * episodes.planning_s[1:].numpy()
-    if any(episodes.errors) or not len(counted):
+    times_ms = 1e3 * episodes.planning_s[1:].numpy()
+    if any(episodes.errors) or not len(times_ms):
         return None
-    median_ms, p95_ms, max_ms = (
-        float(np.percentile(counted, percentile)) for percentile in (50, 95, 100)
-    )
     return {
-        "median_ms": median_ms,
-        "p95_ms": p95_ms,
-        "max_ms": max_ms,
-        "steps": len(counted),
+        "median_ms": float(np.percentile(times_ms, 50)),
+        "p95_ms": float(np.percentile(times_ms, 95)),
+        "max_ms": float(np.percentile(times_ms, 100)),
+        "steps": len(times_ms),
     }

@@ -37,11 +37,13 @@ from benchnav.eval.folder.run_folder import (
 from benchnav.eval.folder.steps import align_steps
 from benchnav.eval.run.recordings import keep_ground
 
+_NAMED = 3  # conditions that a message names
+
 
 def merge_shards(parts: Sequence[Path], folder: Path) -> Iterator[tuple[int, int]]:
     """Merge shards into one run folder, and yield (units copied, total units).
 
-    The folder receives its name when it is complete.
+    The folder appears under its name only when it is complete.
 
     Args:
         parts: run folders of shards of one run, in any order.
@@ -55,8 +57,7 @@ def merge_shards(parts: Sequence[Path], folder: Path) -> Iterator[tuple[int, int
         if is_taken(folder):
             raise ConfigError(
                 f"Expected `out` to be a new folder, got {folder}, which exists. "
-                "Write `benchnav-eval merge OUT PART "
-                "…` with the new folder first."
+                "Write `benchnav-eval merge OUT PART …` with the new folder as OUT."
             )
         runs = [_open_shard(part) for part in parts]
         _check_alike(runs)
@@ -97,23 +98,23 @@ def merge_shards(parts: Sequence[Path], folder: Path) -> Iterator[tuple[int, int
 def _check_one_environment(makings: Sequence[Finished]) -> None:
     """Reject units of different code, or whose parts read different files."""
     for earlier, now in pairwise(makings):
-        changed = provenance.code_differences(earlier.about["code"], now.about["code"])
+        before = earlier.metadata["code"]
+        changed = provenance.code_differences(before, now.metadata["code"])
         if changed:
             raise ConfigError(
                 f"Expected shards made by one code, got {earlier.path} and "
-                f"{now.path}, which differ in "
-                f"{'; '.join(changed)}. Give the commands of the shards again "
-                "with one code."
+                f"{now.path}, which differ in {'; '.join(changed)}. Give the commands "
+                "of the shards again with one code."
             )
     touched: dict[str, str] = {}
     for making in makings:
-        contents = making.about.get(TOUCHED, {})
-        if changed := unlike(touched, contents):
+        contents = making.metadata.get(TOUCHED, {})
+        changed = unlike(touched, contents)
+        if changed:
             raise ConfigError(
                 f"Expected shards whose parts read the same, got {making.path}, "
-                "which differs from units before it in "
-                f"{'; '.join(changed)}. Give the commands of the shards again "
-                "with the same files, packages and "
+                f"which differs from units before it in {'; '.join(changed)}. Give the "
+                "commands of the shards again with the same files, packages and "
                 "variables."
             )
         touched |= contents
@@ -141,7 +142,8 @@ def _check_alike(runs: Sequence[Run]) -> None:
         raise ConfigError("Expected one or more `parts`, folders of shards, got none.")
     reasons = []
     for run in runs[1:]:
-        if differing := _unlike(runs[0], run):
+        differing = _unlike(runs[0], run)
+        if differing:
             reasons.append(f"{run.folder}: {'; '.join(differing)}")
     if reasons:
         raise ConfigError(
@@ -152,23 +154,22 @@ def _check_alike(runs: Sequence[Run]) -> None:
 
 
 def _unlike(first: Run, second: Run) -> list[str]:
-    """List what differs between two runs: shards, conditions, extents and maps."""
+    """List differences between two runs: shards, conditions, extents and maps."""
     lines = []
     n_first = _shard(first).of
     n_second = _shard(second).of
     if n_second != n_first:
         lines.append(f"number of shards ({n_first} to {n_second})")
     for run, reference in ((second, first), (first, second)):
-        names = [
-            " ".join(label_words(condition.labels))
-            for i, (condition, _) in reference.conditions.items()
-            if i not in run.conditions
-        ]
+        names = []
+        for condition_id, (condition, _) in reference.conditions.items():
+            if condition_id not in run.conditions:
+                names.append(" ".join(label_words(condition.labels)))
         if names:
-            more = f" and {len(names) - 3} more" if len(names) > 3 else ""
-            lines.append(
-                f"conditions that {run.folder} lacks ({', '.join(names[:3])}{more})"
-            )
+            listed = ", ".join(names[:_NAMED])
+            if len(names) > _NAMED:
+                listed += f" and {len(names) - _NAMED} more"
+            lines.append(f"conditions that {run.folder} lacks ({listed})")
     common = [i for i in first.conditions if i in second.conditions]
     pairs = [(first.conditions[i], second.conditions[i]) for i in common]
     if any(a.labels != b.labels for (a, _), (b, _) in pairs):
@@ -176,36 +177,41 @@ def _unlike(first: Run, second: Run) -> list[str]:
     if any(set(a.draws) != set(b.draws) for (_, a), (_, b) in pairs):
         lines.append("seeds, realisations or maps")
     lines += provenance.dataset_differences(
-        first.about["datasets"], second.about["datasets"]
+        first.manifest["datasets"], second.manifest["datasets"]
     )
     for name in ("hypotheses", "metrics"):
-        if second.about.get(name) != first.about.get(name):
+        if second.manifest.get(name) != first.manifest.get(name):
             lines.append(name)
     return lines
 
 
 def _find(unit: Unit, runs: Sequence[Run]) -> Finished | None:
     """Return a finished unit of some runs; reject one whose rows differ between two."""
-    columns = {metric.quantity.column for metric in metrics_of_run(runs[0].about)}
+    columns = {metric.quantity.column for metric in metrics_of_run(runs[0].manifest)}
     newest = []
     for run in runs:
         makings = find_units(run.folder, unit)
-        newest += [making for making in makings if columns <= making.metrics][:1]
+        complete = [making for making in makings if columns <= making.metrics]
+        newest += complete[:1]
     for making in newest:
-        if damage := making.damage():
+        damage = making.damage()
+        if damage:
             raise ConfigError(
                 f"{making.folder} is damaged: {damage[0]}. Give the shard's command "
                 "again, which runs the unit again."
             )
-    for making in newest[1:]:
-        if len(differences(unit_rows(newest[0]), unit_rows(making))[0]):
+    if not newest:
+        return None
+    first, *others = newest
+    for making in others:
+        cells, _ = differences(unit_rows(first), unit_rows(making))
+        if len(cells):
             raise ConfigError(
                 f"Expected the same rows of a unit in all shards, got {unit.name} "
-                f"({unit.condition.description}), "
-                f"which differs between {newest[0].path} and {making.path}. Leave one "
-                "of them out."
+                f"({unit.condition.description}), which differs between {first.path} "
+                f"and {making.path}. Leave one of them out."
             )
-    return newest[0] if newest else None
+    return first
 
 
 def _check_whole(missing: Sequence[Unit], runs: Sequence[Run]) -> None:
@@ -217,10 +223,9 @@ def _check_whole(missing: Sequence[Unit], runs: Sequence[Run]) -> None:
     folders = {_shard(run).index: run.folder for run in runs}
     named = []
     for index, count in sorted(counts.items()):
+        noun = "unit" if count == 1 else "units"
         begun = f" in {folders[index]}" if index in folders else ""
-        named.append(
-            f"{count} {'unit' if count == 1 else 'units'} of shard {index}/{of}{begun}"
-        )
+        named.append(f"{count} {noun} of shard {index}/{of}{begun}")
     raise ConfigError(
         f"Expected all units of the run, got none for: {', '.join(named)}. Finish the "
         "run's command with each of these "
@@ -231,30 +236,29 @@ def _check_whole(missing: Sequence[Unit], runs: Sequence[Run]) -> None:
 def _about(runs: Sequence[Run]) -> Mapping[str, Any]:
     """Return `run.json` of the merged run.
 
-    It is that of the first shard, with latencies, warnings and history of all.
+    It is `run.json` of the first shard, with latencies, warnings and history of all
+    shards.
     """
-    manifest = {name: value for name, value in runs[0].about.items() if name != "shard"}
-    entries = {
-        i: [run.about["conditions"][i] for run in reversed(runs)]
-        for i in runs[0].conditions
-    }
-    # Entries differ only in latencies, which only the shards that measured them have.
-    manifest["conditions"] = {
-        i: {k: v for entry in shard_entries for k, v in entry.items()}
-        for i, shard_entries in entries.items()
-    }
+    manifest = dict(runs[0].manifest)
+    manifest.pop("shard", None)
+    entries: dict[str, dict[str, Any]] = {}
+    for condition_id in runs[0].conditions:
+        entries[condition_id] = {}
+        # Entries differ only in latencies, which only shards that measured them have.
+        for run in reversed(runs):
+            entries[condition_id] |= run.manifest["conditions"][condition_id]
+    manifest["conditions"] = entries
     for name in ("warnings", "dropped", "history"):
-        manifest[name] = provenance.join(*(run.about[name] for run in runs))
+        manifest[name] = provenance.join(*(run.manifest[name] for run in runs))
     manifest["history"] = provenance.extend_history(
         manifest["history"], manifest["suite"]
     )
-    machines = provenance.join([run.about["machine"] for run in runs])
+    machines = provenance.join([run.manifest["machine"] for run in runs])
     if len(machines) > 1:
-        described = [
-            f"{machine['processor']} with {machine['cores']} cores"
-            for machine in machines
-        ]
-        names = ", ".join(dict.fromkeys(described))
+        described: dict[str, None] = {}
+        for machine in machines:
+            described[f"{machine['processor']} with {machine['cores']} cores"] = None
+        names = ", ".join(described)
         line = (
             f"the shards ran on {len(machines)} machines ({names}), so that "
             "planning times do not compare planners"

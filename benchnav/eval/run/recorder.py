@@ -29,7 +29,7 @@ class Recorder:
     """Collects plans and known maps of some episodes of a unit.
 
     Args:
-        unit: the unit.
+        unit: unit whose episodes are recorded.
         problem: the unit's problem.
         simulation: the unit's simulation, with a λ field that is not resampled.
         terrain: the unit's true maps, with the true λ, which no planner receives.
@@ -53,18 +53,21 @@ class Recorder:
         self._known: dict[int, list[KnownMap]] = {member: [] for member in self._plans}
 
     def watch(self, step: int, plan: Plan, planned: list[int]) -> None:
-        """Store a step's plan, thinned after the time that figures show.
+        """Store a step's plan; plans after the time that figures show are thinned.
 
         Args:
             step: index of the step.
             plan: plan of some episodes.
             planned: indices of these episodes in the unit.
         """
-        is_drawn = step * self.problem.dt_s <= MOMENT_S + 1e-6
+        is_shown = step * self.problem.dt_s <= MOMENT_S + 1e-6
         for index, member in enumerate(planned):
-            if member in self._plans:
-                drawn = drawn_plan(step, plan.lines(index))
-                self._plans[member].append(drawn if is_drawn else thinned(drawn))
+            if member not in self._plans:
+                continue
+            drawn = drawn_plan(step, plan.lines(index))
+            if not is_shown:
+                drawn = thinned(drawn)
+            self._plans[member].append(drawn)
 
     @property
     def observer(self) -> Observer:
@@ -76,14 +79,14 @@ class Recorder:
         )
 
     def learn(self, step: int, knowing: Knowing) -> None:
-        """Store what robots know from a step on.
+        """Store the robots' knowledge from a step on.
 
         Args:
             step: index of the step.
             knowing: the knowledge of the batch.
         """
         for member, known_map in knowing.maps_of(step, self._known).items():
-            # Half the memory, and finer than a file's resolution.
+            # float16 takes half the memory, and is finer than a file's resolution.
             halved = {
                 name: getattr(known_map, name).astype(np.float16) for name in NUMBERS
             }
@@ -92,9 +95,10 @@ class Recorder:
     def recording(self, episodes: Episodes, member: int) -> Recording:
         """Return the recording of one episode."""
         steps = int(episodes.steps[member])
+        outcome = Outcome(int(episodes.outcome[member]))
         return self.driven(
             member,
-            Outcome(int(episodes.outcome[member])).name.lower(),
+            outcome.name.lower(),
             episodes.states[member, : steps + 1].numpy(),
             episodes.actions[member, :steps].numpy(),
             episodes.traversability[member, :steps].numpy(),
@@ -108,60 +112,51 @@ class Recorder:
         actions: np.ndarray,
         traversability: np.ndarray,
     ) -> Recording:
-        """Record an episode from its driven states, with the plans collected here.
+        """Record an episode from its driven states, with the collected plans.
 
         Letters in shapes are those of `Recording`.
 
         Args:
             member: index of the episode in the unit.
             outcome: name of the outcome.
-            states: shape [N + 1, S].
-            actions: shape [N, A].
+            states: robot states, shape [N + 1, S].
+            actions: commanded actions, shape [N, A].
             traversability: observed λ, shape [N].
         """
-        unit = self.unit
         problem = self.problem
-        simulation = self.simulation
+        terrain = self.terrain
 
         def of_member(values: Any) -> np.ndarray:
             return values[member].cpu().numpy()
 
-        truth = self.terrain.truth
-        free = problem.task.rules.free_space
+        truth = terrain.truth
         true_mean = truth.select(torch.tensor([member])).mean()[0]
         soft = (truth.weights[member, 1:] > 0).any(dim=0)
-        field = simulation.field
-        numbers = {
-            "seed": unit.seed,
-            "realisation": unit.realisation,
-            "map": unit.maps[member],
-        }
+        field = None
+        if self.simulation.field is not None:
+            field = of_member(self.simulation.field)
+        layers = {name: of_member(layer) for name, layer in terrain.layers.items()}
         # A batch may continue after the episode has ended.
         known_maps = [
             known_map
             for known_map in self._known.get(member, ())
             if known_map.step <= len(actions)
         ]
-        identity = {
-            "condition": unit.condition.id,
-            **unit.condition.labels,
-            **{name: str(number) for name, number in numbers.items()},
-            "outcome": outcome,
-        }
+        free_space = problem.task.rules.free_space
         return Recording(
-            about=identity,
+            about=self._identity(member, outcome),
             resolution_m=problem.grid.resolution_m,
-            rgb=of_member(self.terrain.rgb),
-            field=None if field is None else of_member(field),
-            immobilising=of_member(simulation.immobilising),
+            rgb=of_member(terrain.rgb),
+            field=field,
+            immobilising=of_member(self.simulation.immobilising),
             goal_m=of_member(problem.goal_m),
-            elevation_m=of_member(self.terrain.elevation_m),
+            elevation_m=of_member(terrain.elevation_m),
             true_mean=true_mean.float().cpu().numpy(),
             soft=soft.cpu().numpy(),
             predicted=of_member(problem.risk_map),
             free=of_member(problem.free),
-            free_by=free.by,
-            free_above=free.above,
+            free_by=free_space.by,
+            free_above=free_space.above,
             dt_s=problem.dt_s,
             time_budget_s=float(problem.time_budget_s[member]),
             action_names=problem.robot.action_names,
@@ -169,8 +164,16 @@ class Recorder:
             actions=actions,
             traversability=traversability,
             plans=self._plans.get(member, ()),
-            layers={
-                name: of_member(layer) for name, layer in self.terrain.layers.items()
-            },
+            layers=layers,
             known=tuple(known_maps),
         )
+
+    def _identity(self, member: int, outcome: str) -> dict[str, str]:
+        """Return the text by which a recording identifies its episode."""
+        unit = self.unit
+        identity = {"condition": unit.condition.id, **unit.condition.labels}
+        identity["seed"] = str(unit.seed)
+        identity["realisation"] = str(unit.realisation)
+        identity["map"] = str(unit.maps[member])
+        identity["outcome"] = outcome
+        return identity

@@ -1,4 +1,4 @@
-"""Recordings that are created again from a finished run, and the map of its figures."""
+"""Recordings created again from a finished run, and the map that its figures show."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -42,13 +42,13 @@ from benchnav.planning.world.simulation import Simulation
 def find_recording(
     folder: Path, unit: Unit, member: int, out: Path | None = None
 ) -> Recording:
-    """Return the recording of an episode, running its unit again if necessary.
+    """Return the recording of an episode; run its unit again if necessary.
 
     Args:
         folder: a run in which the unit is finished.
         unit: unit of the episode.
         member: index of the episode in the unit.
-        out: folder that a new recording is written to; by default the run's.
+        out: folder to which a new recording is written; if None, the run folder.
 
     Raises:
         ConfigError: If the run has no row of the episode, or its device is missing.
@@ -60,9 +60,10 @@ def find_recording(
         if stored.exists():
             return Recording.load(stored)
     row = _row(folder, unit, unit.maps[member])
+    device = device_of_run(open_run(folder).manifest)
+    # Without a time limit of planners, since it changes no action.
+    settings = Settings(device=device.type)
     with one_thread():
-        # Without a time limit of planners, which changes no action.
-        settings = Settings(device=device_of_run(open_run(folder).about).type)
         recorder, built = _recorder(unit, settings, [member])
         episodes, _ = simulate(unit, built, settings, observer=recorder.observer)
     recording = recorder.recording(episodes, member)
@@ -93,22 +94,29 @@ def _row(folder: Path, unit: Unit, map_index: int) -> dict[str, Any]:
     if (folder / EPISODES).exists():
         rows = read_table(folder, EPISODES)
     else:
-        finished = [unit_rows(making) for making in find_units(folder, unit)[:1]]
-        rows = pd.concat([pd.DataFrame(columns=KEYS), *finished])
+        newest = find_units(folder, unit)[:1]
+        no_rows = pd.DataFrame(columns=KEYS)
+        rows = pd.concat([no_rows, *map(unit_rows, newest)])
     keys = {
         "condition": unit.condition.id,
         "seed": unit.seed,
         "realisation": unit.realisation,
         "map": map_index,
     }
-    matches = (rows[list(keys)] == pd.Series(keys)).all(axis=1)
-    if not matches.any():
+    matches = _matching(rows, keys)
+    if matches.empty:
         raise ConfigError(
             f"Expected an episode that is finished, got one that {folder} does not "
             "have yet. Give its `benchnav-eval "
             "run` command again to finish it, or name another condition."
         )
-    return rows[matches].to_dict("records")[0]
+    return matches.to_dict("records")[0]
+
+
+def _matching(rows: pd.DataFrame, values: Mapping[str, Any]) -> pd.DataFrame:
+    """Return the rows that have these values in the columns of their names."""
+    is_equal = rows[list(values)] == pd.Series(values)
+    return rows[is_equal.all(axis=1)]
 
 
 def _repeats(row: Mapping[str, Any], recording: Recording) -> bool:
@@ -118,11 +126,11 @@ def _repeats(row: Mapping[str, Any], recording: Recording) -> bool:
         return False
     if not len(recording.traversability):
         return True
-    length_m = path_length_m(recording.track.astype(np.float64))
-    traversability = recording.traversability.astype(np.float64).mean()
-    return bool(
-        row["path_length_m"] == length_m and row["traversability"] == traversability
-    )
+    track = recording.track.astype(np.float64)
+    traversability = recording.traversability.astype(np.float64)
+    is_same_length = row["path_length_m"] == path_length_m(track)
+    is_same_mean = row["traversability"] == traversability.mean()
+    return bool(is_same_length and is_same_mean)
 
 
 def record_driven(folder: Path, rows: pd.DataFrame) -> list[Recording]:
@@ -133,7 +141,7 @@ def record_driven(folder: Path, rows: pd.DataFrame) -> list[Recording]:
         rows: episodes of one condition, rows of the run's table.
 
     Returns:
-        A recording a row.
+        One recording per row.
 
     Raises:
         BenchnavError: If maps or parts differ from those of the run, or are missing.
@@ -154,19 +162,7 @@ def _record_block(run: Run, rows: pd.DataFrame) -> Iterator[Recording]:
     seed = int(first["seed"])
     realisation = int(first["realisation"])
     unit = Unit(condition=condition, seed=seed, realisation=realisation, maps=maps)
-    origin = Settings().origins().of(unit)
-    code = code_of(run, first["code"])
-    digests = run.about["datasets"][condition.data]["maps"][condition.split]
-    if origin.maps[1:] != tuple(digests[i] for i in maps):
-        raise BenchnavError(
-            f"Expected {condition.data} with the maps of {run.folder}, got other maps."
-        )
-    for part, digest in origin.code["parts"].items():
-        if code["parts"].get(part) != digest:
-            raise BenchnavError(
-                f"Expected {part} as it was when {run.folder} was run, got a changed "
-                "one."
-            )
+    _check_unchanged(run, unit, first["code"])
     with one_thread():
         recorder, _ = _recorder(unit, Settings(), ())
     steps_table = read_steps(
@@ -183,11 +179,34 @@ def _record_block(run: Run, rows: pd.DataFrame) -> Iterator[Recording]:
         yield recorder.driven(member, outcome, states, actions, traversability)
 
 
+def _check_unchanged(run: Run, unit: Unit, code_digest: str) -> None:
+    """Reject maps or parts that differ from those of a run.
+
+    Raises:
+        BenchnavError: If they differ.
+    """
+    condition = unit.condition
+    origin = Settings().origins().of(unit)
+    digests = run.manifest["datasets"][condition.data]["maps"][condition.split]
+    map_digests = tuple(digests[index] for index in unit.maps)
+    if origin.maps[1:] != map_digests:
+        raise BenchnavError(
+            f"Expected {condition.data} with the maps of {run.folder}, got other maps."
+        )
+    parts = code_of(run, code_digest)["parts"]
+    for part, digest in origin.code["parts"].items():
+        if parts.get(part) != digest:
+            raise BenchnavError(
+                f"Expected {part} as it was when {run.folder} was run, got a changed "
+                "one."
+            )
+
+
 def telling_map(episodes: pd.DataFrame) -> dict[str, Any]:
     """Choose the map and draw of λ on which conditions differ most in success.
 
-    Successes and failures are about equally frequent there. Ties go to the map that
-    most conditions were run on, then to the first.
+    Successes and failures are about equally frequent there. Of equal maps, the one that
+    most conditions were run on is chosen, then the first.
 
     Args:
         episodes: rows of a run.
@@ -215,26 +234,25 @@ def keep_ground(folder: Path) -> None:
         return
     rows = read_table(folder, EPISODES)
     map_keys = telling_map(rows)
-    matches = (rows[list(map_keys)] == pd.Series(map_keys)).all(axis=1)
-    map_rows = rows[matches]
-    condition, _ = open_run(folder).conditions[map_rows["condition"].iloc[0]]
-    block = read_maps(condition.dataset, condition.split, [map_keys["map"]])
+    first_id = _matching(rows, map_keys)["condition"].iloc[0]
+    condition, _ = open_run(folder).conditions[first_id]
+    maps = [map_keys["map"]]
+    block = read_maps(condition.dataset, condition.split, maps)
     noise = noise_key(map_keys["seed"], condition.split, map_keys["realisation"])
     simulation = Simulation(
-        block.terrain,
-        condition.task,
-        condition.world,
-        block.places,
-        noise,
-        [map_keys["map"]],
+        block.terrain, condition.task, condition.world, block.places, noise, maps
     )
-    field = simulation.field
-    Ground(
+    field = None
+    if simulation.field is not None:
+        field = simulation.field[0].cpu().numpy()
+    ground = Ground(
         about=map_keys,
         resolution_m=block.terrain.grid.resolution_m,
         rgb=block.terrain.rgb[0].cpu().numpy(),
-        field=None if field is None else field[0].cpu().numpy(),
+        field=field,
         immobilising=simulation.immobilising[0].cpu().numpy(),
         goal_m=block.places.goal_m[0].cpu().numpy(),
-    ).save(folder / GROUND)
-    note_checksums(folder, [folder / GROUND])
+    )
+    path = folder / GROUND
+    ground.save(path)
+    note_checksums(folder, [path])

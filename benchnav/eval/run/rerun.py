@@ -73,21 +73,20 @@ def rerun(
     if not overwrite and (folder / RUN).exists():
         _check_repeats(run, folder)
     settings = Settings(
-        planner_limit_s=run.about["planner_limit_s"],
-        device=device_of_run(run.about).type,
+        planner_limit_s=run.manifest["planner_limit_s"],
+        device=device_of_run(run.manifest).type,
     )
     _check_available(run)
-    metrics = metrics_of_run(run.about)
+    metrics = metrics_of_run(run.manifest)
     if jobs != 1 or settings.planner_limit_s:
-        check_everywhere(
-            (condition for condition, _ in run.conditions.values()), metrics
-        )
+        conditions = [condition for condition, _ in run.conditions.values()]
+        check_everywhere(conditions, metrics)
     work = Work(
-        suite=run.about["suite"],
+        suite=run.manifest["suite"],
         conditions=run.conditions,
-        dropped=tuple(run.about["dropped"]),
-        warnings=tuple(run.about["warnings"]),
-        hypotheses=run.about.get("hypotheses", {}),
+        dropped=tuple(run.manifest["dropped"]),
+        warnings=tuple(run.manifest["warnings"]),
+        hypotheses=run.manifest.get("hypotheses", {}),
         metrics=metrics,
         record="none",
         settings=settings,
@@ -116,18 +115,23 @@ def compare(run_folder: Path, folder: Path) -> tuple[bool, list[str]]:
     second = read_table(folder, EPISODES)
     columns = differing_columns(first, second)
     cells, missing = differences(first, second)
-    same = not (len(cells) or len(missing) or columns)
-    lines = [f"all {len(first)} rows came out the same"] if same else []
-    if len(cells) or len(missing):
+    rows_differ = bool(len(cells) or len(missing))
+    same = not rows_differ and not columns
+    lines = []
+    if same:
+        lines.append(f"all {len(first)} rows came out the same")
+    if rows_differ:
         conditions: dict[str, Condition] = {}
         for entries in (again.conditions, run.conditions):
             conditions |= {i: condition for i, (condition, _) in entries.items()}
         lines += _verdict(conditions, len(first), cells, missing)
     lines += [f"column {name} is in only one of the two tables" for name in columns]
-    return same, [*lines, _environment(run.about, again.about)]
+    lines.append(_environment(run.manifest, again.manifest))
+    return same, lines
 
 
 def _open(folder: Path) -> Run:
+    """Open a finished run; reject one without a table."""
     run = open_run(folder)
     read_table(folder, EPISODES)
     return run
@@ -142,29 +146,29 @@ def _check_repeats(run: Run, folder: Path) -> None:
             "another `out`."
         )
     run_units = units(run.conditions)
-    copied = len(_makings(run.folder, run_units) & _makings(folder, run_units))
+    copied = _tokens(run.folder, run_units) & _tokens(folder, run_units)
     if copied:
         raise ConfigError(
             f"Expected `out` to be new or an earlier rerun of {run.folder}, got "
-            f"{folder}, where {copied} of "
+            f"{folder}, where {len(copied)} of "
             f"{len(run_units)} units are copies of that run's units. Choose another "
             "`out`, or pass --overwrite."
         )
 
 
-def _makings(folder: Path, run_units: Sequence[Unit]) -> set[str]:
-    """Return the tokens of all finished units; copies share a token."""
-    return {
-        finished.about["made"]
-        for unit in run_units
-        for finished in find_units(folder, unit)
-    }
+def _tokens(folder: Path, run_units: Sequence[Unit]) -> set[str]:
+    """Return the tokens of all finished units; a copy has the token of its original."""
+    tokens = set()
+    for unit in run_units:
+        for finished in find_units(folder, unit):
+            tokens.add(finished.metadata["made"])
+    return tokens
 
 
 def _check_available(run: Run) -> None:
     """Reject a run that depends on something missing, and list all that is missing."""
     missing: dict[str, None] = {}
-    parts = [metric.part for metric in metrics_of_run(run.about)]
+    parts = [metric.part for metric in metrics_of_run(run.manifest)]
     checks: list[Callable[[], Any]] = [partial(provenance.describe_metrics, parts)]
     for condition, extent in run.conditions.values():
         checks.append(partial(check_split, condition, maps=extent.maps))
@@ -176,8 +180,7 @@ def _check_available(run: Run) -> None:
             missing[str(error)] = None
     if missing:
         raise ConfigError(
-            f"Expected all that {run.folder} was made with, got a lack: "
-            f"{' '.join(missing)}"
+            f"Expected all inputs of {run.folder}, got missing ones: {' '.join(missing)}"
         )
     conditions = [condition for condition, _ in run.conditions.values()]
     for entry in find_left_out(conditions).values():
@@ -195,42 +198,30 @@ def _verdict(
     changes = [
         f"{name} {_text(a)} → {_text(b)}" for (*_, name), a, b in cells.itertuples()
     ]
-    changes_by_row = (
-        pd.Series(changes, index=cells.index, dtype=str)
-        .groupby(level=KEYS, sort=False)
-        .agg(", ".join)
+    by_row = pd.Series(changes, index=cells.index, dtype=str).groupby(
+        level=KEYS, sort=False
     )
-    differing = pd.concat(
-        [changes_by_row, pd.Series("in only one of the two tables", index=missing)]
-    )
+    unmatched = pd.Series("in only one of the two tables", index=missing)
+    differing = pd.concat([by_row.agg(", ".join), unmatched])
     counts = differing.groupby(level="condition", sort=False).size()
     lines = [
         f"{len(differing)} of {rows} rows came out differently, in {len(counts)} of "
         f"{len(conditions)} conditions:"
     ]
-    lines += [
-        f"  {conditions[condition].description}: {count} rows"
-        for condition, count in counts.items()
-    ]
+    for condition, count in counts.items():
+        lines.append(f"  {conditions[condition].description}: {count} rows")
     lines.append("the first of them:")
     for (condition, *draw), line in differing.head(_SHOWN).items():
-        where = ", ".join(
-            f"{name} {value}" for name, value in zip(KEYS[1:], draw, strict=True)
-        )
-        lines.append(f"  {conditions[condition].description}, {where}: {line}")
-    numbers = cells[cells.map(lambda value: isinstance(value, float)).all(axis=1)]
-    gaps = (
-        (numbers["first"] - numbers["second"])
-        .abs()
-        .groupby(level=-1, sort=False)
-        .max()
-        .dropna()
-    )
-    if len(gaps):
-        lines.append(
-            "greatest differences: "
-            f"{', '.join(f'{name} {gap:.3g}' for name, gap in gaps.items())}"
-        )
+        keys = zip(KEYS[1:], draw, strict=True)
+        words = ", ".join(f"{name} {value}" for name, value in keys)
+        lines.append(f"  {conditions[condition].description}, {words}: {line}")
+    is_number = cells.map(lambda value: isinstance(value, float)).all(axis=1)
+    numbers = cells[is_number]
+    gaps = (numbers["first"] - numbers["second"]).abs()
+    max_gaps = gaps.groupby(level=-1, sort=False).max().dropna()
+    if len(max_gaps):
+        words = ", ".join(f"{name} {gap:.3g}" for name, gap in max_gaps.items())
+        lines.append(f"greatest differences: {words}")
     return lines
 
 
@@ -242,19 +233,22 @@ def _environment(
     before_manifest: Mapping[str, Any], now_manifest: Mapping[str, Any]
 ) -> str:
     """Describe the differences between the environments of two runs."""
-    codes = zip(
-        before_manifest["codes"].values(), now_manifest["codes"].values(), strict=False
-    )
-    changed = [line for pair in codes for line in provenance.code_differences(*pair)]
+    before_codes = before_manifest["codes"].values()
+    now_codes = now_manifest["codes"].values()
+    changed = []
+    for before_code, now_code in zip(before_codes, now_codes, strict=False):
+        changed += provenance.code_differences(before_code, now_code)
     changed += provenance.dataset_differences(
         before_manifest["datasets"], now_manifest["datasets"]
     )
-    machines = [
-        f"{manifest['machine']['processor']}, {manifest['machine']['cores']} cores"
-        for manifest in (before_manifest, now_manifest)
-    ]
-    if machines[0] != machines[1]:
-        changed.append(f"machine ({machines[0]} to {machines[1]})")
+    before_machine = _machine_words(before_manifest["machine"])
+    now_machine = _machine_words(now_manifest["machine"])
+    if before_machine != now_machine:
+        changed.append(f"machine ({before_machine} to {now_machine})")
     if not changed:
         return "no difference between the recorded environments"
     return f"the environments differ in: {'; '.join(dict.fromkeys(changed))}"
+
+
+def _machine_words(machine: Mapping[str, Any]) -> str:
+    return f"{machine['processor']}, {machine['cores']} cores"

@@ -1,9 +1,9 @@
 """Episodes: a planner and the simulation in a closed loop, as one batch.
 
-A GPU executes queued work while the CPU queues more, as long as no value is read. So on
-devices other than the CPU the loop reads only every few steps which episodes still run,
-and faults remain tensors until the end. Letters in shapes: B episodes, N steps, S state
-and A action dimensions.
+A GPU executes queued work while the CPU queues more, as long as no value is read. On
+devices other than the CPU, the loop therefore reads the mask of running episodes only
+every few steps, and faults remain tensors until the end.
+Letters in shapes: B episodes, N steps, S state and A action dimensions.
 """
 
 import itertools
@@ -36,7 +36,7 @@ from benchnav.planning.sensing.sensor import Step
 from benchnav.planning.world.outcome import Outcome, tell_standstill
 from benchnav.planning.world.simulation import Simulation, SimulationState, end
 
-_FULL = 0.75  # fraction of running episodes above which the batch is not reduced
+_MAX_REMAINING = 0.75  # fraction of running episodes above which no batch is reduced
 _CHECK_INTERVAL = 8  # steps between two reads of the running episodes, on a GPU
 
 
@@ -45,11 +45,12 @@ class Observer:
     """Callbacks during episodes, for recordings.
 
     Args:
-        plan: called with the index of a step, its plan and the indices of its episodes,
-            before the step is taken.
-        plan_interval: steps between two calls of `plan`, from the first step.
-        knowledge: called with the index of a step and the knowledge after an update,
-            before the step is planned.
+        plan: function that is called with the index of a step, its plan and the indices
+            of its episodes, before the step is taken.
+        plan_interval: number of steps between two calls of `plan`; the first step has a
+            call.
+        knowledge: function that is called with the index of a step and the knowledge
+            after an update, before the step is planned.
     """
 
     plan: Callable[[int, Plan, list[int]], None] | None = None
@@ -64,27 +65,30 @@ class Episodes:
     Beyond an episode's `steps` its state is constant.
 
     Args:
-        states: shape [B, N + 1, S].
-        actions: shape [B, N, A].
+        states: robot states, shape [B, N + 1, S].
+        actions: commanded actions, shape [B, N, A].
         traversability: observed λ of each step, shape [B, N].
-        speed_mps: speed of each action on terrain of λ = 1 [m/s], shape [B, N].
-        turn_rate_radps: turn rate of each action, likewise [rad/s], shape [B, N].
-        outcome: `Outcome`, shape [B].
-        steps: steps to the end, shape [B].
-        begin_s: wall time of the planner's preparation for the batch.
-        planning_s: wall time of each step's plan, shape [N].
-        planned: number of episodes planned for in each step, int64, shape [N].
+        speed_mps: speed that each action gives on terrain of λ = 1, in m/s, shape
+            [B, N].
+        turn_rate_radps: turn rate that each action gives on terrain of λ = 1, in rad/s,
+            shape [B, N].
+        outcome: codes of `Outcome`, shape [B].
+        steps: number of steps to the end, shape [B].
+        begin_s: wall time of the planner's preparation for the batch, in seconds.
+        planning_s: wall time of each step's plan, in seconds, shape [N].
+        planned: number of episodes that each step's plan is for, int64, shape [N].
         revisions: number of changes of each episode's map, int64, shape [B].
-        learning_s: wall time of sensing and updates, total of all steps.
-        errors: a line for each episode that ended by a fault of its planner, empty
-            for the others, length B.
-        traceback: traceback of the planner's exception; empty if there was none.
-        seen_cells: number of cells each robot saw, int64, shape [B]; None if robots do
-            not learn.
+        learning_s: wall time of sensing and updates in all steps, in seconds.
+        errors: one line for each episode, length B: the fault of its planner that ended
+            it; empty for other episodes.
+        traceback: traceback of the planner's exception; empty if it raised none.
+        seen_cells: number of cells that each robot saw, int64, shape [B]; None if
+            robots do not learn.
         sensed_cells: number of cells whose λ each robot measured, int64, shape [B];
-            None likewise.
-        ahead: RMSE of E[λ] and log score over the cells ahead of the robot, NaN at
-            steps without an update, shape [B, N, 2]; None likewise. See `Knowing`.
+            None if robots do not learn.
+        ahead: RMSE of E[λ] and log score over the cells ahead of the robot, as in
+            `Knowing.ahead`, shape [B, N, 2]; NaN at steps without an update. None if
+            robots do not learn.
     """
 
     states: Tensor
@@ -146,30 +150,28 @@ class _Log:
     """Record of the steps while they are taken."""
 
     def __init__(self, start: SimulationState, problem: Problem) -> None:
+        device = start.state.device
         self.dt_s = problem.dt_s
         self.states = [start.state]
-        # Of each step: actions, observed λ, and distance and turn rate for λ = 1.
+        # Each step has actions, observed λ, and distance and turn rate for λ = 1. The
+        # empty first entry gives shapes to episodes without a step.
+        n_actions = len(problem.robot.action_low)
         empty = start.state.new_zeros(len(start.state), 0)
-        self._steps = [
-            [
-                empty[..., None].expand(-1, 0, len(problem.robot.action_low)),
-                empty,
-                empty,
-                empty,
-            ]
-        ]
-        self.clock = Clock(start.state.device)  # what is prepared, then each plan
-        self.learning = Clock(start.state.device)
+        no_actions = empty[..., None].expand(-1, 0, n_actions)
+        self._steps = [[no_actions, empty, empty, empty]]
+        self.clock = Clock(device)  # of the preparation, then of each plan
+        self.learning = Clock(device)
         self.planned: list[int] = []
         self._reasons: list[str] = []
-        # Index of each episode's reason; -1 for none.
+        # Index of each episode's reason; -1 without a fault.
         self._fault = torch.full_like(start.outcome, -1)
 
     def blame(self, mask: Tensor, reason: str) -> None:
-        """Record why some running episodes end, by a mask, bool [B]."""
+        """Record the reason for which the episodes of a mask, bool [B], end."""
         if reason not in self._reasons:
             self._reasons.append(reason)
-        self._fault = torch.where(mask, self._reasons.index(reason), self._fault)
+        index = self._reasons.index(reason)
+        self._fault = torch.where(mask, index, self._fault)
 
     def add(
         self,
@@ -178,15 +180,18 @@ class _Log:
         traversability: Tensor,
         free: Tensor,
     ) -> None:
+        """Add a step; `free` are the states that terrain of λ = 1 would give."""
         before = self.states[-1]
+        driven = distance(free, before[:, :2])
         turned = (free[:, 2] - before[:, 2]) / self.dt_s
-        values = action, traversability, distance(free, before[:, :2]), turned
+        values = (action, traversability, driven, turned)
         self._steps.append([value.unsqueeze(1) for value in values])
         self.states.append(after.state)
 
     def episodes(
         self, now: SimulationState, traceback_: str, knowing: Knowing | None
     ) -> Episodes:
+        """Return the episodes; `now` is the last state of the simulation."""
         track = torch.stack(self.states, dim=1)
         taken = len(self._steps) - 1
         actions, traversability, driven, turned = (
@@ -196,15 +201,16 @@ class _Log:
         outcome = tell_standstill(
             now.outcome, now.step, track[..., :2], driven, self.dt_s
         )
-        errors = ["" if i < 0 else self._reasons[i] for i in self._fault.tolist()]
-        learnt: dict[str, Any] = {"revisions": torch.zeros_like(now.step).cpu()}
-        if knowing is not None:
-            learnt = {
-                "revisions": knowing.revisions.cpu(),
-                "seen_cells": knowing.seen_cells.cpu(),
-                "sensed_cells": knowing.sensed_cells.cpu(),
-                "ahead": _by_step(knowing.ahead, len(track), taken),
-            }
+        reasons = [*self._reasons, ""]  # index -1 selects the empty one
+        errors = [reasons[index] for index in self._fault.tolist()]
+        learnt: dict[str, Any] = {}
+        if knowing is None:
+            learnt["revisions"] = torch.zeros_like(now.step).cpu()
+        else:
+            learnt["revisions"] = knowing.revisions.cpu()
+            learnt["seen_cells"] = knowing.seen_cells.cpu()
+            learnt["sensed_cells"] = knowing.sensed_cells.cpu()
+            learnt["ahead"] = _by_step(knowing.ahead, len(track), taken)
         return Episodes(
             states=track.cpu(),
             actions=actions.cpu(),
@@ -248,15 +254,16 @@ def run_episodes(
     robot cannot perform ends only its own episode.
 
     Args:
-        planner: chooses actions; it receives copies of predictions, never the truth.
+        planner: planner that chooses actions; it receives copies of predictions, never
+            the truth.
         problem: problem with predicted traversability.
         simulation: simulation with the true terrain.
         generator: random generator of the planner.
         observer: callbacks for recordings.
-        stop: called with each step index; True ends the run. Episodes that still run
-            keep the outcome running.
-        learning: sensing and belief of the robots, whose planner then replans; None if
-            they do not learn.
+        stop: function that is called with the index of each step; True ends the run.
+            Episodes that still run keep the outcome running.
+        learning: sensing and belief of the robots, after whose updates the planner
+            replans; None if the robots do not learn.
 
     Returns:
         The episodes.
@@ -334,10 +341,10 @@ def run_episodes(
 
 
 class _Batch:
-    """The episodes planned for: all at first, fewer after enough of them have ended.
+    """The episodes that are planned: all at first, fewer after enough have ended.
 
     Args:
-        planner: the planner.
+        planner: planner of all episodes.
         problem: problem of all episodes.
         plan_state: plan state returned by `begin`.
     """
@@ -363,7 +370,7 @@ class _Batch:
             episode was removed.
         """
         remaining = running[self.members].nonzero()[:, 0]
-        if len(remaining) > _FULL * len(self.members):
+        if len(remaining) > _MAX_REMAINING * len(self.members):
             return None
         indices = remaining.to(self._index.device)
         state = self._planner.select(self._state, indices)
@@ -376,7 +383,7 @@ class _Batch:
         return indices
 
     def part_of(self, values: Tensor) -> Tensor:
-        """Return the values of the remaining episodes, from values [B, ...] of all."""
+        """Select the values of the remaining episodes from those of all, [B, ...]."""
         return values[self._index]
 
     def revise(self, problem: Problem, generator: torch.Generator) -> None:
@@ -397,14 +404,13 @@ class _Batch:
 
     def spread(self, answer: Answer) -> tuple[Tensor, Tensor, Tensor]:
         """Return actions, faults and statuses of all episodes, neutral for ended ones."""
-        zeros = torch.zeros(
-            len(self._all), dtype=torch.int64, device=self._index.device
-        )
-        return (
-            standing_actions(self._all).index_copy(0, self._index, answer.action),
-            zeros.bool().index_copy(0, self._index, answer.faulty),
-            zeros.index_copy(0, self._index, answer.plan.status),
-        )
+        index = self._index
+        zeros = torch.zeros(len(self._all), dtype=torch.int64, device=index.device)
+        standing = standing_actions(self._all)
+        action = standing.index_copy(0, index, answer.action)
+        faulty = zeros.bool().index_copy(0, index, answer.faulty)
+        status = zeros.index_copy(0, index, answer.plan.status)
+        return action, faulty, status
 
 
 class RobotError(BenchnavError):
@@ -422,6 +428,5 @@ def _move(
         raise gpu_failed(error) from error
     except Exception as error:
         robot = type(simulation.robot).__name__
-        raise out_of_memory(error) or RobotError(
-            f"Robot {robot} failed in the simulation: {fault(error)}"
-        ) from error
+        message = f"Robot {robot} failed in the simulation: {fault(error)}"
+        raise out_of_memory(error) or RobotError(message) from error

@@ -1,4 +1,4 @@
-"""Rows of tables: an episode's metrics, and its steps."""
+"""Rows of tables: the metrics of each episode, and its steps."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,11 +25,12 @@ class Draws:
     """Reference values of the maps of a batch and of the λ drawn on them.
 
     Args:
-        reference_time_s: grid reference times at 1 m/s, shape [B]; NaN if missing.
-        rejected_draws: number of draws of λ of each episode without a feasible path to
-            the goal, length B.
-        lower_bound_s: lower bound of the time to the goal, infinite if no trajectory
-            reaches it, length B; empty if it was not computed.
+        reference_time_s: grid reference times at 1 m/s, in seconds, shape [B]; NaN if
+            missing.
+        rejected_draws: number of draws of λ that were rejected before each episode's
+            draw, since they had no feasible path to the goal, length B.
+        lower_bound_s: lower bounds of the time to the goal, in seconds, infinite if no
+            trajectory reaches it, length B; empty if no bound was computed.
     """
 
     reference_time_s: np.ndarray
@@ -47,76 +48,82 @@ def finished_episodes(
         episodes: the episodes of the batch.
         draws: reference values of their maps and λ.
     """
-    # In the tensor's own precision, in which planners compare.
+    # In the precision of the observed λ, in which planners compare.
     dtype = episodes.traversability.dtype
     above = torch.tensor(problem.task.rules.free_space.above, dtype=dtype)
+    n_episodes = len(episodes.steps)
     planning_s = episodes.planning_s / episodes.planned
+    preparing_s = episodes.begin_s / n_episodes
     finished = []
-    for b in range(len(episodes.steps)):
+    for b in range(n_episodes):
         steps = int(episodes.steps[b])
+        outcome = Outcome(int(episodes.outcome[b]))
         lower_bound_s = draws.lower_bound_s[b] if len(draws.lower_bound_s) else np.nan
-        finished.append(
-            Episode(
-                states=_float64(episodes.states[b, : steps + 1]),
-                actions=_float64(episodes.actions[b, :steps]),
-                action_names=problem.robot.action_names,
-                speed_mps=_float64(episodes.speed_mps[b, :steps]),
-                turn_rate_radps=_float64(episodes.turn_rate_radps[b, :steps]),
-                traversability=_float64(episodes.traversability[b, :steps]),
-                outcome=Outcome(int(episodes.outcome[b])).name.lower(),
-                dt_s=problem.dt_s,
-                time_budget_s=float(problem.time_budget_s[b]),
-                reference_time_s=float(draws.reference_time_s[b]),
-                goal_m=_float64(problem.goal_m[b]),
-                goal_radius_m=problem.goal_radius_m,
-                stuck_traversability=float(above),
-                robot=problem.robot,
-                planning_s=_float64(planning_s[:steps]),
-                preparing_s=episodes.begin_s / len(episodes.steps),
-                learning=_learning(episodes, b),
-                rejected_draws=draws.rejected_draws[b],
-                lower_bound_s=lower_bound_s,
-            )
+        episode = Episode(
+            states=_float64(episodes.states[b, : steps + 1]),
+            actions=_float64(episodes.actions[b, :steps]),
+            action_names=problem.robot.action_names,
+            speed_mps=_float64(episodes.speed_mps[b, :steps]),
+            turn_rate_radps=_float64(episodes.turn_rate_radps[b, :steps]),
+            traversability=_float64(episodes.traversability[b, :steps]),
+            outcome=outcome.name.lower(),
+            dt_s=problem.dt_s,
+            time_budget_s=float(problem.time_budget_s[b]),
+            reference_time_s=float(draws.reference_time_s[b]),
+            goal_m=_float64(problem.goal_m[b]),
+            goal_radius_m=problem.goal_radius_m,
+            stuck_traversability=float(above),
+            robot=problem.robot,
+            planning_s=_float64(planning_s[:steps]),
+            preparing_s=preparing_s,
+            learning=_learning(episodes, b),
+            rejected_draws=draws.rejected_draws[b],
+            lower_bound_s=lower_bound_s,
         )
+        finished.append(episode)
     return finished
 
 
 def unbegun_episodes(
-    task: Task, places: Endpoints, time_budget_s: Tensor, outcome: Outcome
+    task: Task, endpoints: Endpoints, time_budget_s: Tensor, outcome: Outcome
 ) -> list[Episode]:
-    """Return episodes without a step, such as those whose model failed.
+    """Return episodes without a step, for example because their model failed.
 
     Args:
         task: task of all episodes.
-        places: starts and goals.
+        endpoints: starts and goals of B episodes.
         time_budget_s: T in seconds, shape [B].
         outcome: outcome of all episodes.
     """
-    starts = task.robot.initial_state(heading_to(places.start_m, places.goal_m))
-    nothing = np.empty(0)
-    return [
-        Episode(
+    robot = task.robot
+    poses = heading_to(endpoints.start_m, endpoints.goal_m)
+    starts = robot.initial_state(poses)
+    no_steps = np.empty(0)
+    no_actions = np.empty((0, len(robot.action_names)))
+    unbegun = []
+    for start, goal_m, budget_s in zip(
+        starts, endpoints.goal_m, time_budget_s, strict=True
+    ):
+        episode = Episode(
             states=_float64(start[None]),
-            actions=np.empty((0, len(task.robot.action_names))),
-            action_names=task.robot.action_names,
-            speed_mps=nothing,
-            turn_rate_radps=nothing,
-            traversability=nothing,
+            actions=no_actions,
+            action_names=robot.action_names,
+            speed_mps=no_steps,
+            turn_rate_radps=no_steps,
+            traversability=no_steps,
             outcome=outcome.name.lower(),
-            dt_s=task.robot.dt_s,
+            dt_s=robot.dt_s,
             time_budget_s=float(budget_s),
             reference_time_s=np.nan,
             goal_m=_float64(goal_m),
             goal_radius_m=task.rules.goal_radius_m,
             stuck_traversability=task.rules.free_space.above,
-            robot=task.robot,
-            planning_s=nothing,
+            robot=robot,
+            planning_s=no_steps,
             preparing_s=np.nan,
         )
-        for start, goal_m, budget_s in zip(
-            starts, places.goal_m, time_budget_s, strict=True
-        )
-    ]
+        unbegun.append(episode)
+    return unbegun
 
 
 def _float64(values: Tensor) -> np.ndarray:
@@ -125,19 +132,20 @@ def _float64(values: Tensor) -> np.ndarray:
 
 
 def _learning(episodes: Episodes, member: int) -> LearningRecord | None:
-    if (
-        episodes.ahead is None
-        or episodes.seen_cells is None
-        or episodes.sensed_cells is None
-    ):
+    """Return the record of learning of one episode; None if robots do not learn."""
+    seen_cells = episodes.seen_cells
+    sensed_cells = episodes.sensed_cells
+    if episodes.ahead is None or seen_cells is None or sensed_cells is None:
         return None
-    planned = int(episodes.planned.sum())
+    steps = int(episodes.steps[member])
+    n_planned = int(episodes.planned.sum())
+    step_s = episodes.learning_s / n_planned if n_planned else np.nan
     return LearningRecord(
         revisions=int(episodes.revisions[member]),
-        seen_cells=int(episodes.seen_cells[member]),
-        sensed_cells=int(episodes.sensed_cells[member]),
-        ahead=_float64(episodes.ahead[member, : int(episodes.steps[member])]),
-        step_s=episodes.learning_s / planned if planned else np.nan,
+        seen_cells=int(seen_cells[member]),
+        sensed_cells=int(sensed_cells[member]),
+        ahead=_float64(episodes.ahead[member, :steps]),
+        step_s=step_s,
     )
 
 
@@ -148,89 +156,96 @@ def episode_rows(
     errors: Sequence[str],
     compiled: bool,
 ) -> pd.DataFrame:
-    """Tabulate episodes, a row each.
+    """Tabulate episodes, one row each.
 
     Args:
         unit: the unit, with its metrics in addition to the built-in ones.
         groups: group index of each map, shape [B].
         finished: episodes of the unit, length B.
-        errors: message of each episode's fault, one line; empty if there was none.
+        errors: message of each episode's fault in one line; empty if it had no fault.
         compiled: whether the planner ran compiled.
 
     Returns:
         The condition's id and labels, `seed`, `realisation`, `map`, `group`, `outcome`;
         the columns of `benchnav.metrics.SHIPPED`; `compiled`, `error`; and the columns
-        of the unit's own metrics.
+        of the unit's further metrics.
 
     Raises:
-        MetricError: If a metric fails, or returns no finite number.
+        MetricError: If a metric raises, or returns an infinite number or no number.
     """
     further = [part.create() for part in unit.metrics]
     rows = []
     for map_index, episode, error in zip(unit.maps, finished, errors, strict=True):
         row: dict[str, Any] = {"outcome": episode.outcome}
-        row |= {metric.column: metric.value(episode) for metric in SHIPPED}
-        row |= {"compiled": compiled, "error": error}
+        for metric in SHIPPED:
+            row[metric.column] = metric.value(episode)
+        row["compiled"] = compiled
+        row["error"] = error
         try:
-            row |= {metric.column: measure(metric, episode) for metric in further}
+            for metric in further:
+                row[metric.column] = measure(metric, episode)
         except MetricError as fault:
-            where = (
+            origin = (
                 f"{unit.condition.description}, seed {unit.seed}, realisation "
                 f"{unit.realisation}, map {map_index}"
             )
-            raise MetricError(f"{fault} It was given an episode of {where}.") from fault
+            message = f"{fault} It was given an episode of {origin}."
+            raise MetricError(message) from fault
         rows.append(row)
-    return _named(unit, groups).join(pd.DataFrame(rows))
+    return _identities(unit, groups).join(pd.DataFrame(rows))
 
 
-def _named(unit: Unit, groups: np.ndarray) -> pd.DataFrame:
-    """Return the columns that identify episodes, a row each."""
-    condition = unit.condition
-    draw = {
-        "seed": unit.seed,
-        "realisation": unit.realisation,
-        "map": unit.maps,
-        "group": groups,
-    }
-    return pd.DataFrame({"condition": condition.id, **condition.labels, **draw})
+def _identities(unit: Unit, groups: np.ndarray) -> pd.DataFrame:
+    """Return the columns that identify the unit's episodes, one row each."""
+    columns: dict[str, Any] = {"condition": unit.condition.id}
+    columns |= unit.condition.labels
+    columns["seed"] = unit.seed
+    columns["realisation"] = unit.realisation
+    columns["map"] = unit.maps
+    columns["group"] = groups
+    return pd.DataFrame(columns)
 
 
 def step_table(unit: Unit, problem: Problem, episodes: Episodes) -> pa.Table:
-    """Tabulate driven paths, a row for each step and one for the last state.
+    """Tabulate driven paths, one row for each step and one for the last state.
 
     Args:
-        unit: the unit.
+        unit: unit that was run.
         problem: the unit's problem.
         episodes: the unit's episodes.
 
     Returns:
-        `seed`, `realisation`, `map`, `step`, `time_s`, `x_m`, `y_m`, `heading_rad`,
-        each action by its name, if robots learn `AHEAD_COLUMNS` (NaN except at
-        updates), and observed `traversability`; actions and `traversability`
-        are NaN at the last state.
+        `seed`, `realisation`, `map`, `step`, `time_s`, `x_m`, `y_m`, `heading_rad`; a
+        column for each action; if robots learn, `AHEAD_COLUMNS` (NaN except at
+        updates); and observed `traversability`. Actions and `traversability` are NaN at
+        the last state.
     """
-    steps_axis = np.arange(episodes.states.shape[1])
-    steps = episodes.steps.numpy()[:, None]
-    inside = steps_axis <= steps
-    step = np.broadcast_to(steps_axis, inside.shape)[inside]
+    step_axis = np.arange(episodes.states.shape[1])
+    n_steps = episodes.steps.numpy()[:, None]
+    is_row = step_axis <= n_steps
+    is_step = step_axis < n_steps
+    step = np.broadcast_to(step_axis, is_row.shape)[is_row]
+    n_rows = len(step)
 
     def of_steps(values: Tensor) -> np.ndarray:
         """Return one value a row, NaN at the last state of each episode."""
-        padded = np.pad(values.numpy().astype(np.float32), ((0, 0), (0, 1)))
-        return np.where(steps_axis < steps, padded, np.float32(np.nan))[inside]
+        numbers = values.numpy().astype(np.float32)
+        padded = np.pad(numbers, ((0, 0), (0, 1)))
+        return np.where(is_step, padded, np.float32(np.nan))[is_row]
 
-    columns: dict[str, Any] = {
-        "seed": np.full(len(step), unit.seed),
-        "realisation": np.full(len(step), unit.realisation, np.int32),
-        "map": np.repeat(np.array(unit.maps, np.int32), inside.sum(1)),
-        "step": step.astype(np.int32),
-        "time_s": step * problem.dt_s,
-    }
+    columns: dict[str, Any] = {}
+    columns["seed"] = np.full(n_rows, unit.seed)
+    columns["realisation"] = np.full(n_rows, unit.realisation, np.int32)
+    columns["map"] = np.repeat(np.array(unit.maps, np.int32), is_row.sum(1))
+    columns["step"] = step.astype(np.int32)
+    columns["time_s"] = step * problem.dt_s
     for index, name in enumerate(("x_m", "y_m", "heading_rad")):
-        columns[name] = episodes.states[..., index].numpy().astype(np.float32)[inside]
+        numbers = episodes.states[..., index].numpy()
+        columns[name] = numbers.astype(np.float32)[is_row]
     for index, name in enumerate(problem.robot.action_names):
         columns[name] = of_steps(episodes.actions[..., index])
     if episodes.ahead is not None:
         for index, name in enumerate(AHEAD_COLUMNS):
             columns[name] = of_steps(episodes.ahead[..., index])
-    return pa.table(columns | {LAST_COLUMN: of_steps(episodes.traversability)})
+    columns[LAST_COLUMN] = of_steps(episodes.traversability)
+    return pa.table(columns)

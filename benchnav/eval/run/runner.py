@@ -1,8 +1,8 @@
-"""Running a suite: check it, split it into units, run missing ones, write the table.
+"""Runs of suites: check the suite, split it into units, run missing ones, write tables.
 
-A run folder stores finished units, each identified by its origin (`Origin.key`). A run
-is resumed or extended by repeating its command or giving another. A row does not depend
-on the number of workers, the order of units, or interruptions.
+A run folder stores finished units, each identified by its origin (`Origin.key`). The
+same command resumes a run, another command extends it. A row does not depend on the
+number of workers, the order of units, or interruptions.
 """
 
 from collections import Counter, defaultdict
@@ -69,25 +69,24 @@ def run_suite(
     unfinished, the run has no table, which `say` reports.
 
     Args:
-        suite: the suite.
-        folder: the run folder; it may hold a run, which is resumed or extended.
+        suite: suite to run.
+        folder: the run folder; a run that it contains is resumed or extended.
         jobs: number of worker processes, or the address of a Dask cluster's scheduler,
             whose workers are used.
         overwrite: whether to delete an existing run first.
         settings: device, and time limit of planners.
-        say: receives what a user should know, a line at a time.
-        shard: the shard of the units that is run; None for all.
+        say: function that receives messages for the user, a line at a time.
+        shard: the shard of the units that is run; None for all units.
         reuse_code: whether to accept finished units of other code, and report it.
 
     Raises:
-        ConfigError: If the folder holds something else, or the suite cannot be run.
+        ConfigError: If the folder contains something else, or the suite cannot be run.
         DatasetError: If the dataset lacks a split or map.
         BenchnavError: If the cluster cannot be reached, or is lost.
     """
     with sole_writer(folder, str(folder)):
-        checked = check_suite(
-            suite, elsewhere=jobs != 1 or settings.planner_limit_s > 0
-        )
+        elsewhere = jobs != 1 or settings.planner_limit_s > 0
+        checked = check_suite(suite, elsewhere)
         for line in checked.caveats:
             say(line)
         work = Work(
@@ -105,7 +104,10 @@ def run_work(
     work: Work, folder: Path, jobs: int | str, overwrite: bool, say: Say
 ) -> Iterator[Progress]:
     """Run unfinished units in a folder that the caller has locked; see `run_suite`."""
-    jobs, scheduler = (1, jobs) if isinstance(jobs, str) else (jobs, "")
+    scheduler = ""
+    if isinstance(jobs, str):
+        scheduler = jobs
+        jobs = 1
     if scheduler:
         with connected(scheduler):  # fails before anything is deleted or written
             pass
@@ -115,28 +117,25 @@ def run_work(
         drop(folder)
     requested, conditions, metrics = begin(work, folder, say)
     all_units = units(conditions, work.record, metrics)
-    shard_units = [
-        unit
-        for unit in all_units
-        if work.shard is None or unit.shard(work.shard.of) == work.shard
-    ]
+    shard_units = all_units
+    if work.shard is not None:
+        of = work.shard.of
+        shard_units = [unit for unit in all_units if unit.shard(of) == work.shard]
     named, others = _parted(shard_units, requested)
     origins = work.settings.origins()
-    missing = _missing(
-        named, origins, folder, work.reuse_code, say, is_here=not scheduler
-    )
+    is_here = not scheduler
+    missing = _missing(named, origins, folder, work.reuse_code, say, is_here)
     if not shard_units:
         say(f"shard {work.shard} holds none of the {len(all_units)} units")
     # Workers may have started in another folder, so they receive the working folder.
     run: Any = partial(_run_in, Path.cwd(), folder.resolve())
     if scheduler:
         run = partial(run_on_worker, Path.cwd())
-    calls: list[Any] = [
-        partial(run, unit, origin, work.settings) for unit, origin in missing
-    ]
-    steps = _Steps(
-        named, [unit for unit, _ in missing], in_turn=jobs == 1 and not scheduler
-    )
+    calls: list[Any] = []
+    for unit, origin in missing:
+        calls.append(partial(run, unit, origin, work.settings))
+    missing_units = [unit for unit, _ in missing]
+    steps = _Steps(named, missing_units, in_turn=jobs == 1 and is_here)
     if named:
         yield steps.progress()
     for unit, files in run_calls(calls, jobs, scheduler):
@@ -145,16 +144,15 @@ def run_work(
         yield steps.progress(unit)
     if missing:
         say("measuring the planning time of a single robot")
-    measure_latencies(folder, {unit.condition.id for unit in named}, work.settings)
-    finished, reused = _finished(
-        in_table_order(named, conditions), origins, folder, work.reuse_code
-    )
+    named_ids = {unit.condition.id for unit in named}
+    measure_latencies(folder, named_ids, work.settings)
+    ordered = in_table_order(named, conditions)
+    finished, reused = _finished(ordered, origins, folder, work.reuse_code)
     if others:
-        unfinished = [
-            unit
-            for unit in others
-            if _counted(unit, origins, folder, work.reuse_code) is None
-        ]
+        unfinished = []
+        for unit in others:
+            if _counted(unit, origins, folder, work.reuse_code) is None:
+                unfinished.append(unit)
         if unfinished:
             write_errors(folder, finished)
             note_checksums(folder, [folder / ERRORS])
@@ -162,11 +160,10 @@ def run_work(
                 (folder / EPISODES).unlink(missing_ok=True)
             say(_unfinished(folder, unfinished, len(conditions)))
             return
-        finished, reused = _finished(
-            in_table_order(shard_units, conditions), origins, folder, work.reuse_code
-        )
+        ordered = in_table_order(shard_units, conditions)
+        finished, reused = _finished(ordered, origins, folder, work.reuse_code)
     if not work.reuse_code:
-        _check_steady([making for _, making in finished], is_here=not scheduler)
+        _check_steady([making for _, making in finished], is_here)
     if work.shard is not None:
         write_errors(folder, finished)
         note_checksums(folder, [folder / ERRORS])
@@ -192,14 +189,24 @@ def _key(unit: Unit) -> tuple[str, int, int, int]:
 
 
 def _unfinished(folder: Path, units_: Sequence[Unit], conditions: int) -> str:
-    ids = {unit.condition.id for unit in units_}
+    """Return a line on a run whose other conditions are not finished.
+
+    Args:
+        folder: the run folder.
+        units_: units that are not finished.
+        conditions: number of conditions of the run.
+    """
+    n_unfinished = len({unit.condition.id for unit in units_})
     n_other = sum(bool(find_units(folder, unit)) for unit in units_)
-    reason = f" ({n_other} of their units are of other code or maps)" if n_other else ""
+    reason = ""
+    if n_other:
+        reason = f" ({n_other} of their units are of other code or maps)"
     return (
-        f"what this command names is finished; {len(ids)} of {conditions} conditions "
+        "all conditions of this command are finished; "
+        f"{n_unfinished} of {conditions} conditions "
         f"of {folder} are not{reason}, so that "
-        "the run has no new table. Give the command that named them, or read what is "
-        "there with `report --partial`"
+        "the run has no new table. Give the command that named them, or read finished "
+        "units with `report --partial`"
     )
 
 
@@ -213,25 +220,26 @@ class _Steps:
         self._names = unit_names(named)
         self._total = len(named)
         self._episodes = sum(len(unit.maps) for unit in named)
-        self._waiting = list(missing)
+        self._missing = list(missing)
         self._in_turn = in_turn
-        self._left = len(missing)
-        self._left_episodes = sum(len(unit.maps) for unit in missing)
+        self._n_waiting = len(missing)
+        self._waiting_episodes = sum(len(unit.maps) for unit in missing)
 
     def progress(self, finished: Unit | None = None) -> Progress:
         """Return the progress after a unit was finished, or before the first."""
+        doing = ""
         if finished is not None:
-            self._left -= 1
-            self._left_episodes -= len(finished.maps)
-        done = len(self._waiting) - self._left
-        doing = f"finished {self._names(finished)}" if finished is not None else ""
-        if self._left and (self._in_turn or finished is None):
-            doing = f"running {self._names(self._waiting[done])}"
+            self._n_waiting -= 1
+            self._waiting_episodes -= len(finished.maps)
+            doing = f"finished {self._names(finished)}"
+        if self._n_waiting and (self._in_turn or finished is None):
+            next_unit = self._missing[-self._n_waiting]
+            doing = f"running {self._names(next_unit)}"
         return Progress(
-            self._total - self._left,
+            self._total - self._n_waiting,
             self._total,
             doing=doing,
-            size_done=self._episodes - self._left_episodes,
+            size_done=self._episodes - self._waiting_episodes,
             size=self._episodes,
             sized="episodes",
         )
@@ -246,7 +254,7 @@ def _run_in(
     return unit, {}
 
 
-# Why existing units are run again, as `say` receives it.
+# Reasons for which existing units are run again, as `say` receives them.
 _AGAIN = {
     "unrecorded": "are run again for recordings or steps that they lack",
     "unmeasured": "are run again for metrics that they lack ({})",
@@ -272,9 +280,10 @@ def _missing(
         origins: current origins of units.
         folder: the run folder.
         reuse_code: whether to accept units of other code.
-        say: receives how many units are run again, and why.
-        is_here: whether units run on this machine, so that what parts read can be
-            compared with its files.
+        say: function that receives the number of units that are run again, with
+            reasons.
+        is_here: whether units run on this machine. If so, the contents that parts have
+            read are compared with its files.
     """
     missing: list[tuple[Unit, Origin]] = []
     counts: Counter[str] = Counter()
@@ -285,7 +294,7 @@ def _missing(
         finished = _counting(makings, unit, origin, reuse_code)
         reason, lines = _why_missing(folder, unit, origin, makings, finished)
         if not reason and is_here and not reuse_code and finished:
-            lines = changes_since(finished.about.get(TOUCHED, {}))
+            lines = changes_since(finished.metadata.get(TOUCHED, {}))
             reason = "changed" if lines else ""
         if not reason and finished and not finished.has(unit):
             reason = "unrecorded"
@@ -295,15 +304,16 @@ def _missing(
         if reason != "damaged" or not details[reason]:
             details[reason] |= dict.fromkeys(lines)
         making = makings[0] if reason == "unmeasured" else finished
-        missing.append((replace(unit, record=_richest(unit, making)), origin))
-    if done := len(shard_units) - len(missing):
-        say(f"{done} of {len(shard_units)} units were there already")
+        record = _richest(unit, making)
+        missing.append((replace(unit, record=record), origin))
+    n_units = len(shard_units)
+    n_done = n_units - len(missing)
+    if n_done:
+        say(f"{n_done} of {n_units} units were there already")
     for reason, template in _AGAIN.items():
         if counts[reason]:
-            say(
-                f"{counts[reason]} of {len(shard_units)} units "
-                f"{template.format('; '.join(details[reason]))}"
-            )
+            text = template.format("; ".join(details[reason]))
+            say(f"{counts[reason]} of {n_units} units {text}")
     return missing
 
 
@@ -314,29 +324,30 @@ def _why_missing(
     makings: list[Finished],
     making: Finished | None,
 ) -> tuple[str, list[str]]:
-    """Return why a unit is missing, a key of `_AGAIN` or "new", with details.
+    """Return the reason for which a unit is missing, and details.
 
-    The key is empty if the unit is finished.
+    The reason is a key of `_AGAIN` or "new"; it is empty if the unit is finished.
     """
     if making is not None:
         damage = making.damage()
-        return ("damaged", damage[:1]) if damage else ("", [])
+        reason = "damaged" if damage else ""
+        return reason, damage[:1]
     path = unit_path(unit, origin.key(unit))
     if (folder / path).exists():
         return "damaged", [f"{path}: it cannot be read"]
     if not makings:
         return "new", []
-    differences = _differences(makings[0], origin)
-    if not differences and (
-        columns := lacks_metrics(makings[0].about["code"], origin.code)
-    ):
+    newest = makings[0]
+    differences = _differences(newest, origin)
+    columns = lacks_metrics(newest.metadata["code"], origin.code)
+    if columns and not differences:
         return "unmeasured", [", ".join(columns)]
     return "other", differences
 
 
 def _richest(unit: Unit, making: Finished | None) -> Record:
-    """Return the record of a unit that is run again, at least what it has stored."""
-    stored = making.about["record"] if making else unit.record
+    """Return the higher of the requested record and the one that a making has."""
+    stored = making.metadata["record"] if making else unit.record
     return max(unit.record, stored, key=RECORDS.index)
 
 
@@ -345,18 +356,19 @@ def _counting(
 ) -> Finished | None:
     """Return the valid making of a unit, or None.
 
-    It has the current code and maps, or other code if `reuse_code`.
+    A valid making has the current maps, and the current code or, if `reuse_code`, other
+    code.
     """
     key = origin.key(unit)
     maps = list(origin.maps)
     for making in makings:
-        if making.about["key"] == key:
+        if making.metadata["key"] == key:
             return making
     if not reuse_code:
         return None
     for making in makings:
-        has_metrics = not lacks_metrics(making.about["code"], origin.code)
-        if making.about["digests"] == maps and has_metrics:
+        has_metrics = not lacks_metrics(making.metadata["code"], origin.code)
+        if making.metadata["digests"] == maps and has_metrics:
             return making
     return None
 
@@ -370,23 +382,26 @@ def _counted(
 
 def _differences(finished: Finished, origin: Origin) -> list[str]:
     """Describe the differences between the origin of a finished unit and another."""
-    maps = ["maps"] if finished.about["digests"] != list(origin.maps) else []
-    return [*code_differences(finished.about["code"], origin.code), *maps]
+    lines = code_differences(finished.metadata["code"], origin.code)
+    if finished.metadata["digests"] != list(origin.maps):
+        lines.append("maps")
+    return lines
 
 
 def _check_steady(finished: list[Finished], is_here: bool) -> None:
     """Reject units whose parts read different contents of a file, package or variable.
 
     Raises:
-        ConfigError: If there are such units, or if what they read has changed since.
+        ConfigError: If there are such units, or if these contents have changed since.
     """
     seen: dict[str, str] = {}
     changed: dict[str, None] = {}
     for making in finished:
-        touched = making.about.get(TOUCHED, {})
+        touched = making.metadata.get(TOUCHED, {})
         changed |= dict.fromkeys(unlike(seen, touched))
         seen |= touched
-    changed |= dict.fromkeys(changes_since(seen)) if is_here else {}
+    if is_here:
+        changed |= dict.fromkeys(changes_since(seen))
     if changed:
         raise ConfigError(
             "Expected what parts read to stay the same during the run, got changes: "
@@ -407,7 +422,7 @@ def _finished(
         ConfigError: If a unit was removed.
     """
     counted = []
-    reused = 0
+    n_reused = 0
     changes: dict[str, None] = {}
     for unit in shard_units:
         origin = origins.of(unit)
@@ -415,16 +430,20 @@ def _finished(
         if making is None:
             raise ConfigError(
                 f"Expected unit {unit.name} of condition {unit.condition.id} in "
-                f"{folder}, got none: it was removed. "
+                f"{folder}, got none, since it was removed. "
                 "Give its `benchnav-eval run` command again."
             )
         counted.append((unit, making))
-        changed = changes_since(making.about.get(TOUCHED, {})) if reuse_code else []
-        if changed or making.about["key"] != origin.key(unit):
-            reused += 1
+        changed = []
+        if reuse_code:
+            changed = changes_since(making.metadata.get(TOUCHED, {}))
+        if changed or making.metadata["key"] != origin.key(unit):
+            n_reused += 1
             changes |= dict.fromkeys([*_differences(making, origin), *changed])
+    if not n_reused:
+        return counted, ""
     line = (
-        f"{reused} of {len(shard_units)} units were made by other code "
-        f"({'; '.join(changes)}); column `code` tells which rows"
+        f"{n_reused} of {len(shard_units)} units were made by other code "
+        f"({'; '.join(changes)}); column `code` indicates which rows"
     )
-    return counted, line if reused else ""
+    return counted, line

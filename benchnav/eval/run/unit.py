@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 from torch import Tensor
 
@@ -84,7 +85,7 @@ def run_unit(unit: Unit, folder: Path, origin: Origin, settings: Settings) -> No
     """Run one unit on one thread, and write its recordings, its steps and its rows.
 
     Args:
-        unit: the unit.
+        unit: unit to run.
         folder: the run folder.
         origin: origin of the unit when the run was begun.
         settings: settings of the run.
@@ -100,15 +101,7 @@ def run_unit(unit: Unit, folder: Path, origin: Origin, settings: Settings) -> No
         try:
             built = build(unit, origin, device)
         except KnowledgeError as error:
-            task = unit.condition.task
-            places = block.places
-            budgets = unit.condition.world.budget_s(
-                places.reference_time_s, task.robot.top_speed_mps
-            )
-            unbegun = unbegun_episodes(task, places, budgets, error.outcome)
-            rows = episode_rows(
-                unit, block.groups, unbegun, [str(error)] * len(unbegun), compiled=False
-            )
+            rows = _failed_rows(unit, block, error)
             write_unit(folder, unit, origin, rows, [str(error)], traceback.format_exc())
             return
         problem = built.problem
@@ -117,16 +110,20 @@ def run_unit(unit: Unit, folder: Path, origin: Origin, settings: Settings) -> No
         recorder = Recorder(unit, problem, simulation, block.terrain, watched)
         observer = recorder.observer if watched else Observer()
         episodes, compiled = simulate(unit, built, settings, observer=observer)
-        failed = all(episodes.errors)  # such as a planner that cannot be created
-        bounds_s = None if failed else _lower_bounds_s(unit, built)
+        bounds_s = None
+        if not all(episodes.errors):  # such as those of a planner that was not created
+            bounds_s = _lower_bounds_s(unit, built)
     succeeded = (episodes.outcome == Outcome.SUCCESS).tolist()
     for member in unit.recorded(succeeded):
-        recorder.recording(episodes, member).save(folder / unit.recording_path(member))
+        recording = recorder.recording(episodes, member)
+        recording.save(folder / unit.recording_path(member))
     if unit.record != "none":
-        write_steps(folder, unit, origin.key(unit), step_table(unit, problem, episodes))
+        steps = step_table(unit, problem, episodes)
+        write_steps(folder, unit, origin.key(unit), steps)
+    rejected = simulation.attempts - 1
     draws = Draws(
         reference_time_s=block.places.reference_time_s.cpu().numpy(),
-        rejected_draws=(simulation.attempts - 1).tolist(),
+        rejected_draws=rejected.tolist(),
         lower_bound_s=bounds_s or (),
     )
     finished = finished_episodes(problem, episodes, draws)
@@ -135,8 +132,19 @@ def run_unit(unit: Unit, folder: Path, origin: Origin, settings: Settings) -> No
     write_unit(folder, unit, origin, rows, errors, episodes.traceback)
 
 
+def _failed_rows(unit: Unit, block: "Block", error: KnowledgeError) -> pd.DataFrame:
+    """Return the rows of a unit whose model, sensor or belief failed at the start."""
+    task = unit.condition.task
+    budgets_s = unit.condition.world.budget_s(
+        block.places.reference_time_s, task.robot.top_speed_mps
+    )
+    unbegun = unbegun_episodes(task, block.places, budgets_s, error.outcome)
+    errors = [str(error)] * len(unbegun)
+    return episode_rows(unit, block.groups, unbegun, errors, compiled=False)
+
+
 def _check_origin(unit: Unit, origin: Origin, settings: Settings) -> None:
-    """Reject code or maps that differ from those that the run was begun with."""
+    """Reject code or maps that have changed since the run was begun."""
     now = settings.origins().of(unit)
     changed = code_differences(origin.code, now.code)
     if now.maps != origin.maps:
@@ -186,9 +194,8 @@ def read_maps(dataset: TerrainDataset, split: str, maps: Sequence[int]) -> Block
 
 def read_block(unit: Unit, origin: Origin, device: torch.device = CPU) -> Block:
     """Return a unit's maps and endpoints on a device, cached for other settings."""
-    return _block(
-        unit.condition.data, unit.condition.split, unit.maps, origin.maps, device
-    )
+    condition = unit.condition
+    return _block(condition.data, condition.split, unit.maps, origin.maps, device)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -210,7 +217,7 @@ def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> Built:
     """Create the problem, the simulation and the initial knowledge of a unit.
 
     Args:
-        unit: the unit.
+        unit: unit whose episodes are run.
         origin: origin of the unit, which cached predictions depend on.
         device: device of all computation.
 
@@ -226,38 +233,35 @@ def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> Built:
     simulation = Simulation(
         block.terrain, task, condition.world, block.places, noise, unit.maps
     )
+    start_m = block.places.start_m
+    goal_m = block.places.goal_m
     try:
         learner = _learner(condition, block)
-        redrawn = simulation.field is None
         field = block.terrain.traversability
         if condition.learns:
             field = simulation.field_at(0)
-        truth = Truth(
-            terrain=block.terrain, field=field, keys=sensor_keys(noise, unit.maps)
-        )
+        keys = sensor_keys(noise, unit.maps)
+        truth = Truth(terrain=block.terrain, field=field, keys=keys)
         predicted = None
         if learner.sensor.sees_all:
-            predicted = call(
-                Outcome.MODEL_ERROR,
-                lambda: _predict(condition.model.key, block, simulation.field),
+            prediction_of_block = partial(
+                _predict, condition.model.key, block, simulation.field
             )
-        start = task.robot.initial_state(
-            heading_to(block.places.start_m, block.places.goal_m)
-        )
+            predicted = call(Outcome.MODEL_ERROR, prediction_of_block)
+        start = task.robot.initial_state(heading_to(start_m, goal_m))
         knowledge = learner.begin(truth, start, predicted)
-        fields = Fields(learner.belief, knowledge.belief_state, tuple(unit.maps))
         prediction = Prediction(
-            knowledge.observation,
-            learner.distribution(knowledge),
-            knowledge.risk_map,
-            knowledge.free,
-            fields,
+            observation=knowledge.observation,
+            distribution=learner.distribution(knowledge),
+            risk_map=knowledge.risk_map,
+            free=knowledge.free,
+            fields=Fields(learner.belief, knowledge.belief_state, tuple(unit.maps)),
         )
         problem = pose_problem(
             task,
             prediction,
-            block.places.start_m,
-            block.places.goal_m,
+            start_m,
+            goal_m,
             simulation.time_budget_s,
             condition.world.immobile,
         )
@@ -265,11 +269,12 @@ def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> Built:
         raise gpu_failed(error) from error
     if not condition.learns:
         return Built(problem=problem, simulation=simulation, learning=None)
+    is_resampled = simulation.field is None
     learning = Learning(
         learner=learner,
         start=knowledge,
         truth=truth,
-        field_at=simulation.field_at if redrawn else None,
+        field_at=simulation.field_at if is_resampled else None,
     )
     return Built(problem=problem, simulation=simulation, learning=learning)
 
@@ -292,7 +297,6 @@ def _learner(condition: Condition, block: Block) -> Learner:
         statistics=condition.statistics,
         class_names=model.class_names or recipe_names,
     )
-
     return Learner(
         sensor=sensor,
         ground=call(Outcome.SENSOR_ERROR, condition.ground.create),
@@ -324,16 +328,17 @@ def noise_key(seed: int, split: str, realisation: int) -> int:
 
 
 def _draw(split: str, realisation: int) -> tuple[str | int, ...]:
+    """Return the stream keys of a draw of λ; realisation 0 adds no key."""
     return (split, realisation) if realisation else (split,)
 
 
 def simulate(
     unit: Unit, built: Built, settings: Settings, **options: Any
 ) -> tuple[Episodes, bool]:
-    """Run a unit's episodes; return them and whether the planner ran compiled.
+    """Run a unit's episodes, and return them and whether the planner ran compiled.
 
     Args:
-        unit: the unit.
+        unit: unit whose episodes are run.
         built: inputs of its episodes.
         settings: settings with the time limit of planners.
         **options: further arguments of `run_episodes`.
@@ -343,23 +348,20 @@ def simulate(
     with ExitStack() as stack:
         try:
             if settings.planner_limit_s:
-                planner = stack.enter_context(
-                    closing(IsolatedPlanner(condition, settings.planner_limit_s))
-                )
+                isolated = IsolatedPlanner(condition, settings.planner_limit_s)
+                planner = stack.enter_context(closing(isolated))
             else:
                 planner = condition.planner.create()
         except (Exception, SystemExit) as error:
             planner = _FailedPlanner(error)
         # Keyed by seed and split, never by the batch.
-        key = rng.stream_key(
-            unit.seed, "planner", *_draw(condition.split, unit.realisation)
-        )
-        generator = rng.generator(key)
+        draw = _draw(condition.split, unit.realisation)
+        key = rng.stream_key(unit.seed, "planner", *draw)
         episodes = run_episodes(
             planner,
             built.problem,
             built.simulation,
-            generator,
+            rng.generator(key),
             learning=built.learning,
             **options,
         )
@@ -369,30 +371,27 @@ def simulate(
 def _lower_bounds_s(unit: Unit, built: Built) -> list[float] | None:
     """Return lower bounds of the time to the goal if the planner is given λ.
 
-    None if the robot or the world has no such bound.
+    None if the planner is not given λ, or the robot or the world has no such bound.
     """
     problem = built.problem
     field = built.simulation.field
     condition = unit.condition
-    if (
-        field is None
-        or type(problem.robot) not in BOUNDED_ROBOTS
-        or condition.model.part != "clairvoyant"
-    ):
+    has_bound = field is not None and type(problem.robot) in BOUNDED_ROBOTS
+    if not has_bound or condition.model.part != "clairvoyant":
         return None
     if not condition.planner.object.given_truth:
         return None
+    assert field is not None
     motion = Motion(
         robot=problem.robot,
         goal_radius_m=problem.goal_radius_m,
         immobile=condition.world.immobile,
     )
+    fields = field.cpu().numpy()
     starts_m = problem.start[:, :2].cpu().numpy()
     goals_m = problem.goal_m.cpu().numpy()
     bounds_s = []
-    for values, start_m, goal_m in zip(
-        field.cpu().numpy(), starts_m, goals_m, strict=True
-    ):
+    for values, start_m, goal_m in zip(fields, starts_m, goals_m, strict=True):
         bound_s = lower_bound_s(values, problem.grid, motion, start_m, goal_m)
         bounds_s.append(bound_s)
     return bounds_s
@@ -433,7 +432,8 @@ def _block(
     digests: tuple[str, ...],
     device: torch.device,
 ) -> Block:
-    return read_maps(TerrainDataset(find_dataset(data)), split, maps).to(device)
+    dataset = TerrainDataset(find_dataset(data))
+    return read_maps(dataset, split, maps).to(device)
 
 
 @lru_cache(maxsize=2)

@@ -1,6 +1,6 @@
-"""The best condition of each block, and which are significantly worse.
+"""The best condition of each block, and the conditions that are significantly worse.
 
-The test is `benchnav.stats.best`.
+The test is that of `benchnav.stats.best`.
 """
 
 from collections.abc import Mapping
@@ -18,42 +18,45 @@ from benchnav.stats.intervals import success_interval
 
 # Conditions of a block have the same task, maps and noise.
 BLOCK = ("data", "scenario", "world", "robot", "objective")
-# Privileged models, the one given most first.
+# Privileged models; the model that is given most comes first.
 PRIVILEGED = ("clairvoyant", "oracle", "ideal")
 
 _COLUMNS = (
-    *(
-        "condition",
-        "best",
-        "best_rivals",
-        "best_episodes",
-        "best_maps",
-        "best_difference",
-        "best_low",
-    ),
-    *("best_high", "best_p", "best_shown", "best_alike", "best_marked"),
+    "condition",
+    "best",
+    "best_rivals",
+    "best_episodes",
+    "best_maps",
+    "best_difference",
+    "best_low",
+    "best_high",
+    "best_p",
+    "best_shown",
+    "best_alike",
+    "best_marked",
 )
 
 
 def privileged_models(conditions: Mapping[str, Any]) -> dict[str, str]:
-    """Return the conditions whose models are privileged: given part of the truth.
+    """Return the privileged models of conditions: models given part of the truth.
 
     Args:
         conditions: entries of `run.json` by id.
 
     Returns:
-        One of `PRIVILEGED` by id.
+        Names in `PRIVILEGED`, by the id of each condition with such a model.
     """
-    models = {
-        condition: entry["value"]["model"]["part"]
-        for condition, entry in conditions.items()
-        if entry["labels"]["model"] != NOT_USED
-    }
-    return {condition: part for condition, part in models.items() if part in PRIVILEGED}
+    privileged = {}
+    for condition, entry in conditions.items():
+        model = entry["value"]["model"]["part"]
+        is_used = entry["labels"]["model"] != NOT_USED
+        if is_used and model in PRIVILEGED:
+            privileged[condition] = model
+    return privileged
 
 
 def competing(rows: pd.DataFrame) -> pd.Series:
-    """Return which conditions of a block compete for the best.
+    """Return a mask of the conditions of a block that compete for the best.
 
     A privileged model is only a reference, unless no other condition of the block uses
     a prediction.
@@ -62,11 +65,12 @@ def competing(rows: pd.DataFrame) -> pd.Series:
         rows: summary of one block, with `privileged` as in `against_best`.
 
     Returns:
-        Bool, by the index of `rows`.
+        Boolean series with the index of `rows`.
     """
-    for excluded in (list(PRIVILEGED), list(PRIVILEGED)[:1]):
+    has_model = rows["model"] != NOT_USED
+    for excluded in (PRIVILEGED, PRIVILEGED[:1]):
         is_competing = ~rows["privileged"].isin(excluded)
-        if (is_competing & (rows["model"] != NOT_USED)).any():
+        if (is_competing & has_model).any():
             return is_competing
     return pd.Series(True, index=rows.index)
 
@@ -78,44 +82,46 @@ def against_best(
 ) -> pd.DataFrame:
     """Compare the competing conditions of each block per map with the best.
 
-    All are compared on the episodes that they have in common, so that a condition run
-    on more maps is compared on the same ones. The best has the highest success rate
-    there; ties are decided by the smaller mean T_total.
+    All are compared on the episodes that they have in common, so that a condition with
+    more maps is compared on the same maps as the others. The best condition has the
+    highest success rate on these episodes; ties are decided by the lower mean T_total.
 
     Args:
         episodes: rows of episodes.
         summary: their summary, from `summary.summarise`.
-        privileged: from `privileged_models`; by default no model is.
+        privileged: names from `privileged_models`; by default no model is privileged.
 
     Returns:
-        A row a condition, in the order of the summary: `condition`; `privileged`, of
-        `PRIVILEGED` or empty; `best`, the best condition of its block; `best_rivals`,
-        the number of other competitors; `best_episodes`, the number of common episodes,
-        on `best_maps` maps, where a group counts as one;
-        `best_difference`, by how much the best's success rate is higher, with its 95 %
-        interval `_low`, `_high`, of that pair, uncorrected; `best_p`, from `best_set_p`;
-        `best_shown`, the minimum detectable difference with 80 % power; `best_alike`,
-        true if it competes and is not significantly worse than the best; and
-        `best_marked`, true if it is alike and some condition of its block is worse. NaN
-        if a condition does not compete, and for the best itself.
+        One row per condition, in the order of the summary, with the columns below. They
+        are NaN if the condition does not compete, or if it is the best itself.
+
+        - `condition`; `privileged`, its name in `PRIVILEGED` or empty; `best`, the best
+          condition of its block.
+        - `best_rivals`, the number of other competitors; `best_episodes`, the number of
+          common episodes; `best_maps`, the number of their maps, where a group counts
+          as one.
+        - `best_difference`, by which the success rate of the best is higher, with the
+          uncorrected 95 % interval of this pair, `best_low`, `best_high`; `best_p`,
+          from `best_set_p`; `best_shown`, the minimum detectable difference with 80 %
+          power.
+        - `best_alike`, true if the condition competes and is not significantly worse
+          than the best; `best_marked`, true if it is alike and another condition of its
+          block is significantly worse.
     """
     groups = dict(list(episodes.groupby("condition", sort=False)))
-    summary = summary.assign(
-        privileged=summary["condition"].map(privileged or {}).fillna("")
-    )
+    model_names = summary["condition"].map(privileged or {})
+    summary = summary.assign(privileged=model_names.fillna(""))
     table_rows: list[dict[str, Any]] = []
     for _, rows in summary.groupby(list(BLOCK), sort=False, dropna=False):
         rivals = rows.loc[competing(rows), "condition"]
         of_block, compared = _compare({name: groups[name] for name in rivals})
-        some_worse = not all(
-            of_condition["best_alike"] for of_condition in compared.values()
-        )
+        alike_flags = [columns["best_alike"] for columns in compared.values()]
+        some_worse = not all(alike_flags)
         for condition in rows["condition"]:
-            of_condition = compared.get(condition, {"best_alike": False})
-            marked = {"best_marked": of_condition["best_alike"] and some_worse}
-            table_rows.append(
-                {"condition": condition, **of_block, **of_condition, **marked}
-            )
+            columns = compared.get(condition, {"best_alike": False})
+            row = {"condition": condition, **of_block, **columns}
+            row["best_marked"] = columns["best_alike"] and some_worse
+            table_rows.append(row)
     table = pd.DataFrame(table_rows).reindex(columns=_COLUMNS)
     return summary[["condition", "privileged"]].merge(
         table, on="condition", how="left", validate="1:1"
@@ -134,30 +140,35 @@ def _compare(
     mean_s = dict(zip(names, alike(times, times.max()), strict=True))
     rates = {name: rows_of[name]["success"].mean() for name in names}
     best, *others = sorted(names, key=lambda name: (-rates[name], mean_s[name]))
-    episodes = len(rows_of[best])
-    maps = rows_of[best]["group"].nunique()
+    n_episodes = len(rows_of[best])
+    n_maps = rows_of[best]["group"].nunique()
     of_block = {
         "best": best,
         "best_rivals": len(others),
-        "best_episodes": episodes,
-        "best_maps": maps,
+        "best_episodes": n_episodes,
+        "best_maps": n_maps,
     }
     of_conditions: dict[str, dict[str, Any]] = {best: {"best_alike": True}}
     if has_no_draws:  # nothing to compare
-        untested = {"best_alike": True, "best_p": 1.0}
-        return of_block, of_conditions | {name: dict(untested) for name in others}
-    wins = [rows_of[name].groupby("group")["success"].sum() for name in (best, *others)]
-    values = np.stack([won.to_numpy(dtype=int) for won in wins], axis=1)
+        for condition in others:
+            of_conditions[condition] = {"best_alike": True, "best_p": 1.0}
+        return of_block, of_conditions
+    wins = []
+    for condition in (best, *others):
+        by_group = rows_of[condition].groupby("group")["success"]
+        wins.append(by_group.sum().to_numpy(dtype=int))
+    values = np.stack(wins, axis=1)
     draws = rows_of[best].groupby("group").size().to_numpy()
-    p, shown = best_set_p(values, draws)
+    p, detectable = best_set_p(values, draws)
     for index, condition in enumerate(others, start=1):
         gain = values[:, 0] - values[:, index]
-        entry = {"best_p": p[index], "best_alike": bool(p[index] >= ALPHA)}
-        entry["best_difference"] = gain.sum() / episodes
-        if maps > 1:
+        columns: dict[str, Any] = {"best_p": p[index]}
+        columns["best_alike"] = bool(p[index] >= ALPHA)
+        columns["best_difference"] = gain.sum() / n_episodes
+        if n_maps > 1:
             _, low, high = success_interval(gain, draws)
-            entry["best_low"] = float(low)
-            entry["best_high"] = float(high)
-            entry["best_shown"] = shown[index]
-        of_conditions[condition] = entry
+            columns["best_low"] = float(low)
+            columns["best_high"] = float(high)
+            columns["best_shown"] = detectable[index]
+        of_conditions[condition] = columns
     return of_block, of_conditions

@@ -1,4 +1,4 @@
-"""Tables of comparisons: a row a pair of conditions, with Holm's correction."""
+"""Tables of comparisons: one row per pair of conditions, with Holm's correction."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -28,31 +28,35 @@ def compare(pairs: Sequence[Pair], difference: float = 0.05) -> pd.DataFrame:
     """Compare each pair per map, with Holm's correction for success and for time.
 
     Args:
-        pairs: from `pairs.find_pairs`.
-        difference: difference of success whose required number of maps is computed, in
-            (0, 1].
+        pairs: pairs from `pairs.find_pairs`.
+        difference: difference in success rate for which the required number of maps is
+            computed, in (0, 1].
 
     Returns:
-        A row a pair: common labels, `one`, `other`; `n_maps`; `n_groups`, the number of
-        statistical units, equal to `n_maps` unless maps are grouped; `n_episodes` of
-        each condition; `success_one`, `success_other`; `success_difference` with its
-        95 % interval `_low`, `_high`, `success_p` and, corrected, `success_p_holm`;
-        `success_detectable`, the minimum detectable difference with 80 % power, and
-        `maps_needed` for `difference`, both at the level of the first step of Holm. The
-        same columns of `time`, T_total in seconds, where a failure counts as T:
-        `time_difference_s`, `time_low_s`, `time_high_s`. If T differs between the
-        conditions of some pair, all times are fractions of T and end in `_share`,
-        since the penalties would differ otherwise. Columns of `arrival_time` are over
-        episodes in which both reach the goal: without a test, since both conditions
-        select these episodes.
+        One row per pair, with these columns:
+
+        - Common labels; `one`, `other`; `n_maps`; `n_groups`, the number of statistical
+          units, equal to `n_maps` unless maps are grouped; `n_episodes` of each
+          condition.
+        - `success_one`, `success_other`; `success_difference` with its 95 % interval
+          `success_low`, `success_high`; `success_p`, and `success_p_holm` after Holm's
+          correction; `success_detectable`, the minimum detectable difference with 80 %
+          power, and `maps_needed` for `difference`, both at the level of the first step
+          of Holm's correction.
+        - `time_difference_s`, `time_low_s`, `time_high_s`, `time_p` and `time_p_holm`
+          of T_total, where a failure counts as T. If T differs between the conditions
+          of any pair, all times are fractions of T and end in `_share`, since failures
+          would otherwise be penalised differently.
+        - `arrival_time_…` over episodes in which both conditions reach the goal. There
+          is no test, since both conditions select these episodes.
     """
     alpha = ALPHA / len(pairs)
-    in_shares = any(budgets_differ(pair.episodes) for pair in pairs)
-    rows = [
-        _labels(pair, pair.episodes)
-        | _compare(pair.episodes, alpha, difference, in_shares)
-        for pair in pairs
-    ]
+    as_fractions = any(budgets_differ(pair.episodes) for pair in pairs)
+    rows = []
+    for pair in pairs:
+        labels = _labels(pair, pair.episodes)
+        columns = _compare(pair.episodes, alpha, difference, as_fractions)
+        rows.append(labels | columns)
     return _corrected(rows, "success_p", "time_p")
 
 
@@ -60,15 +64,15 @@ def compare_by(pairs: Sequence[Pair], quantity: Quantity) -> pd.DataFrame:
     """Compare each pair by one metric, over episodes in which both have a value.
 
     Args:
-        pairs: from `pairs.find_pairs`.
-        quantity: the quantity compared.
+        pairs: pairs from `pairs.find_pairs`.
+        quantity: the compared quantity.
 
     Returns:
-        A row a pair: common labels, `one`, `other`; `n_maps`, `n_groups`,
+        One row per pair: common labels, `one`, `other`; `n_maps`, `n_groups`,
         `n_episodes` of each condition; `metric`; `unit` of the following columns;
         `mean_one`, `mean_other`, `difference` with its 95 % interval `low`, `high`; `p`
-        of a sign-flip test and, corrected, `p_holm`. A difference and its ends
-        are NaN without episodes.
+        of a sign-flip test, and `p_holm` after Holm's correction. The difference and
+        its interval are NaN without episodes.
     """
     rows = []
     for pair in pairs:
@@ -95,26 +99,26 @@ def _labels(pair: Pair, episodes: pd.DataFrame) -> dict[str, Any]:
 
 
 def _corrected(rows: Sequence[Mapping[str, Any]], *names: str) -> pd.DataFrame:
-    """Return the table of rows, with each column of p-values corrected by Holm."""
+    """Return the table of rows, with Holm-corrected copies of columns of p-values."""
     table = pd.DataFrame(rows)
     corrected = {f"{name}_holm": holm(table[name].to_numpy()) for name in names}
     return table.assign(**corrected)
 
 
 def _compare(
-    rows: pd.DataFrame, alpha: float, difference: float, in_shares: bool
+    rows: pd.DataFrame, alpha: float, difference: float, as_fractions: bool
 ) -> dict[str, Any]:
-    timed = in_budgets(rows) if in_shares else rows
-    time_unit = "_share" if in_shares else "_s"
+    timed = in_budgets(rows) if as_fractions else rows
+    time_unit = "_share" if as_fractions else "_s"
     time_interval = interval_of(timed, "total_time_s")
     gain, draws = gain_by_map(rows)
     std = float(standard_deviation(gain, draws))
-    arrived = mean_differences(rows[rows["success"] & rows["success_other"]])
-    mean, low, high = map(float, mean_interval(arrived))
-    row: dict[str, Any] = {
-        "success_one": rows["success"].mean(),
-        "success_other": rows["success_other"].mean(),
-    }
+    both_arrived = rows["success"] & rows["success_other"]
+    arrival_differences = mean_differences(rows[both_arrived])
+    mean, low, high = map(float, mean_interval(arrival_differences))
+    row: dict[str, Any] = {}
+    row["success_one"] = rows["success"].mean()
+    row["success_other"] = rows["success_other"].mean()
     row |= named("success", interval_of(rows, "success"))
     row["success_p"] = difference_p(rows, "success")
     row["success_detectable"] = smallest_difference(std, len(gain), alpha)
@@ -122,11 +126,21 @@ def _compare(
     row |= named("time", time_interval, time_unit)
     row["time_p"] = signed_rank_p(summed_differences(timed))
     row |= named("arrival_time", (mean, low, high), "_s")
-    row["arrival_time_n_maps"] = len(arrived)
+    row["arrival_time_n_maps"] = len(arrival_differences)
     return row
 
 
 def named(name: str, interval: Interval, unit: str = "") -> dict[str, float]:
-    """Return a difference and the ends of its interval, by column."""
-    columns = (f"{name}_{value}{unit}" for value in ("difference", "low", "high"))
-    return dict(zip(columns, interval, strict=True))
+    """Return a difference and the ends of its interval, by column.
+
+    Args:
+        name: start of the columns, such as `time`.
+        interval: difference, lower and upper end.
+        unit: end of the columns, such as `_s`.
+    """
+    difference, low, high = interval
+    return {
+        f"{name}_difference{unit}": difference,
+        f"{name}_low{unit}": low,
+        f"{name}_high{unit}": high,
+    }

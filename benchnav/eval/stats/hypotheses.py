@@ -1,7 +1,7 @@
 """Tests of the hypotheses that a suite fixed, per map.
 
-A difference is tested by sign flips, other kinds by a margin
-(`benchnav.stats.margins`). Holm's correction is over all hypotheses.
+A difference is tested by sign flips, other kinds of hypotheses by a margin
+(`benchnav.stats.margins`). Holm's correction covers all hypotheses of a run.
 """
 
 from collections.abc import Mapping
@@ -35,42 +35,49 @@ def test_hypotheses(
         episodes: all rows of the run.
         worlds: world of each condition, by id.
         is_whole: whether the run is finished. If not, differences and intervals are
-            computed on common episodes, and `p`, `p_holm` are NaN: a test is made once.
-        quantities: quantities that conditions are compared by, by name.
+            computed on common episodes, and `p`, `p_holm` are NaN, since a hypothesis
+            must be tested only once.
+        quantities: quantities by which conditions are compared, by name.
 
     Returns:
-        A row a hypothesis: all fields of `Hypothesis` and `claim`; `unit` of the
+        One row per hypothesis: all fields of `Hypothesis` and `claim`; `unit` of the
         following columns; `n_maps`, where a group counts as one; `n_episodes` of each
         condition; `mean_one`, `mean_other` and their `difference`, `one` minus `other`,
         with the ends of its 95 % and 90 % intervals, `low`, `high`, `low_90`,
         `high_90`; `p`, and `p_holm` after Holm's correction; and `supported`, true if
-        `p_holm` is below 0.05. Below `stats.bootstrap.LEAST_MAPS` maps, a difference of
-        any quantity except success has no interval.
+        `p_holm` is below 0.05. With fewer than `stats.bootstrap.LEAST_MAPS` maps, only
+        a difference in success has an interval.
     """
     rows = dict(list(episodes.groupby("condition", sort=False)))
     table_rows = []
-    for plain in fixed["tests"]:
-        skipped = ("names", "claim")
-        fields = {name: value for name, value in plain.items() if name not in skipped}
+    for entry in fixed["tests"]:
+        fields = dict(entry)
+        fields.pop("names", None)
+        fields.pop("claim", None)
         test = Hypothesis(**fields)
         sides = []
         for condition in (test.one, test.other):
             of_condition = rows.get(condition, episodes.iloc[:0])
             budgets = time_budgets(of_condition, worlds[condition])
             sides.append(of_condition.assign(time_budget_s=budgets))
+        first, second = sides
         quantity = quantities[test.metric]
-        paired = comparable(sides[0], sides[1], quantity)
+        paired = comparable(first, second, quantity)
         _, low_90, high_90 = _interval(paired, quantity, 0.9)
-        row = {**plain, "unit": quantity.unit}
+        row = {**entry, "unit": quantity.unit}
         row["n_maps"] = paired["group"].nunique()
         row["n_episodes"] = len(paired)
         row |= means_and_difference(quantity, paired)
         row["low_90"] = low_90
         row["high_90"] = high_90
-        row["p"] = p_of(test, paired, quantities) if is_whole else np.nan
+        row["p"] = np.nan
+        if is_whole:
+            row["p"] = p_of(test, paired, quantities)
         table_rows.append(row)
     table = pd.DataFrame(table_rows)
-    table["p_holm"] = holm(table["p"].to_numpy()) if is_whole else np.nan
+    table["p_holm"] = np.nan
+    if is_whole:
+        table["p_holm"] = holm(table["p"].to_numpy())
     return table.assign(supported=table["p_holm"] < ALPHA)
 
 
@@ -80,19 +87,20 @@ def comparable(
     """Return the episodes in which two conditions can be compared, side by side.
 
     Args:
-        first: rows of a condition, with T of each as `time_budget_s`.
+        first: rows of a condition, each with its T as `time_budget_s`.
         second: rows of the other condition, likewise.
-        quantity: the quantity compared.
+        quantity: the compared quantity.
 
     Returns:
         The episodes in which both have a value and, for a quantity `of_arrivals`, both
-        reached the goal; see `side_by_side`.
+        reached the goal; columns as in `side_by_side`.
     """
     column = quantity.column
     measures = dict.fromkeys(["success", "total_time_s", "time_budget_s", column])
     paired = side_by_side(first, second, [*measures])
     if quantity.of_arrivals:
-        paired = paired[paired["success"] & paired["success_other"]]
+        both_arrived = paired["success"] & paired["success_other"]
+        paired = paired[both_arrived]
     return paired.dropna(subset=[column, f"{column}_other"])
 
 
@@ -100,13 +108,15 @@ def means_and_difference(quantity: Quantity, rows: pd.DataFrame) -> dict[str, fl
     """Return the means, their difference and its 95 % interval, in the quantity's unit.
 
     Args:
-        quantity: the quantity compared.
+        quantity: the compared quantity.
         rows: rows from `comparable`.
     """
     difference, low, high = _interval(rows, quantity, 0.95)
+    first_mean = rows[quantity.column].mean()
+    second_mean = rows[f"{quantity.column}_other"].mean()
     return {
-        "mean_one": quantity.scale * rows[quantity.column].mean(),
-        "mean_other": quantity.scale * rows[f"{quantity.column}_other"].mean(),
+        "mean_one": quantity.scale * first_mean,
+        "mean_other": quantity.scale * second_mean,
         "difference": difference,
         "low": low,
         "high": high,
@@ -114,10 +124,10 @@ def means_and_difference(quantity: Quantity, rows: pd.DataFrame) -> dict[str, fl
 
 
 def _interval(rows: pd.DataFrame, quantity: Quantity, confidence: float) -> Interval:
-    """Return the difference and its interval, NaN if there are too few maps."""
-    interval = interval_of(rows, quantity.column, confidence)
-    difference, low, high = (quantity.scale * value for value in interval)
-    return difference, low, high
+    """Return the difference and its interval, whose ends are NaN with too few maps."""
+    difference, low, high = interval_of(rows, quantity.column, confidence)
+    scale = quantity.scale
+    return scale * difference, scale * low, scale * high
 
 
 def p_of(
@@ -129,9 +139,9 @@ def p_of(
 
     Args:
         test: the hypothesis.
-        rows: episodes of the two conditions side by side, the other's columns ending in
-            `_other`.
-        quantities: quantities that conditions are compared by, by name.
+        rows: episodes of the two conditions side by side; the columns of the second end
+            in `_other`.
+        quantities: quantities by which conditions are compared, by name.
     """
     quantity = quantities[test.metric]
     if test.kind == "difference":

@@ -1,8 +1,9 @@
 """Pairs of conditions whose values differ in one part, on the same maps and draws."""
 
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import combinations
+from itertools import chain, combinations
 from typing import Any
 
 import pandas as pd
@@ -18,17 +19,15 @@ from benchnav.eval.experiment.condition import (
 )
 from benchnav.eval.experiment.unit import DRAW
 
-# Columns that conditions may differ in, with their keys in a condition's value. Other
-# data or scenarios would be other maps.
+# Columns in which conditions may differ, with their keys in a condition's value. Data
+# and scenario are not among them, since they determine the maps.
+_PARTS = ("risk", "planner", "model", "objective", "robot", *KNOWLEDGE)
 _KEYS: Mapping[str, tuple[str, ...]] = {
-    **{
-        name: (name,)
-        for name in ("risk", "planner", "model", "objective", "robot", *KNOWLEDGE)
-    },
+    **{name: (name,) for name in _PARTS},
     "world": ("world", "rules"),
     "run": (),
 }
-# Columns of an episode that pairs have for both sides.
+# Columns of an episode that a pair has for both conditions.
 _MEASURES = (
     "success",
     "total_time_s",
@@ -41,17 +40,18 @@ _MEASURES = (
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Compared:
-    """A condition of one run, or of several that contain identical rows.
+    """A condition of one run, or of several runs that contain identical rows of it.
 
     Args:
         labels: labels in tables by column, including `run`, which is `NOT_USED` unless
-            two runs contain one condition.
-        value: all that affects its rows, as in `run.json`.
+            two runs contain the condition.
+        value: all settings that affect its rows, as in `run.json`.
         maps: digests of its maps, in the order of maps.
-        episodes: its rows, with T of each as `time_budget_s`.
+        episodes: its rows, each with its T as `time_budget_s`.
         code: code that computed the rows, by run: names of sources, versions and parts
             with their digests.
-        about: digest of the maps' properties `MEANING`; empty if the run lacks it.
+        map_properties: digest of the maps' properties `MEANING`; empty if the run lacks
+            it.
     """
 
     labels: Mapping[str, str]
@@ -59,7 +59,7 @@ class Compared:
     maps: Sequence[str]
     episodes: pd.DataFrame
     code: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    about: str = ""
+    map_properties: str = ""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -68,13 +68,14 @@ class Pair:
 
     Args:
         one: label of the first condition.
-        other: label of the second condition, which the first is compared with.
-        shared: labels of both; if one does not use a part, the other's label.
+        other: label of the second condition, with which the first is compared.
+        shared: labels that both conditions have; if only one condition uses a part,
+            its label.
         episodes: common episodes by seed, realisation and map: `success`,
-            `total_time_s`, `time_budget_s` and other measures of the first, those of
-            the second with `_other`; and `group`, the statistical unit. Maps may have
-            different numbers of episodes.
-        members: the conditions.
+            `total_time_s`, `time_budget_s` and other measures of the first condition;
+            the same columns of the second, which end in `_other`; and `group`, the
+            statistical unit. Maps may have different numbers of episodes.
+        members: both conditions.
     """
 
     one: str
@@ -93,16 +94,17 @@ def find_pairs(
     equals any other.
 
     Args:
-        conditions: conditions of one run or several, each once unless runs are compared
-            with each other.
-        by: column that differs, see `by_what`.
-        against: label that all others are compared with; if empty, all pairs.
+        conditions: conditions of one or several runs; each condition occurs once unless
+            runs are compared with each other.
+        by: column that differs; see `by_what`.
+        against: label with which all others are compared; if empty, all pairs are
+            formed.
 
     Returns:
         Pairs, grouped by their common labels.
 
     Raises:
-        ConfigError: If there is nothing to compare, or it cannot be paired.
+        ConfigError: If there is nothing to compare, or conditions cannot be paired.
     """
     by = by_what(conditions, by, against)
     used = [c.labels[by] for c in conditions if c.labels[by] != NOT_USED]
@@ -111,13 +113,15 @@ def find_pairs(
         check_known("`against`", against, values)
     pairs = [_pair(a, b, by) for a, b in matches(conditions, by, against)]
     if not pairs:
+        listed = ", ".join(values) or NOT_USED
         raise ConfigError(
             f"Expected two conditions or more that differ in their {by} and in "
-            f"nothing else, got {by} "
-            f"{', '.join(values) or NOT_USED}.{_others(conditions, by)}"
+            f"nothing else, got {by} {listed}.{_others(conditions, by)}"
         )
-    families = list(dict.fromkeys(tuple(pair.shared.values()) for pair in pairs))
-    return sorted(pairs, key=lambda pair: families.index(tuple(pair.shared.values())))
+    families: dict[tuple[str, ...], list[Pair]] = defaultdict(list)
+    for pair in pairs:
+        families[tuple(pair.shared.values())].append(pair)
+    return list(chain.from_iterable(families.values()))
 
 
 def matches(
@@ -131,17 +135,22 @@ def matches(
         against: as in `find_pairs`.
     """
     for a, b in combinations(conditions, 2):
-        is_selected = not against or against in (a.labels[by], b.labels[by])
-        if is_selected and _differ_in(a, b, by):
-            # The later one comes first, unless the earlier is compared with `against`.
-            yield (a, b) if against and b.labels[by] == against else (b, a)
+        labels = (a.labels[by], b.labels[by])
+        is_selected = not against or against in labels
+        if not is_selected or not _differ_in(a, b, by):
+            continue
+        # The later condition comes first, unless it is the one with label `against`.
+        if against and b.labels[by] == against:
+            yield a, b
+        else:
+            yield b, a
 
 
 def by_what(conditions: Sequence[Compared], by: str = "", against: str = "") -> str:
     """Return the column by which conditions are compared, a key of `_KEYS`.
 
     Args:
-        conditions: the conditions.
+        conditions: conditions that are compared.
         by: requested column. If empty: the column that contains `against`; `run` if
             runs have common conditions; else `risk`.
         against: a label, or empty.
@@ -155,13 +164,13 @@ def by_what(conditions: Sequence[Compared], by: str = "", against: str = "") -> 
     if not against:
         has_runs = any(c.labels["run"] != NOT_USED for c in conditions)
         return "run" if has_runs else "risk"
-    labels = [
-        (name, condition.labels[name]) for condition in conditions for name in _KEYS
-    ]
-    check_known(
-        "`against`", against, sorted({label for _, label in labels} - {NOT_USED})
-    )
-    columns = list(dict.fromkeys(name for name, label in labels if label == against))
+    columns_of: dict[str, dict[str, None]] = defaultdict(dict)
+    for condition in conditions:
+        for name in _KEYS:
+            columns_of[condition.labels[name]][name] = None
+    columns_of.pop(NOT_USED, None)
+    check_known("`against`", against, sorted(columns_of))
+    columns = list(columns_of[against])
     if len(columns) > 1:
         raise ConfigError(
             f"Expected `against` to be a label of one kind, got {against!r}, a label "
@@ -175,7 +184,7 @@ def check_one_value_each(conditions: Iterable[Compared]) -> None:
     """Reject two values under one label, which readers could not distinguish.
 
     Raises:
-        ConfigError: If there are such values.
+        ConfigError: If two values have one label.
     """
     values: dict[tuple[str, str], tuple[dict[str, Any], Compared]] = {}
     for condition in conditions:
@@ -187,22 +196,19 @@ def check_one_value_each(conditions: Iterable[Compared]) -> None:
                 runs = " and ".join(dict.fromkeys([*first.code, *condition.code]))
                 raise ConfigError(
                     f"Expected one {name} under each label, got two that {runs} call "
-                    f"{label!r}: "
-                    f"{_in_words(earlier, value)}. Leave one of the runs out, or run "
-                    "one again under "
-                    "another label."
+                    f"{label!r}: {_in_words(earlier, value)}. Leave one of the runs "
+                    "out, or run one again under another label."
                 )
 
 
 def _in_words(a: Any, b: Any) -> str:
     """Describe differences of plain data, such as `options.level 0.5 and 0.9`."""
-    return ", ".join(
-        f"{name} {first} and {second}" for name, first, second in differences(a, b)
-    )
+    words = [f"{name} {old} and {new}" for name, old, new in differences(a, b)]
+    return ", ".join(words)
 
 
 def _others(conditions: Sequence[Compared], by: str) -> str:
-    """Describe the labels or worlds in which the conditions differ."""
+    """Describe the other columns or worlds in which the conditions differ."""
     fields: dict[str, dict[str, Any]] = {}
     for condition in conditions:
         field_ = _field(condition)
@@ -217,10 +223,11 @@ def _others(conditions: Sequence[Compared], by: str) -> str:
             differing[name] = labels
     if not differing:
         return ""
-    differences_text = " and ".join(
-        f"{name} ({', '.join(sorted(labels))})" for name, labels in differing.items()
-    )
-    return f" They differ in {differences_text}: try `--by {next(iter(differing))}`."
+    words = []
+    for name, labels in differing.items():
+        words.append(f"{name} ({', '.join(sorted(labels))})")
+    first_name = next(iter(differing))
+    return f" They differ in {' and '.join(words)}: try `--by {first_name}`."
 
 
 def _differ_in(a: Compared, b: Compared, by: str) -> bool:
@@ -228,26 +235,31 @@ def _differ_in(a: Compared, b: Compared, by: str) -> bool:
     if by == "run":
         return a.value == b.value and a.labels["run"] != b.labels["run"]
     unused = [name for name in _KEYS if NOT_USED in (a.labels[name], b.labels[name])]
-    keys = _KEYS[by]
-    is_equal = all(
-        a.value.get(key) == b.value.get(key)
-        for key in {*a.value, *b.value} - {*keys, *unused}
-    )
-    differ = any(a.value.get(key) != b.value.get(key) for key in keys)
-    return is_equal and differ and by not in unused and _field(a) == _field(b)
+    if by in unused:
+        return False
+    keys = {*a.value, *b.value}
+    differing = {key for key in keys if a.value.get(key) != b.value.get(key)}
+    by_keys = set(_KEYS[by])
+    is_only_difference = differing - set(unused) <= by_keys
+    return is_only_difference and bool(differing & by_keys) and _field(a) == _field(b)
 
 
 def _field(condition: Compared) -> dict[str, Any]:
     """Return the settings of a world that determine the drawn λ.
 
-    Immobilising terrain is among them if λ is frozen; time budgets never are.
+    If λ is frozen, the threshold of immobilising terrain is one of them. Time budgets
+    never are.
     """
     world = condition.value["world"]
     if world["noise"] != "frozen":
         return {"noise": world["noise"]}
-    below = (world.get("immobile") or {}).get("below")
-    drawn = {key: world.get(key) for key in ("correlation_m", "kernel")}
-    return {"noise": "frozen", **drawn, "immobile.below": below}
+    immobile = world.get("immobile") or {}
+    return {
+        "noise": "frozen",
+        "correlation_m": world.get("correlation_m"),
+        "kernel": world.get("kernel"),
+        "immobile.below": immobile.get("below"),
+    }
 
 
 def _pair(first: Compared, second: Compared, by: str) -> Pair:
@@ -259,13 +271,12 @@ def _pair(first: Compared, second: Compared, by: str) -> Pair:
             f"Expected conditions with episodes in common, got {names} with "
             f"{_draws(first)} and {_draws(second)}."
         )
-    shared = {
-        name: second.labels[name]
-        if first.labels[name] == NOT_USED
-        else first.labels[name]
-        for name in (*LABELS, "run")
-        if name != by
-    }
+    shared = {}
+    for name in (*LABELS, "run"):
+        if name == by:
+            continue
+        is_used = first.labels[name] != NOT_USED
+        shared[name] = first.labels[name] if is_used else second.labels[name]
     return Pair(
         one=first.labels[by],
         other=second.labels[by],
@@ -283,15 +294,15 @@ def side_by_side(
     Args:
         first: rows of a condition.
         second: rows of the other condition.
-        measures: columns of both, those of `second` with `_other`.
+        measures: columns that both have; the columns of `second` get the suffix
+            `_other`.
 
     Returns:
-        `DRAW`, the measures, and `group`.
+        The columns `DRAW`, the measures, and `group`.
     """
     columns = [*DRAW, *measures]
-    return first[["group", *columns]].merge(
-        second[columns], on=DRAW, suffixes=("", "_other")
-    )
+    first_columns = first[["group", *columns]]
+    return first_columns.merge(second[columns], on=DRAW, suffixes=("", "_other"))
 
 
 def on_common_draws(conditions: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
@@ -300,22 +311,27 @@ def on_common_draws(conditions: Mapping[str, pd.DataFrame]) -> dict[str, pd.Data
     Args:
         conditions: rows of each condition, by id.
     """
-    draws = [
-        set(rows[DRAW].itertuples(index=False, name=None))
-        for rows in conditions.values()
-    ]
-    common = pd.DataFrame(sorted(set.intersection(*draws)), columns=DRAW, dtype=int)
+    draws = []
+    for rows in conditions.values():
+        draws.append(set(rows[DRAW].itertuples(index=False, name=None)))
+    common_draws = sorted(set.intersection(*draws))
+    common = pd.DataFrame(common_draws, columns=DRAW, dtype=int)
     return {
         condition: common.merge(rows, on=DRAW) for condition, rows in conditions.items()
     }
 
 
 def check_maps(first: Compared, second: Compared, names: str) -> None:
-    """Check that two conditions have the same maps, with one meaning and grouping.
+    """Check that two conditions have the same maps, properties and groups of maps.
+
+    Args:
+        first: a condition.
+        second: the other condition.
+        names: names of both conditions, for the message.
 
     Raises:
-        ConfigError: If maps of one index have different digests, or what the maps mean
-            or their groups differ.
+        ConfigError: If maps of one index have different digests, or the properties or
+            the groups of the maps differ.
     """
     common = min(len(first.maps), len(second.maps))
     if list(first.maps[:common]) != list(second.maps[:common]):
@@ -326,28 +342,25 @@ def check_maps(first: Compared, second: Compared, names: str) -> None:
     first_groups = first.episodes.groupby("map")["group"].first()
     second_groups = second.episodes.groupby("map")["group"].first()
     common_maps = first_groups.index.intersection(second_groups.index)
-    has_meaning = bool(first.about and second.about)
-    same_groups = first_groups[common_maps].equals(second_groups[common_maps])
-    unlike = {
-        MEANING: has_meaning and first.about != second.about,
-        "groups of maps": not same_groups,
-    }
-    if any(unlike.values()):
+    differing = []
+    has_properties = bool(first.map_properties and second.map_properties)
+    if has_properties and first.map_properties != second.map_properties:
+        differing.append(MEANING)
+    if not first_groups[common_maps].equals(second_groups[common_maps]):
+        differing.append("groups of maps")
+    if differing:
         split = f"of {first.value['data']} {first.value['split']}"
-        differing = ", ".join(
-            f"{name} {split}" for name, differs in unlike.items() if differs
-        )
+        words = ", ".join(f"{name} {split}" for name in differing)
         raise ConfigError(
             f"Expected conditions on maps of one meaning, got {names}, which differ "
-            f"in {differing}. Run them on one "
-            "dataset."
+            f"in {words}. Run them on one dataset."
         )
 
 
 def _draws(condition: Compared) -> str:
-    rows = condition.episodes
-    numbers = {
-        name: ", ".join(map(str, sorted(rows[name].unique())))
-        for name in ("seed", "realisation")
-    }
-    return ", ".join(f"{name}s {listed}" for name, listed in numbers.items())
+    """Return the seeds and realisations of a condition in words."""
+    words = []
+    for name in ("seed", "realisation"):
+        values = sorted(condition.episodes[name].unique())
+        words.append(f"{name}s {', '.join(map(str, values))}")
+    return ", ".join(words)

@@ -1,14 +1,17 @@
 """Regret, split along a chain of conditions that ends at the near-optimal reference.
 
-The chain leads from a planner with a model's prediction to the optimal planner with the
-same prediction, then with the models `ideal` and `oracle`, and to the near-optimal
-reference, which is given λ itself. The reference's trajectories are feasible, so regret
-against it is at most the regret against the minimum time; the table also has the lower
-bound of the time, which no trajectory undercuts. Each step is a paired difference. The
-steps add up to the total by construction, which does not make them causes: a step may
-be negative, and another order of steps would give other values.
+The chain starts at a planner with a model's prediction. It leads to the optimal planner
+with the same prediction, then with the models `ideal` and `oracle`, and ends at the
+near-optimal reference, which is given λ itself. The reference's trajectories are
+feasible, so that regret against it is at most the regret against the minimum time. The
+table also has a lower bound of the time, which no trajectory undercuts.
+
+Each step of the chain is a paired difference. The steps add up to the total by
+construction, but they are not causes: a step may be negative, and another order of
+steps would give other values.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any
@@ -31,57 +34,73 @@ _MODELS = ("ideal", "oracle")
 def find_chains(conditions: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
     """Find complete chains of five conditions.
 
-    Robots that learn during the episode are in no chain: optimal planners plan once.
+    Robots that learn during the episode are in no chain, since optimal planners plan
+    only once.
 
     Args:
         conditions: entries of `run.json` by id.
 
     Returns:
-        Five ids for each chain: a planner with a model, the optimal planner with it,
-        with `ideal` and with `oracle`, and the reference.
+        Five ids for each chain: a planner with a model; the optimal planner with that
+        model, with `ideal` and with `oracle`; and the reference.
     """
     values = {condition: entry["value"] for condition, entry in conditions.items()}
-
-    def like(
-        value: Mapping[str, Any], ignored: Sequence[str], **parts: str
-    ) -> list[str]:
-        """Return conditions with these parts that equal `value` except in some keys."""
-        expected = _without(value, ignored)
-        matching = []
-        for condition, candidate in values.items():
-            has_parts = all(candidate[kind]["part"] == parts[kind] for kind in parts)
-            if has_parts and _without(candidate, ignored) == expected:
-                matching.append(condition)
-        return matching
-
     chains = []
     for condition, value in values.items():
         planner = value["planner"]["part"]
         model = value["model"]["part"]
-        blind = conditions[condition]["labels"]["model"] == NOT_USED
-        if planner in (OPTIMAL, REFERENCE) or model in PRIVILEGED or blind:
+        is_blind = conditions[condition]["labels"]["model"] == NOT_USED
+        if planner in (OPTIMAL, REFERENCE) or model in PRIVILEGED or is_blind:
             continue
-        references = like(
-            value,
-            ("planner", "model", "risk"),
-            planner=REFERENCE,
-            model="clairvoyant",
-        )
-        # With zero levels, entering a soft spot counts as a loss: no reference.
-        references = [
-            name
-            for name in references
-            if values[name]["planner"]["options"].get("levels") != 0
-        ]
-        for optimal in like(value, ("planner",), planner=OPTIMAL):
-            privileged = [
-                like(values[optimal], ("model",), model=name) for name in _MODELS
-            ]
-            if not all(privileged):
+        references = _references(values, value)
+        for optimal in _alike(values, value, ("planner",), planner=OPTIMAL):
+            privileged = []
+            for name in _MODELS:
+                privileged += _alike(values, values[optimal], ("model",), model=name)[
+                    :1
+                ]
+            if len(privileged) < len(_MODELS):
                 continue
-            start = [condition, optimal, *(names[0] for names in privileged)]
-            chains += [[*start, reference] for reference in references]
+            for reference in references:
+                chains.append([condition, optimal, *privileged, reference])
     return chains
+
+
+def _references(
+    values: Mapping[str, Mapping[str, Any]], value: Mapping[str, Any]
+) -> list[str]:
+    """Return the reference conditions for a condition's value."""
+    parts = {"planner": REFERENCE, "model": "clairvoyant"}
+    references = []
+    for condition in _alike(values, value, ("planner", "model", "risk"), **parts):
+        options = values[condition]["planner"]["options"]
+        # With zero levels, entering a soft spot counts as a loss: no reference.
+        if options.get("levels") != 0:
+            references.append(condition)
+    return references
+
+
+def _alike(
+    values: Mapping[str, Mapping[str, Any]],
+    value: Mapping[str, Any],
+    ignored: Sequence[str],
+    **parts: str,
+) -> list[str]:
+    """Return conditions that have some parts, and equal `value` except in some keys.
+
+    Args:
+        values: values of all conditions by id.
+        value: the value to compare with.
+        ignored: keys that may differ.
+        **parts: required parts by kind.
+    """
+    expected = _without(value, ignored)
+    matching = []
+    for condition, candidate in values.items():
+        has_parts = all(candidate[kind]["part"] == parts[kind] for kind in parts)
+        if has_parts and _without(candidate, ignored) == expected:
+            matching.append(condition)
+    return matching
 
 
 def _without(value: Mapping[str, Any], ignored: Sequence[str]) -> dict[str, Any]:
@@ -101,18 +120,21 @@ def split_regret(
         worlds: world of each condition, by id.
 
     Returns:
-        A row a step of a chain: `chain`, its index from 1; labels of its first
-        condition; `against`, the reference; ids, planners and models of the two
-        conditions, `one`, `one_planner`, `one_model` and `other…`; `n_maps`, where a
-        group counts as one, and `n_episodes`; for `success` and `time` (T_total in
-        seconds, a failure counts as T) the means `_one` and `_other`, and their
-        `_difference`, one minus other, with its 95 % interval `_low`, `_high`; and
-        `_bound`, the best mean that the lower bounds of the time allow, NaN if the
-        reference's rows have none.
+        One row per step of a chain, with these columns:
+
+        - `chain`, the chain's index from 1; labels of the chain's first condition;
+          `against`, the reference.
+        - Id, planner and model of the step's two conditions: `one`, `one_planner`,
+          `one_model`, and the same for `other`.
+        - `n_maps`, where a group counts as one; `n_episodes`.
+        - For `success` and `time` (T_total in seconds; a failure counts as T): the
+          means `…_one` and `…_other`; their `…_difference`, one minus other, with its
+          95 % interval `…_low`, `…_high`; and `…_bound`, the best mean that the lower
+          bounds of the time allow, NaN if the reference's rows lack these bounds.
     """
     rows = dict(list(episodes.groupby("condition", sort=False)))
     steps: list[dict[str, Any]] = []
-    for number, chain in enumerate(find_chains(conditions), start=1):
+    for index, chain in enumerate(find_chains(conditions), start=1):
         common = on_common_draws({condition: rows[condition] for condition in chain})
         with_budgets = {}
         for condition, group in common.items():
@@ -129,11 +151,13 @@ def split_regret(
                 with_budgets[second],
                 ["success", "total_time_s", "time_budget_s"],
             )
-            step = {"chain": number, **of_chain, "against": AGAINST}
-            step |= {"one": first, "other": second}
-            for side, condition in (("one", first), ("other", second)):
-                for kind in ("planner", "model"):
-                    step[f"{side}_{kind}"] = conditions[condition]["labels"][kind]
+            step = {"chain": index, **of_chain, "against": AGAINST}
+            sides = {"one": first, "other": second}
+            step |= sides
+            for side, condition in sides.items():
+                side_labels = conditions[condition]["labels"]
+                step[f"{side}_planner"] = side_labels["planner"]
+                step[f"{side}_model"] = side_labels["model"]
             steps.append({**step, **_differences(paired), **bounds})
     return pd.DataFrame(steps)
 
@@ -145,16 +169,18 @@ def best_possible(rows: pd.DataFrame) -> dict[str, float]:
         rows: episodes, with `time_budget_s`.
 
     Returns:
-        `success_bound`, and `time_bound` in seconds; NaN if some episode has no
+        `success_bound`, and `time_bound` in seconds; NaN if any episode has no
         `lower_bound_s`.
     """
-    bounds = rows.get("lower_bound_s")
-    if bounds is None or bounds.isna().any():
-        return {"success_bound": float("nan"), "time_bound": float("nan")}
-    budgets = rows["time_budget_s"]
+    bounds_s = rows.get("lower_bound_s")
+    if bounds_s is None or bounds_s.isna().any():
+        return {"success_bound": math.nan, "time_bound": math.nan}
+    budgets_s = rows["time_budget_s"]
+    is_reachable = bounds_s <= budgets_s
+    times_s = bounds_s.clip(upper=budgets_s)
     return {
-        "success_bound": float((bounds <= budgets).mean()),
-        "time_bound": float(bounds.clip(upper=budgets).mean()),
+        "success_bound": float(is_reachable.mean()),
+        "time_bound": float(times_s.mean()),
     }
 
 
@@ -164,9 +190,7 @@ def _differences(paired: pd.DataFrame) -> dict[str, Any]:
         "n_episodes": len(paired),
     }
     for name, column in (("success", "success"), ("time", "total_time_s")):
-        row |= {
-            f"{name}_one": float(paired[column].mean()),
-            f"{name}_other": float(paired[f"{column}_other"].mean()),
-        }
+        row[f"{name}_one"] = float(paired[column].mean())
+        row[f"{name}_other"] = float(paired[f"{column}_other"].mean())
         row |= named(name, interval_of(paired, column))
     return row

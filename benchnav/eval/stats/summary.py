@@ -1,9 +1,9 @@
 """Summaries of conditions: success rates with intervals, and means with counts.
 
 The statistical unit is the map, or the group of maps if a dataset has groups. Episodes
-on one map under several seeds or realisations are correlated: a hundred of them on
-twenty maps contain less information than a hundred maps. The design effect states how
-much less.
+on one map under several seeds or realisations are correlated: a hundred episodes on
+twenty maps contain less information than episodes on a hundred maps. The design effect
+quantifies the loss.
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,15 +26,17 @@ from benchnav.stats.intervals import (
     wilson_interval,
 )
 
-# Metrics with mean and standard deviation, with a median, and of learning with a mean.
+# Metrics summarised by mean and standard deviation, by the median, and by the mean.
 _SPREAD: tuple[Metric, ...] = (
     shipped.TRAVERSABILITY,
     shipped.TIME_RATIO,
     shipped.SCORE,
+    shipped.PATH_LENGTH,
+    shipped.STUCK_FRACTION,
+    shipped.ROUGHNESS,
 )
-_SPREAD += (shipped.PATH_LENGTH, shipped.STUCK_FRACTION, shipped.ROUGHNESS)
 _MEDIANS: tuple[Metric, ...] = shipped.PLANNING
-_LEARNT: tuple[Metric, ...] = (
+_LEARNING: tuple[Metric, ...] = (
     shipped.SEEN_CELLS,
     shipped.SENSED_CELLS,
     shipped.REVISIONS,
@@ -44,33 +46,31 @@ _LEARNT: tuple[Metric, ...] = (
 
 
 def time_budgets(episodes: pd.DataFrame, world: Mapping[str, Any]) -> pd.Series:
-    """Return T of each episode in seconds: T_total of a failure, else from the world.
+    """Return each episode's T in seconds: T_total of a failure, else from the world.
 
     Args:
         episodes: rows of one condition.
         world: world of the condition, as in `run.json`.
     """
+    total_s = episodes["total_time_s"]
     if "time_budget_ratio" in world:
         # The time over its ratio is the reference time at the robot's top speed.
-        granted = (
-            world["time_budget_ratio"]
-            * episodes["total_time_s"]
-            / episodes["time_ratio"]
-        )
+        budget_s = world["time_budget_ratio"] * total_s / episodes["time_ratio"]
     else:
-        granted = world["time_budget_s"]
-    return episodes["total_time_s"].where(~episodes["success"], granted)
+        budget_s = world["time_budget_s"]
+    return total_s.where(~episodes["success"], budget_s)
 
 
 def success_mean(episodes: pd.DataFrame) -> tuple[float, float, float]:
     """Return the success rate of a condition with Wilson's 95 % interval.
 
-    The number of episodes is divided by `design_effect`.
+    The interval is that of the number of episodes divided by `design_effect`.
     """
     success = episodes["success"].to_numpy(dtype=bool)
-    effect = design_effect(success, episodes["group"].to_numpy())
+    maps = episodes["group"].to_numpy()
+    n_effective = len(success) / design_effect(success, maps)
     rate = float(success.mean())
-    low, high = wilson_interval(rate, len(success) / effect)
+    low, high = wilson_interval(rate, n_effective)
     return rate, low, high
 
 
@@ -84,27 +84,28 @@ def total_time_mean(
         world: world of the condition, as in `run.json`.
 
     Returns:
-        Mean and ends in seconds; the ends are NaN below `stats.bootstrap.LEAST_MAPS`
-        maps.
+        Mean and ends in seconds; the ends are NaN with fewer than
+        `stats.bootstrap.LEAST_MAPS` maps.
     """
     success = episodes["success"].to_numpy(dtype=bool)
     maps = episodes["group"].to_numpy()
-    taken = episodes["total_time_s"].to_numpy()
-    budgets = time_budgets(episodes, world)
-    arrival = taken[success].mean() if success.any() else 0.0  # no arrival takes less
+    total_s = episodes["total_time_s"].to_numpy()
+    budgets_s = time_budgets(episodes, world)
+    arrival_s = 0.0  # without a success; no arrival takes less
+    if success.any():
+        arrival_s = total_s[success].mean()
     _, low, high = success_mean(episodes)
-    mean, low_s, high_s = total_time_interval(
-        by_map(taken, maps),
+    maps_of_success = np.unique(maps[success])
+    mean_s, low_s, high_s = total_time_interval(
+        by_map(total_s, maps),
         by_map(1.0 - success, maps),
         (1 - high, 1 - low),
-        budgets.mean() - arrival,
-        len(np.unique(maps[success])),
+        budgets_s.mean() - arrival_s,
+        len(maps_of_success),
     )
-    return (
-        float(mean),
-        float(np.maximum(low_s, 0.0)),
-        float(np.minimum(high_s, budgets.max())),
-    )
+    low_s = np.maximum(low_s, 0.0)
+    high_s = np.minimum(high_s, budgets_s.max())
+    return float(mean_s), float(low_s), float(high_s)
 
 
 def summarise(
@@ -120,19 +121,25 @@ def summarise(
         further: quantities of the episodes in addition to the built-in ones.
 
     Returns:
-        A row a condition: `condition` and its labels; `n_episodes`, `n_maps`, and
-        `n_groups`, equal to `n_maps` if the dataset has no groups; `success_rate` with
-        Wilson's interval `success_low`, `success_high` on the number of episodes over
-        `design_effect`. For each quantity `NAME_mean`, `NAME_std` and `NAME_n`, the
-        number of episodes that have it: total time, where a failure counts as T; time
-        of successes only; observed λ; time over the reference time; score; path length;
-        fraction of stuck steps; roughness.
-        `total_time_low_s`, `total_time_high_s`, the 95 % interval of its mean, from
-        `total_time_interval`. `planning_ms_median`, and so for `planning_ms_p95` and
-        `planning_start_ms`; `NAME_mean` of metrics of learning, NaN if robots do not
-        learn; `compiled_share`; and `OUTCOME_count` of each failure. For each further
-        quantity mean, standard deviation and number of episodes, as above, and
-        `NAME_low`, `NAME_high`, Student's 95 % interval of the mean per map.
+        One row per condition, with these columns:
+
+        - `condition` and its labels; `n_episodes`; `n_maps`; `n_groups`, equal to
+          `n_maps` if the dataset has no groups.
+        - `success_rate` with Wilson's interval `success_low`, `success_high`, computed
+          from the number of episodes divided by `design_effect`.
+        - `NAME_mean`, `NAME_std`, and `NAME_n`, the number of episodes that have a
+          value: of the total time (a failure counts as T), the time of successes only,
+          observed λ, the time over the reference time, the score, the path length, the
+          fraction of stuck steps, and the roughness.
+        - `total_time_low_s`, `total_time_high_s`: 95 % interval of the mean total time,
+          from `total_time_interval`.
+        - The medians `planning_ms_median`, `planning_ms_p95_median` and
+          `planning_start_ms_median`.
+        - `NAME_mean` of metrics of learning, NaN if robots do not learn;
+          `compiled_share`; `OUTCOME_count`, the number of failures of each kind.
+        - Mean, standard deviation and number of episodes of each further quantity, as
+          above, and `NAME_low`, `NAME_high`, Student's 95 % interval of its mean per
+          map.
     """
     groups = episodes.groupby("condition", sort=False)
     rows = [
@@ -146,44 +153,47 @@ def _summarise_condition(
     group: pd.DataFrame, world: Mapping[str, Any], further: Sequence[Quantity]
 ) -> dict[str, object]:
     success = group["success"].to_numpy(dtype=bool)
-    effect = design_effect(success, group["group"].to_numpy())
     rate, low, high = success_mean(group)
     row: dict[str, object] = {
         name: group[name].iloc[0] for name in ("condition", *LABELS)
     }
-    row |= {
-        "n_episodes": len(group),
-        "n_maps": group["map"].nunique(),
-        "n_groups": group["group"].nunique(),
-    }
-    row |= {
-        "success_rate": rate,
-        "success_low": low,
-        "success_high": high,
-        "design_effect": effect,
-    }
+    row["n_episodes"] = len(group)
+    row["n_maps"] = group["map"].nunique()
+    row["n_groups"] = group["group"].nunique()
+    row["success_rate"] = rate
+    row["success_low"] = low
+    row["success_high"] = high
+    row["design_effect"] = design_effect(success, group["group"].to_numpy())
     total_time = shipped.TOTAL_TIME.quantity
-    taken = group[total_time.column]
-    row |= _spread(total_time, taken)
-    _, row["total_time_low_s"], row["total_time_high_s"] = total_time_mean(group, world)
-    row |= _spread(replace(total_time, column="success_time_s"), taken.where(success))
+    total_s = group[total_time.column]
+    row |= _spread(total_time, total_s)
+    _, low_s, high_s = total_time_mean(group, world)
+    row["total_time_low_s"] = low_s
+    row["total_time_high_s"] = high_s
+    success_time = replace(total_time, column="success_time_s")
+    row |= _spread(success_time, total_s.where(success))
     for metric in _SPREAD:
         row |= _spread(metric.quantity, group[metric.column])
     for metric in _MEDIANS:
-        row[metric.quantity.summary_column("median")] = group[metric.column].median()
-    for metric in _LEARNT:
-        mean = group[metric.column].mean() if metric.column in group else np.nan
-        row[metric.quantity.summary_column("mean")] = mean
+        name = metric.quantity.summary_column("median")
+        row[name] = group[metric.column].median()
+    for metric in _LEARNING:
+        name = metric.quantity.summary_column("mean")
+        # Runs of robots that do not learn lack the columns.
+        values = group.get(metric.column)
+        row[name] = np.nan if values is None else values.mean()
     row["compiled_share"] = group["compiled"].astype(float).mean()
-    outcomes = [outcome.name.lower() for outcome in FAILURES]
-    row |= {f"{name}_count": int((group["outcome"] == name).sum()) for name in outcomes}
+    for outcome in FAILURES:
+        name = outcome.name.lower()
+        is_outcome = group["outcome"] == name
+        row[f"{name}_count"] = int(is_outcome.sum())
     for quantity in further:
         row |= _mean_with_interval(quantity, group)
     return row
 
 
 def _spread(quantity: Quantity, values: pd.Series) -> dict[str, object]:
-    """Return mean and standard deviation of a quantity, and its number of episodes."""
+    """Return a quantity's mean, standard deviation and number of episodes with a value."""
     stem = quantity.column.removesuffix(quantity.suffix)
     return {
         quantity.summary_column("mean"): values.mean(),
@@ -201,11 +211,9 @@ def _mean_with_interval(quantity: Quantity, group: pd.DataFrame) -> dict[str, ob
     if quantity.column in group:
         values = group[quantity.column]
     has_value = values.notna()
-    by_unit = by_map(
-        values[has_value].to_numpy(dtype=float),
-        group.loc[has_value, "group"].to_numpy(),
-    )
-    _, low, high = mean_interval(by_unit)
+    numbers = values[has_value].to_numpy(dtype=float)
+    maps = group.loc[has_value, "group"].to_numpy()
+    _, low, high = mean_interval(by_map(numbers, maps))
     return {
         **_spread(quantity, values),
         quantity.summary_column("low"): float(low),

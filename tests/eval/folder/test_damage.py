@@ -48,7 +48,7 @@ def test_runs_of_other_formats_are_refused_with_what_reads_them(
     version: int, run: Path
 ) -> None:
     (run / "run.json").write_text(
-        json.dumps({**open_run(run).about, "format_version": version})
+        json.dumps({**open_run(run).manifest, "format_version": version})
     )
     remedy = {
         5: r"Run its suite again, or read it with benchnav 1\.3",
@@ -64,7 +64,7 @@ def test_runs_of_other_formats_are_refused_with_what_reads_them(
 def test_a_seal_that_does_not_fit_is_damage(run: Path) -> None:
     text = (run / "run.json").read_text()
     (run / "run.json").write_text(text.replace('"compiles": ', '"compiles":  '))
-    assert open_run(run).about["codes"]  # as JSON it is the same
+    assert open_run(run).manifest["codes"]  # as JSON it is the same
     (run / "run.json").write_text(text.replace('"date": "2', '"date": "3'))
     with pytest.raises(ConfigError, match="changed after benchnav wrote it"):
         open_run(run)
@@ -74,7 +74,7 @@ def test_a_table_or_a_seal_that_was_changed_or_taken_away_is_damage(run: Path) -
     pd.read_parquet(run / EPISODES).iloc[:-1].to_parquet(run / EPISODES)
     with pytest.raises(ConfigError, match="changed after benchnav wrote it"):
         read_table(run, EPISODES)
-    about = open_run(run).about
+    about = open_run(run).manifest
     (run / "run.json").write_text(
         json.dumps(
             {name: value for name, value in about.items() if name != "manifest_digest"}

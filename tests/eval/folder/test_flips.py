@@ -53,7 +53,7 @@ def run(suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def everything(folder: Path) -> Iterator[Any]:
     """All that is read of a run."""
     known = open_run(folder)
-    yield known.about
+    yield known.manifest
     yield read_table(folder, EPISODES)
     yield read_steps(folder)
     for unit in units(known.conditions):
@@ -61,7 +61,7 @@ def everything(folder: Path) -> Iterator[Any]:
         if finished is None or finished.damage():
             raise ConfigError("a unit is damaged")
         yield unit_rows(finished)
-        yield dict(finished.about)
+        yield dict(finished.metadata)
     for path in sorted((folder / "playback").glob("*.npz")):
         recording = Recording.load(path)
         yield recording.states, recording.predicted, recording.about

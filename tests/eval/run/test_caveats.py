@@ -62,12 +62,12 @@ def test_a_pair_that_cannot_be_steered_is_left_out_and_named_everywhere(
         ("Faulty", "bicycle"),
         ("Steering", "unicycle"),
     }
-    (dropped,) = run.about["dropped"]
+    (dropped,) = run.manifest["dropped"]
     assert (dropped["planner"], dropped["robot"]) == ("Steering", "bicycle")
     assert dropped["reason"].startswith(
         "Expected a robot with actions (speed_mps, turn_rate_radps)"
     )
-    assert run.about["warnings"].count(WARNING.removeprefix("warning: ")) == 1
+    assert run.manifest["warnings"].count(WARNING.removeprefix("warning: ")) == 1
     report = write_report(folder)
     print_report(report)
     printed = capsys.readouterr().out
@@ -95,13 +95,13 @@ def test_a_pair_that_cannot_be_steered_is_left_out_and_named_everywhere(
     assert not any(line.startswith(LINE) for line in shown.notes)
     # A run that is extended, and one that is repeated, still say it.
     list(run_suite(suite_on(dataset_path, robots=("unicycle",), seed=1), folder))
-    assert open_run(folder).about["dropped"] == [dropped]
+    assert open_run(folder).manifest["dropped"] == [dropped]
     next(steps := rerun(folder, tmp_path / "again"))
     steps.close()
-    again = open_run(tmp_path / "again").about
+    again = open_run(tmp_path / "again").manifest
     assert (again["dropped"], again["warnings"]) == (
         [dropped],
-        open_run(folder).about["warnings"],
+        open_run(folder).manifest["warnings"],
     )
 
 
@@ -137,9 +137,9 @@ def test_a_merged_run_says_what_its_shards_said(
     for index, part in enumerate(parts, start=1):
         list(run_suite(suite_on(dataset_path), part, shard=Shard(index=index, of=2)))
     list(merge_shards(parts, tmp_path / "all"))
-    about = open_run(tmp_path / "all").about
-    assert about["dropped"] == open_run(parts[0]).about["dropped"]
-    assert about["warnings"] == open_run(parts[1]).about["warnings"]
+    about = open_run(tmp_path / "all").manifest
+    assert about["dropped"] == open_run(parts[0]).manifest["dropped"]
+    assert about["warnings"] == open_run(parts[1]).manifest["warnings"]
     assert json.dumps(about["history"]).count(str(dataset_path)) == len(
         about["history"]
     )
@@ -153,7 +153,7 @@ def test_a_merged_run_says_what_its_shards_said(
         ({"planner": "near_optimal"}, "planner 'near_optimal', which is given λ itself, got 'oracle'"),
         ({"planner": "optimal", "robots": ("bicycle",)}, "Expected robot Unicycle for planner 'optimal', got Bicycle"),
         ({"planner": HAZARD, "world": "paper"}, "immobilises robots for `hazard`"),
-        ({"planner": FREE, "models": ("clairvoyant",), "world": "paper"}, "λ that stays for the model 'clairvoyant'"),
+        ({"planner": FREE, "models": ("clairvoyant",), "world": "paper"}, "constant λ for the model 'clairvoyant'"),
         ({"planner": FREE, "risks": ("single-class",), "models": (TWO_MODES,)}, "has no `class_names`"),
     ],
 )  # fmt: skip
@@ -235,13 +235,13 @@ def test_what_is_left_out_is_told_before_anything_is_run_and_until_it_can_be_run
     assert line.startswith(
         "left out: model TwoModes, risk single-class: Expected a model that predicts classes"
     )
-    assert line in caveats(open_run(tmp_path / "run").about)
+    assert line in caveats(open_run(tmp_path / "run").manifest)
     # The class has learnt its classes.
     monkeypatch.setattr(TwoModes, "class_names", ("firm", "soft"))
     checked = check_suite(suite, elsewhere=False)
     work = Work(**vars(checked), suite={}, record="none", settings=Settings())
     begin(work, tmp_path / "run", said.append)
-    assert open_run(tmp_path / "run").about["dropped"] == []
+    assert open_run(tmp_path / "run").manifest["dropped"] == []
 
 
 def test_a_planner_whose_settings_are_never_prepared_is_refused(
@@ -280,7 +280,9 @@ def test_a_hypothesis_on_what_is_left_out_is_refused(
         risks=("mean", "single-class"), hypotheses=({"one": one, "other": other, "metric": "success"},),
     )  # fmt: skip
     if words:
-        with pytest.raises(ConfigError, match=f"names one that cannot: .*{words}"):
+        with pytest.raises(
+            ConfigError, match=f"names one that cannot be run: .*{words}"
+        ):
             check_suite(suite, elsewhere=False)
     else:
         assert len(check_suite(suite, elsewhere=False).hypotheses["tests"]) == 1

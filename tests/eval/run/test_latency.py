@@ -38,7 +38,8 @@ def suite_on(dataset: Path, *planners: Any, **changes: Any) -> Suite:
 
 def latencies(folder: Path) -> list[Any]:
     return [
-        entry.get("latency") for entry in open_run(folder).about["conditions"].values()
+        entry.get("latency")
+        for entry in open_run(folder).manifest["conditions"].values()
     ]
 
 

@@ -405,7 +405,7 @@ def test_an_own_sensor_and_an_own_belief_from_a_file_run_in_two_processes(
     assert set(drove["belief"]) == {"Remembers"}
     assert (drove["sensed_cells"] > 10).all()
     assert (drove["revisions"] > 1).all()
-    parts = open_run(tmp_path / "one").about["codes"].values()
+    parts = open_run(tmp_path / "one").manifest["codes"].values()
     names = {name.rpartition(":")[2] for code in parts for name in code["parts"]}
     assert {"Feeler", "Remembers", "Eye", "statistics of the ground"} <= names
 
@@ -549,7 +549,7 @@ def test_the_time_of_a_planner_alone_is_measured_by_what_it_knows(
     _, folder = finished
     entries = [
         e
-        for e in open_run(folder).about["conditions"].values()
+        for e in open_run(folder).manifest["conditions"].values()
         if e["labels"]["planner"] == "astar_dwa"
     ]
     assert len(entries) == 4

@@ -127,13 +127,13 @@ def test_planning_times_of_several_machines_are_warned_of(
     parts: list[Path], tmp_path: Path
 ) -> None:
     runs = [open_run(part) for part in parts]
-    assert merge._about(runs)["warnings"] == runs[0].about["warnings"]
-    other = {**runs[0].about["machine"], "processor": "Abacus", "host": "elsewhere"}
-    write_run(parts[1], {**runs[1].about, "machine": other})
+    assert merge._about(runs)["warnings"] == runs[0].manifest["warnings"]
+    other = {**runs[0].manifest["machine"], "processor": "Abacus", "host": "elsewhere"}
+    write_run(parts[1], {**runs[1].manifest, "machine": other})
     list(merge_shards(parts, tmp_path / "all"))
     (line,) = [
         line
-        for line in caveats(open_run(tmp_path / "all").about)
+        for line in caveats(open_run(tmp_path / "all").manifest)
         if "planning times" in line
     ]
     assert line.startswith("warning: the shards ran on 2 machines (")
@@ -339,7 +339,7 @@ def test_a_merge_that_is_killed_leaves_nothing_and_can_be_given_again(
 
 def test_a_folder_that_is_there_is_not_merged_into(parts: list[Path]) -> None:
     before = sorted(parts[0].rglob("*"))
-    with pytest.raises(ConfigError, match="new folder first"):
+    with pytest.raises(ConfigError, match="the new folder as OUT"):
         list(merge_shards(parts[1:], parts[0]))
     assert sorted(parts[0].rglob("*")) == before
 
@@ -368,7 +368,7 @@ def test_the_commands(  # type: ignore[no-untyped-def]
     assert status == 0
     assert "Faulty" in printed
     assert (Path(out[2]) / "summary.md").exists()
-    commands = open_run(Path(out[2])).about["history"]
+    commands = open_run(Path(out[2])).manifest["history"]
     assert [entry["command"].split()[1] for entry in commands] == [
         "run",
         "run",

@@ -84,7 +84,7 @@ def test_the_time_limit_of_planners_is_repeated(suite: Suite, tmp_path: Path) ->
     write_run(run, {**about, "planner_limit_s": 77.0})
     next(steps := rerun(run, tmp_path / "again"))
     steps.close()
-    assert open_run(tmp_path / "again").about["planner_limit_s"] == 77.0
+    assert open_run(tmp_path / "again").manifest["planner_limit_s"] == 77.0
 
 
 def test_the_device_is_repeated_and_refused_where_it_is_not(
@@ -102,7 +102,7 @@ def test_the_device_is_repeated_and_refused_where_it_is_not(
     told: list[str] = []
     next(steps := rerun(run, tmp_path / "again", say=told.append))
     steps.close()
-    assert open_run(tmp_path / "again").about["device"] == "cuda"
+    assert open_run(tmp_path / "again").manifest["device"] == "cuda"
     assert "running on a GPU" in told
 
 
@@ -250,7 +250,7 @@ def test_all_that_is_no_longer_there_is_told_before_anything_is_run(
     (tmp_path / "tiny.h5").unlink()
     with pytest.raises(
         ConfigError,
-        match=r"that .*run was made with, got a lack: .*dataset.*tiny\.h5.*mine\.py",
+        match=r"all inputs of .*run, got missing ones: .*dataset.*tiny\.h5.*mine\.py",
     ):
         repeat(run, tmp_path / "again")
     assert not (tmp_path / "again").exists()

@@ -353,7 +353,7 @@ def test_a_run_is_extended_by_another_dataset(
         str(dataset_path): 2,
         str(other): 2,
     }
-    assert len(open_run(tmp_path / "run").about["datasets"]) == 2
+    assert len(open_run(tmp_path / "run").manifest["datasets"]) == 2
 
 
 def test_an_extension_under_a_label_that_is_taken_is_refused(
@@ -536,8 +536,8 @@ def test_every_unit_is_run_on_the_device_that_is_asked_for(
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "a GPU")
     finish(suite, tmp_path / "cuda", settings=Settings.on("auto"))
     assert set(given) == {"cuda"}
-    assert open_run(tmp_path / "cuda").about["device"] == "cuda"
-    assert open_run(tmp_path / "cuda").about["gpu"] == "a GPU"
+    assert open_run(tmp_path / "cuda").manifest["device"] == "cuda"
+    assert open_run(tmp_path / "cuda").manifest["gpu"] == "a GPU"
     given.clear()
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "another")
     assert (
@@ -547,7 +547,7 @@ def test_every_unit_is_run_on_the_device_that_is_asked_for(
     given.clear()
     finish(suite, tmp_path / "cpu", settings=Settings.on("cpu"))
     assert set(given) == {"cpu"}
-    assert open_run(tmp_path / "cpu").about["gpu"] is None
+    assert open_run(tmp_path / "cpu").manifest["gpu"] is None
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ConfigError, match="GPU"):
         finish(suite, tmp_path / "none", settings=Settings.on("cuda"))
@@ -618,9 +618,9 @@ def test_units_of_other_code_are_taken_when_asked_for_and_marked(
     assert not any("not used" in line for line in said)
     codes = dict(zip(rows["seed"], rows["code"], strict=True))
     assert codes[0] == first["code"].iloc[0] != codes[5]
-    about = open_run(folder).about
+    about = open_run(folder).manifest
     assert set(about["codes"]) == set(codes.values())
-    line = f"1 of 2 units were made by other code (planner {mine}:Mine); column `code` tells which rows"
+    line = f"1 of 2 units were made by other code (planner {mine}:Mine); column `code` indicates which rows"
     assert about["reused"] == line
     report = write_report(folder)
     assert f"warning: {line}" in report.warnings
@@ -630,7 +630,7 @@ def test_units_of_other_code_are_taken_when_asked_for_and_marked(
         compare_runs([folder], "risk", "", {}, 0.05)
     # Without it the unit is run anew, and nothing is marked.
     finish(replace(suite, seeds=(0, 5)), folder)
-    assert open_run(folder).about["reused"] == ""
+    assert open_run(folder).manifest["reused"] == ""
     assert len(set(read_table(folder, "episodes.parquet")["code"])) == 1
     # Where a unit is there of this code too, that one is taken, though other code's is
     # newer.
@@ -822,7 +822,7 @@ def test_what_a_user_should_know_is_said(dataset_path: Path, tmp_path: Path) -> 
     data = factories.tiny_dataset(tmp_path / "four.h5", other)
     finish(replace(suite, data=str(data)), tmp_path / "run", say=said.append)
     assert any(
-        "ground above 0.3" in line and "free ground is above 0.1" in line
+        "with λ above 0.3" in line and "free cells have λ above 0.1" in line
         for line in said
     )
     assert any("class" in line and "paper-v1" in line for line in said)
@@ -958,7 +958,7 @@ def test_hypotheses_are_fixed_before_the_first_unit_and_stay(
     suite = quick(dataset_path, scenarios=("std",), hypotheses=(given,))
     folder, steps = tmp_path / "run", run_suite(suite, tmp_path / "run")
     next(steps)
-    about = open_run(folder).about
+    about = open_run(folder).manifest
     fixed = about["hypotheses"]
     assert not list(folder.glob("units/*/*"))
     (test,) = fixed["tests"]
@@ -972,7 +972,7 @@ def test_hypotheses_are_fixed_before_the_first_unit_and_stay(
     list(steps)
     # without them the run goes on
     finish(quick(dataset_path, scenarios=("std",), seed=5), folder)
-    assert open_run(folder).about["hypotheses"] == fixed
+    assert open_run(folder).manifest["hypotheses"] == fixed
     report = write_report(folder)
     assert report.tests["n_episodes"].tolist() == [4]
     assert (
@@ -985,7 +985,7 @@ def test_hypotheses_are_fixed_before_the_first_unit_and_stay(
     finish(quick(dataset_path, scenarios=("std",)), tmp_path / "plain")
     with pytest.raises(ConfigError, match="digest none"):
         finish(suite, tmp_path / "plain")
-    assert "hypotheses" not in open_run(tmp_path / "plain").about
+    assert "hypotheses" not in open_run(tmp_path / "plain").manifest
     wrong = (given | {"one": {"planner": "Fulty"}},)
     with pytest.raises(ConfigError, match="Did you mean 'Faulty'"):
         finish(replace(suite, hypotheses=wrong), tmp_path / "wrong")

@@ -161,7 +161,8 @@ def test_what_a_part_reads_is_recorded_and_a_change_runs_its_unit_again(
     assert not {"package benchnav", "package h5py", "package gymnasium"} & set(touched)
     assert changes_since(touched) == []
     assert touched in [
-        code["touched"] for code in open_run(own.parent / "run").about["codes"].values()
+        code["touched"]
+        for code in open_run(own.parent / "run").manifest["codes"].values()
     ]
     assert run(own, dataset_path, "run") == ["2 of 2 units were there already"]
 
@@ -170,7 +171,7 @@ def test_what_a_part_reads_is_recorded_and_a_change_runs_its_unit_again(
     assert run(own, dataset_path, "run", reuse_code=True) == [
         "2 of 2 units were there already"
     ]
-    reused = open_run(own.parent / "run").about["reused"]
+    reused = open_run(own.parent / "run").manifest["reused"]
     assert reused.startswith("1 of 2 units were made by other code (variable OWN_GAIN)")
     (own / "speed.json").write_text("0.4")
     (own / "helper.py").write_text("FACTOR = 0.9")
