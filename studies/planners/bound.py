@@ -94,12 +94,12 @@ def gap(work: Work, folder: Path, maps: int = 50) -> dict[str, Rows]:
         least = lower_bound_s(*given)
         seconds += time.process_time() - begun
         with without(
-            excess=lambda mesh, value: 1.0, _CHECK_EVERY=lower_bound._MOST_STEPS
+            excess=lambda mesh, value: 1.0, _CHECK_EVERY=lower_bound._MAX_STEPS
         ):
             converged = lower_bound_s(*given)
         with without(_reached=no_reach):
             reads = lower_bound_s(*given)
-        with without(_reached=no_reach, _deepest_m=lambda motion, immobile: -1.0):
+        with without(_reached=no_reach, _max_depth_m=lambda motion, immobile: -1.0):
             dry = lower_bound_s(*given)
         whole = times_s[number]
         steps = (
