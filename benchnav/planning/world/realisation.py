@@ -165,8 +165,7 @@ def check_known(terrain: Terrain, world: World) -> None:
     if world.noise == "stored" and bool(terrain.traversability.isnan().any()):
         raise ConfigError(
             "Expected maps with λ in each cell for `noise` 'stored', got some cells "
-            "whose λ is missing. "
-            "Use `noise` 'resampled'."
+            "that were not observed. Use `noise` 'resampled'."
         )
 
 
@@ -197,8 +196,7 @@ def draw_frozen(
     expect(
         world.correlation_m <= max_m,
         f"`world.correlation_m` of at most {max_m:g} m, a quarter of the maps' "
-        "shorter side, got "
-        f"{world.correlation_m:g} m.",
+        f"shorter side, got {world.correlation_m:g} m.",
     )
     field = torch.zeros_like(terrain.traversability)
     attempts = torch.zeros(len(terrain), dtype=torch.int64, device=field.device)

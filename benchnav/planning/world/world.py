@@ -168,8 +168,7 @@ class World:
         if bool((steps > MAX_STEPS).any()):
             raise ConfigError(
                 f"Expected a time budget of at most {MAX_STEPS:,} time steps of "
-                f"{dt_s:g} s, got "
-                f"{float(budget_s.max()):g} s."
+                f"{dt_s:g} s, got {float(budget_s.max()):g} s."
             )
         return steps.long()
 

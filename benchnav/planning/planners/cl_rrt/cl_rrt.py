@@ -85,18 +85,20 @@ class CLRRTState(Batch):
 
     Args:
         problem: the problem.
-        route: route that is followed.
+        route: route that the robots follow.
         edge: index of the current edge of the path, int64, shape [B].
         tracking: state of the controller.
         progress_m: arc length along the reference of that edge in metres, shape [B].
-        failures: consecutive plans without a path to the goal, int64, shape [B].
-        mark_m: progress along the path at the last mark, shape [B].
-        mark_step: step of that mark, int64, shape [B].
-        ground: `Problem.padded_ground` on which the path was chosen, shape [B, N].
-        doubted: mask of paths that have become more expensive, and are to be compared
-            with new ones, bool, shape [B].
+        failures: number of consecutive plans without a path to the goal, int64, shape
+            [B].
+        mark_m: progress along the path in metres when the robot last had progress of
+            `_STALL_M`, shape [B].
+        mark_step: step at that progress, int64, shape [B].
+        ground: `Problem.padded_ground` when the path was chosen, shape [B, N].
+        doubted: mask of paths that have become more expensive and must be compared with
+            new ones, bool, shape [B].
         follower: the controller.
-        seed: root of the samples.
+        seed: seed of the samples.
         step: number of steps planned so far.
     """
 
@@ -147,8 +149,7 @@ class CLRRT(Planner[CLRRTState]):
         if follower.wanted_mps < robot.top_speed_mps:
             remarks.append(
                 f"CL-RRT drives at {follower.wanted_mps:g} m/s at most; the robot's "
-                "top speed is "
-                f"{robot.top_speed_mps:g} m/s"
+                f"top speed is {robot.top_speed_mps:g} m/s"
             )
         timed_m = config.lookahead_s * follower.wanted_mps
         if follower.lookahead_m > max(config.lookahead_m, timed_m):
@@ -171,8 +172,7 @@ class CLRRT(Planner[CLRRTState]):
         expect(
             config.turning_radius_m >= follower.tightest_m,
             f"`turning_radius_m` ≥ {follower.tightest_m:g}, the radius of the robot's "
-            "tightest turn, for CL-RRT, got "
-            f"{config.turning_radius_m}.",
+            f"tightest turn, for CL-RRT, got {config.turning_radius_m}.",
         )
         zero_m = torch.zeros_like(problem.start[:, 0])
         zero = torch.zeros_like(zero_m, dtype=torch.int64)
@@ -275,7 +275,7 @@ class CLRRT(Planner[CLRRTState]):
         return points, torch.where(index >= nearest, length_m, 0)
 
     def _cost(self, now: CLRRTState, ground: Tensor, length_m: Tensor) -> Tensor:
-        """Return costs of path segments in seconds, as of a tree's edges, shape [B].
+        """Return costs of paths in seconds, by the rule for edges of a tree, shape [B].
 
         Args:
             now: plan state with the robot and its follower.

@@ -154,9 +154,8 @@ class PathFollower:
             has_actions and high[0] > 0 and low[1] < 0 < high[1],
             f"a robot with actions ({SPEED}, {TURN_RATE}), the first up to more than "
             "0 and the second to both sides, "
-            f"got ({', '.join(names)}) from {tuple(low)} to {tuple(high)}. Use a "
-            "planner that samples actions, such "
-            "as mppi.",
+            f"got ({', '.join(names)}) from {tuple(low)} to {tuple(high)}. "
+            "Use a planner that samples actions, such as mppi.",
         )
         self.config = config
         self.dt_s = robot.dt_s

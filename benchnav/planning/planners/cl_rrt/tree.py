@@ -102,8 +102,9 @@ class Route(Batch):
         rows: references of the edges, as rows of `Reference`, shape [B, D, N, 4].
         end_m: arc length in metres at which each reference is left for the next, shape
             [B, D].
-        path: predicted positions, NaN where unused, shape [B, D·P, 2].
-        tree: predicted positions along all edges, NaN where unused, shape [B, E, P, 2].
+        path: predicted positions (x, y), unused ones NaN, shape [B, D·P, 2].
+        tree: predicted positions (x, y) along all edges, unused ones NaN, shape
+            [B, E, P, 2].
     """
 
     status: Tensor

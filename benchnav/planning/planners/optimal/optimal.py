@@ -248,7 +248,7 @@ class Optimal(Planner[OptimalState]):
         if immobile is None:
             raise ConfigError(
                 "Expected a world that immobilises robots for `hazard` of "
-                f"{self.name!r}, got none."
+                f"{self.name!r}, got one that does not."
             )
         below = immobile.below
         distribution = problem.distribution
