@@ -115,12 +115,12 @@ class MPPI(LocalPlanner[MPPIState]):
         self.config = config or MPPIConfig()
         rollouts = self.config.samples * self._fields
         minimum = self.worth_compiling
-        batched = OF_EPISODES
-        self._advance = Fused(advance_chunk, rollouts, minimum, batched)
-        batched = ENTRAPPED_OF_EPISODES
-        self._advance_entrapped = Fused(advance_entrapped, rollouts, minimum, batched)
-        batched = (*OF_EPISODES, 12, 13)  # 12 and 13 are `going` and `to_go`
-        self._weigh = Fused(weigh, rollouts, minimum, batched)
+        self._advance = Fused(advance_chunk, rollouts, minimum, OF_EPISODES)
+        self._advance_entrapped = Fused(
+            advance_entrapped, rollouts, minimum, ENTRAPPED_OF_EPISODES
+        )
+        of_weigh = (*OF_EPISODES, 12, 13)  # 12 and 13 are `going` and `to_go`
+        self._weigh = Fused(weigh, rollouts, minimum, of_weigh)
 
     @property
     def seeks_goal(self) -> bool:

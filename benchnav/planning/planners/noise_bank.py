@@ -104,10 +104,10 @@ def draw_bank(seed: int, horizon: int, samples: int, scale: Tensor) -> NoiseBank
     device = scale.device
     n_actions = len(scale)
     n_draws = _RUNS * samples
-    shape = n_actions, horizon, n_draws
-    values = torch.randn(shape, generator=generator, dtype=scale.dtype).to(device)
+    bank_shape = n_actions, horizon, n_draws
+    values = torch.randn(bank_shape, generator=generator, dtype=scale.dtype).to(device)
     n_offsets = n_draws - samples + 1
-    shape = horizon, n_actions
-    offset = torch.randint(n_offsets, shape, generator=generator).to(device)
-    stride = torch.randint(n_offsets, shape, generator=generator).to(device)
+    run_shape = horizon, n_actions
+    offset = torch.randint(n_offsets, run_shape, generator=generator).to(device)
+    stride = torch.randint(n_offsets, run_shape, generator=generator).to(device)
     return NoiseBank(scale, values * scale[:, None, None], offset, stride, samples)

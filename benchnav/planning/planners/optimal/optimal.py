@@ -270,8 +270,7 @@ class NearOptimal(Optimal):
     value iteration, by A*+DWA with its default settings, and by `straight`. The robot
     follows the drive that reaches the goal first. Hence it succeeds whenever A*+DWA or
     `straight` succeeds on the same problem, and at least as early. Planners that draw
-    samples are not included; only a measurement can show whether they are faster. A
-    robot that has left the drive is steered by value iteration.
+    samples may be faster. Value iteration steers a robot that has left the drive.
 
     Args:
         config: settings.
@@ -349,8 +348,10 @@ class NearOptimal(Optimal):
         """Return the costs of driving; see `Optimal`."""
         distribution = problem.distribution
         immobile = problem.immobile
-        is_mixture = isinstance(distribution, TraversabilityMixture)
-        if not (is_mixture and bool((distribution.stds == 0).all())):
+        is_certain = False
+        if isinstance(distribution, TraversabilityMixture):
+            is_certain = bool((distribution.stds == 0).all())
+        if not is_certain:
             raise ConfigError(
                 f"Expected model 'clairvoyant' for planner {self.name!r}, which is "
                 "given λ itself, got a prediction that is not certain."
