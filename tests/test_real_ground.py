@@ -74,9 +74,9 @@ def test_a_model_is_trained_and_measured_on_ground_that_is_labelled_in_part(
     )
     assert call("eval", "run", "--data", "real.h5", *suite, "--out", "run") == 2
     (line,) = capfd.readouterr().err.strip().splitlines()
-    assert "Expected maps with a class in every cell to drive on" in line
+    assert "Expected maps with a class in each cell for episodes" in line
     assert not (tmp_path / "run").exists()
-    with pytest.raises(ConfigError, match="a class in every cell"):
+    with pytest.raises(ConfigError, match="a class in each cell"):
         gymnasium.make(
             "benchnav/OffRoad-v0", data="real.h5", split="train", world="paper"
         )

@@ -1,5 +1,6 @@
-"""Planning under predicted traversability: problems, planners, robots, objectives, risk
-and worlds.
+"""Planning under predicted traversability.
+
+The package contains problems, planners, robots, objectives, risk measures and worlds.
 """
 
 from benchnav.core.public_names import face

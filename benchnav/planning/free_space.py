@@ -1,15 +1,12 @@
-"""Free space, one rule for all planners, and what immobilises a robot.
+"""Rules of free space and of immobilisation, the same for all planners.
 
-A cell is free if a map exceeds a threshold there, or if it is at the goal. A planner
-may cross non-free cells at a high finite penalty, so that all planners solve the same
-problem and a path exists where no free path is predicted. A planner with a horizon,
-such as MPPI, may still wait in front of such cells. Motion and path costs use a λ̂ of at
-least `min_traversability`, so that a robot on terrain that is predicted to immobilise
-it can plan its way out. This goes beyond the paper, whose equation 2e forbids non-free
-cells.
-costs are given is at least `min_traversability`, so that a robot on ground predicted to
-immobilise it can plan its way out. Beyond the paper, whose equation 2e forbids such
-ground.
+A cell is free if the value of a map there exceeds a threshold, or if it is at the goal.
+A planner may cross non-free cells at a high finite penalty, so that all planners solve
+the same problem, and a path exists even if no free path is predicted. A planner with a
+horizon, such as MPPI, may still wait in front of such cells. Motion and path costs use a
+λ̂ of at least `min_traversability`, so that a robot can plan a path out of terrain that
+is predicted to immobilise it. This goes beyond the paper, whose equation 2e forbids
+non-free cells.
 """
 
 from dataclasses import asdict, dataclass
@@ -34,8 +31,9 @@ class FreeSpace:
     """Rule for free cells.
 
     Args:
-        by: `risk`, the map λ̂ of the risk setting, or `mean`, E[λ] of the prediction.
-        above: threshold that the map exceeds in free cells; the paper's λ_stuck.
+        by: map that decides: `risk`, λ̂ of the risk setting, or `mean`, E[λ] of the
+            prediction.
+        above: threshold that the map exceeds in free cells; λ_stuck in the paper.
     """
 
     by: str = "risk"
@@ -64,17 +62,16 @@ class FreeSpace:
 
 @dataclass(frozen=True, kw_only=True)
 class Rules:
-    """The rules of a task that are neither robot nor objective; the defaults are the
-    paper's.
+    """Rules of a task, besides its robot and objective; the defaults are the paper's.
 
     Args:
         free_space: rule for free cells.
         min_traversability: minimum λ̂ of motion and path costs.
         goal_radius_m: distance to the goal in metres below which a robot has reached it.
-        unseen: λ that is assumed for unobserved terrain: `prior`, that of all training
-            maps; `optimistic`, 1; `pessimistic`, the mean of the worst fifth of the
-            prior, which never closes a cell.
-        replan_every_s: time between two updates of a robot's knowledge, in seconds.
+        unseen: assumption about λ of unobserved terrain: `prior`, the distribution over
+            all training maps; `optimistic`, 1; `pessimistic`, the mean of the worst
+            fifth of the prior, although such cells stay free.
+        replan_every_s: time between two updates of a robot's belief, in seconds.
     """
 
     free_space: FreeSpace = FreeSpace()
@@ -127,14 +124,11 @@ class Rules:
 
         Settings of later versions are omitted at their defaults.
         """
-        later = {
-            name: value
-            for name, value in _LATER.items()
-            if getattr(self, name) == value
-        }
-        return {
-            name: value for name, value in asdict(self).items() if name not in later
-        }
+        rules = asdict(self)
+        for name, default in _LATER.items():
+            if rules[name] == default:
+                del rules[name]
+        return rules
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,8 +137,8 @@ class Immobile:
 
     Args:
         below: observed λ below which terrain immobilises a robot.
-        for_s: consecutive time on such terrain after which an episode ends, in seconds,
-            whatever was commanded.
+        for_s: consecutive time in seconds on such terrain after which an episode ends,
+            whatever the commands.
     """
 
     below: float = 0.1
@@ -165,6 +159,7 @@ def cells_at_goal(grid: Grid, goal_m: Tensor, radius_m: float) -> Tensor:
     columns = torch.arange(grid.width, device=goal_m.device)
     x, y = grid.centre_of(rows, columns)
     half = grid.resolution_m / 2
-    beside_x = ((x - goal_m[:, :1]).abs() - half).clamp(min=0)
-    beside_y = ((y - goal_m[:, 1:]).abs() - half).clamp(min=0)
-    return torch.hypot(beside_x[:, None, :], beside_y[:, :, None]) < radius_m
+    gap_x = ((x - goal_m[:, :1]).abs() - half).clamp(min=0)
+    gap_y = ((y - goal_m[:, 1:]).abs() - half).clamp(min=0)
+    distance_m = torch.hypot(gap_x[:, None, :], gap_y[:, :, None])
+    return distance_m < radius_m

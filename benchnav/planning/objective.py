@@ -1,13 +1,13 @@
 """Objectives J: what a planner minimises.
 
 An objective is an `Objective`, with `stage` and `terminal`. With `path_cost` it also
-defines the cost of a metre of path, which planners that search paths minimise. `target`
-is the goal, or a local planner's waypoint. λ̂ is read at the state before the move, as
-the risk setting returns it: `min_traversability` does not bound it. In the Gymnasium
-environment J receives the observed λ. J does not include the penalty of non-free cells:
-the `Problem` adds it. An objective whose constructor has a parameter `robot` or
-`goal_radius_m` receives that of the task. Source: paper III-C and IV-A. Letters in
-shapes: *B any leading dimensions, S state and A action dimensions.
+defines the cost per metre of path, which planners that search paths minimise. `target`
+is the goal, or a local planner's waypoint. J receives λ̂ at the state before the motion,
+as the risk setting returns it, without the bound `min_traversability`. In the Gymnasium
+environment J receives the observed λ. J does not include the penalty of non-free cells,
+which the `Problem` adds. If the constructor of an objective has a parameter `robot` or
+`goal_radius_m`, it receives the value of the task. Source: paper III-C and IV-A. Letters
+in shapes: *B any leading dimensions, S state and A action dimensions.
 """
 
 from abc import ABC, abstractmethod
@@ -38,8 +38,8 @@ class Objective(Specified, ABC):
         Args:
             state: states that begin with (x, y, θ), shape [*B, S].
             action: actions, shape [*B, A].
-            traversability: λ̂ at the state, in [0, 1] and not clamped, 0 off the map,
-                shape [*B].
+            traversability: λ̂ at the state, in [0, 1] without a lower bound, 0 off the
+                map, shape [*B].
             target: target (x, y) in metres, shape [*B, 2].
 
         Returns:
@@ -53,7 +53,7 @@ class Objective(Specified, ABC):
     def path_cost(self, traversability: Tensor, grade: Tensor) -> Tensor:
         """Return the cost of a horizontal metre of path; by default its length in 3D.
 
-        The cost of a path is the sum over its pieces.
+        The cost of a path is the sum over its segments.
 
         Args:
             traversability: λ̂ of motion, shape [*B].
@@ -85,7 +85,7 @@ class GoalDistance(Objective):
 
 @dataclass(frozen=True)
 class TravelTime(Objective):
-    """Time to the target in seconds: that of steps before it, and the rest at top speed.
+    """Time to the target in seconds: steps before it, then the distance at top speed.
 
     Args:
         robot: robot with its time step and top speed.
@@ -105,8 +105,9 @@ class TravelTime(Objective):
         self, state: Tensor, action: Tensor, traversability: Tensor, target: Tensor
     ) -> Tensor:
         """Return the cost of a step; see `Objective`."""
-        away = distance(state, target)
-        return self.robot.dt_s * (away > self.goal_radius_m).to(away.dtype)
+        distance_m = distance(state, target)
+        is_away = distance_m > self.goal_radius_m
+        return self.robot.dt_s * is_away.to(distance_m.dtype)
 
     def terminal(self, state: Tensor, traversability: Tensor, target: Tensor) -> Tensor:
         """Return the terminal cost; see `Objective`."""
@@ -116,7 +117,7 @@ class TravelTime(Objective):
     def path_cost(self, traversability: Tensor, grade: Tensor) -> Tensor:
         """Return seconds at top speed under λ̂; see `Objective`.
 
-        Grade costs nothing: robots drive in the plane.
+        The grade does not affect it, since robots drive in the plane.
         """
         return 1 / (traversability * self.robot.top_speed_mps)
 
@@ -124,13 +125,14 @@ class TravelTime(Objective):
 def toward_waypoints(objective: Objective) -> Objective:
     """Return J of a local planner, in which a waypoint has a small radius.
 
-    Within the goal's radius a waypoint would not attract a robot, as in narrow
-    passages. A dataclass with a field `goal_radius_m` is copied with the smaller
-    radius; other objectives are used as they are.
+    A waypoint would not attract a robot within the goal's radius, for example in a
+    narrow passage. A dataclass with a field `goal_radius_m` is copied with the smaller
+    radius; other objectives are returned unchanged.
     """
     if not is_dataclass(objective):
         return objective
-    if "goal_radius_m" not in {entry.name for entry in fields(objective)}:
+    names = {entry.name for entry in fields(objective)}
+    if "goal_radius_m" not in names:
         return objective
     radius: float = objective.goal_radius_m
     return replace(objective, goal_radius_m=min(radius, _WAYPOINT_M))
@@ -143,5 +145,6 @@ def has_path_cost(objective: Objective) -> bool:
 
 def distance(state: Tensor, target: Tensor) -> Tensor:
     """Return distances of states [*B, S] to positions [*B, 2], shape [*B]."""
-    offset_x, offset_y = state[..., 0] - target[..., 0], state[..., 1] - target[..., 1]
-    return torch.sqrt(offset_x * offset_x + offset_y * offset_y)
+    dx = state[..., 0] - target[..., 0]
+    dy = state[..., 1] - target[..., 1]
+    return torch.sqrt(dx * dx + dy * dy)

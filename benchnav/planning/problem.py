@@ -1,7 +1,8 @@
 """The navigation problem of a planner (paper, equation 2).
 
-It only contains predictions: the truth stays in the simulation. Letters in shapes: B
-episodes, H×W cells, S state and A action dimensions, *K any further dimensions.
+A problem contains only predictions; the truth stays in the simulation. Letters in
+shapes: B episodes, H×W cells, S state and A action dimensions, *K any further
+dimensions.
 """
 
 from dataclasses import dataclass, field, replace
@@ -40,9 +41,9 @@ class Task:
     """Task of a robot.
 
     Args:
-        robot: F with its action bounds and time step.
-        objective: J.
-        rules: free space, `min_traversability`, goal radius.
+        robot: robot with the motion F, its action bounds and its time step.
+        objective: objective J.
+        rules: free space, `min_traversability` and goal radius.
     """
 
     robot: Robot
@@ -64,8 +65,8 @@ class Problem(Batch):
         goal_m: goals (x, y) in metres, shape [B, 2].
         time_budget_s: T of each episode in seconds, shape [B].
         fields: source of correlated fields of λ; see `sample_fields`.
-        immobile: what immobilises robots in the world, which planners may plan for;
-            None for nothing.
+        immobile: the world's rule of immobilisation, which planners may consider; None
+            if nothing immobilises robots.
     """
 
     task: Task
@@ -81,13 +82,14 @@ class Problem(Batch):
 
     def __post_init__(self) -> None:
         """Check that all tensors are of one batch."""
-        batch = self.start.shape[0]
+        n_episodes = self.start.shape[0]
+        map_shape = n_episodes, *self.grid.shape
         expected = {
-            "distribution": (batch, *self.grid.shape),
-            "risk_map": (batch, *self.grid.shape),
-            "free": (batch, *self.grid.shape),
-            "goal_m": (batch, 2),
-            "time_budget_s": (batch,),
+            "distribution": map_shape,
+            "risk_map": map_shape,
+            "free": map_shape,
+            "goal_m": (n_episodes, 2),
+            "time_budget_s": (n_episodes,),
         }
         for name, shape in expected.items():
             value = getattr(self, name)
@@ -112,7 +114,7 @@ class Problem(Batch):
 
     @property
     def robot(self) -> Robot:
-        """Robot, F."""
+        """Robot with the motion F."""
         return self.task.robot
 
     @property
@@ -136,13 +138,13 @@ class Problem(Batch):
         """Draw correlated fields of λ from the belief.
 
         Args:
-            count: M.
-            key: a stream key, see `benchnav.core.rng`; another key draws other fields.
+            count: number of fields M.
+            key: stream key, see `benchnav.core.rng`; each key draws different fields.
             cells: mask of the requested cells, bool, shape [B, H, W], which may save
-                time; other cells are then undefined.
+                time; λ of other cells is then undefined. None for all cells.
 
         Returns:
-            λ in [0, 1], shape [B, M, H, W]; fields of an episode do not depend on the
+            λ in [0, 1], shape [B, M, H, W]; the fields of an episode do not depend on
             other episodes.
 
         Raises:
@@ -166,7 +168,7 @@ class Problem(Batch):
     def traversability(self) -> Tensor:
         """λ̂ of motion and path costs, at least `min_traversability`, shape [B, H, W].
 
-        J uses `risk_map` itself, so that a cost of low λ̂ is not lost.
+        J uses `risk_map` itself, so that it can penalise lower λ̂.
         """
         return self.risk_map.clamp(min=self.task.rules.min_traversability)
 
@@ -174,7 +176,7 @@ class Problem(Batch):
     def padded_ground(self) -> Tensor:
         """λ̂ and free mask in one padded map: λ̂ if free, −λ̂ if not, −0 off the map.
 
-        One lookup a step serves motion, J and the penalty of non-free cells;
+        Motion, J and the penalty of non-free cells thus need only one lookup per step;
         see `motion_traversability`, `stage_cost` and `free_at`.
         """
         return ground_map(self.grid, self.risk_map, self.free)
@@ -182,17 +184,15 @@ class Problem(Batch):
     @cached_property
     def action_bounds(self) -> tuple[Tensor, Tensor]:
         """Minimum and maximum actions, each of shape [A]."""
-        return (
-            self.start.new_tensor(self.robot.action_low),
-            self.start.new_tensor(self.robot.action_high),
-        )
+        low = self.start.new_tensor(self.robot.action_low)
+        high = self.start.new_tensor(self.robot.action_high)
+        return low, high
 
     @property
     def dynamics(self) -> "Dynamics":
-        """The inputs of a rollout other than its maps."""
-        return Dynamics(
-            self.grid, self.robot, self.objective, self.task.rules.min_traversability
-        )
+        """Inputs of a rollout, except its maps."""
+        min_traversability = self.task.rules.min_traversability
+        return Dynamics(self.grid, self.robot, self.objective, min_traversability)
 
     def ground_at(self, state: Tensor) -> Tensor:
         """Return `padded_ground` at states [B, *K, S], shape [B, *K]."""
@@ -200,9 +200,8 @@ class Problem(Batch):
 
     def traversability_at(self, state: Tensor) -> Tensor:
         """Return λ̂ of motion at states, 0 off the map; shapes as for `ground_at`."""
-        return motion_traversability(
-            self.ground_at(state), self.task.rules.min_traversability
-        )
+        min_traversability = self.task.rules.min_traversability
+        return motion_traversability(self.ground_at(state), min_traversability)
 
     def free_at(self, state: Tensor) -> Tensor:
         """Return a mask of states in free cells, bool; shapes as for `ground_at`."""
@@ -229,16 +228,17 @@ class Problem(Batch):
 
         Shapes as for `stage_cost`.
         """
-        return terminal_cost(self.objective, state, self.ground_at(state), target)
+        ground = self.ground_at(state)
+        return terminal_cost(self.objective, state, ground, target)
 
 
 class Dynamics(NamedTuple):
-    """Inputs of a rollout other than its maps, for compiled functions.
+    """Inputs of a rollout, except its maps, for compiled functions.
 
     Args:
         grid: size and resolution of the maps.
-        robot: F.
-        objective: J.
+        robot: robot with the motion F.
+        objective: objective J.
         min_traversability: minimum λ̂ of motion.
     """
 
@@ -264,7 +264,8 @@ def motion_traversability(ground: Tensor, min_traversability: float) -> Tensor:
     Returns:
         λ̂, shape of `ground`.
     """
-    return torch.where(ground == 0, 0, ground.abs().clamp(min=min_traversability))
+    traversability = ground.abs().clamp(min=min_traversability)
+    return torch.where(ground == 0, 0, traversability)
 
 
 def predicted_traversability(ground: Tensor) -> Tensor:
@@ -299,8 +300,8 @@ class Prediction:
         observation: the robots' observation.
         distribution: the predicted distribution of λ, shape [B, H, W].
         risk_map: λ̂ of the risk setting, shape [B, H, W].
-        free: free mask without the area at the goal, bool, shape [B, H, W]; None for
-            the one that the rules derive from λ̂.
+        free: free mask without the area at the goal, bool, shape [B, H, W]; None to
+            derive it by the rules of the task.
         fields: source of correlated fields of λ; None if no planner uses them.
     """
 
@@ -327,25 +328,27 @@ def pose_problem(
         start_m: starts (x, y) in metres, shape [B, 2].
         goal_m: goals (x, y) in metres, shape [B, 2].
         time_budget_s: T in seconds, a number or of shape [B].
-        immobile: what immobilises robots in the world; None for nothing.
+        immobile: the world's rule of immobilisation; None if nothing immobilises
+            robots.
     """
-    rules, free = task.rules, prediction.free
+    rules = task.rules
+    observation = prediction.observation
+    free = prediction.free
     if free is None:
         free = rules.free(prediction.risk_map, prediction.distribution)
-    at_goal = cells_at_goal(prediction.observation.grid, goal_m, rules.goal_radius_m)
+    at_goal = cells_at_goal(observation.grid, goal_m, rules.goal_radius_m)
+    pose = heading_to(start_m, goal_m)
+    device = goal_m.device
+    budget_s = torch.as_tensor(time_budget_s, dtype=torch.float64, device=device)
     return Problem(
         task=task,
-        observation=prediction.observation,
+        observation=observation,
         distribution=prediction.distribution,
         risk_map=prediction.risk_map,
         free=free | at_goal,
-        start=task.robot.initial_state(heading_to(start_m, goal_m)),
+        start=task.robot.initial_state(pose),
         goal_m=goal_m,
-        time_budget_s=torch.as_tensor(
-            time_budget_s, dtype=torch.float64, device=goal_m.device
-        )
-        .expand(len(goal_m))
-        .clone(),
+        time_budget_s=budget_s.expand(len(goal_m)).clone(),
         fields=prediction.fields,
         immobile=immobile,
     )

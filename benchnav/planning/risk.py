@@ -1,13 +1,12 @@
-"""Risk measures: from the distribution of traversability to the one map a planner is
-given.
+"""Risk measures: from the distribution of traversability to a map for planners.
 
 A measure maps a `TraversabilityDistribution` of shape [B, H, W] to λ̂ in [0, 1] of that
-shape. The shipped measures are values, such as `CVaR(0.8)`; a user's own may be any
-function of a distribution, whose further keyword parameters are its options. In suites
-and commands a setting is written `name` or `name:level`: `cvar:0.9`, `var:0.95`,
+shape. The shipped measures are values, such as `CVaR(0.8)`. A custom measure may be any
+function of a distribution; its other keyword parameters are its options. In suites and
+commands a setting is written `name` or `name:level`: `cvar:0.9`, `var:0.95`,
 `expected-time:0.05`, `mean`. Risk means the lower tail of λ; a higher level of CVaR or
-VaR is more cautious. The integrals are the distribution's own. Source: paper II and
-III-B; `ExpectedTime`, `TimeCVaR` and `Chance` go beyond it.
+VaR is more cautious. The distribution computes the integrals. Source: paper II and
+III-B; `ExpectedTime`, `TimeCVaR` and `Chance` go beyond the paper.
 """
 
 from abc import ABC, abstractmethod
@@ -24,14 +23,14 @@ RiskFunction = Callable[[TraversabilityDistribution], Tensor]
 
 
 class RiskMeasure(Specified, ABC):
-    """The base class of the shipped risk measures."""
+    """Base class of the shipped risk measures."""
 
     @abstractmethod
     def __call__(self, distribution: TraversabilityDistribution) -> Tensor:
         """Infer λ̂.
 
         Args:
-            distribution: of λ in each cell, shape [B, H, W].
+            distribution: distribution of λ in each cell, shape [B, H, W].
 
         Returns:
             λ̂ in [0, 1], shape [B, H, W].
@@ -40,7 +39,7 @@ class RiskMeasure(Specified, ABC):
 
 @dataclass(frozen=True)
 class Mean(RiskMeasure):
-    """E[λ], which considers no tail."""
+    """Mean E[λ], which does not consider a tail."""
 
     def __call__(self, distribution: TraversabilityDistribution) -> Tensor:
         """Infer λ̂; see `RiskMeasure`."""
@@ -79,11 +78,11 @@ class CVaR(RiskMeasure):
 
 @dataclass(frozen=True)
 class ExpectedTime(RiskMeasure):
-    """1 / E[1 / max(λ, floor)], by which a path's length gives its expected time.
+    """1 / E[1 / max(λ, floor)]: a path's length over it is the expected time.
 
-    A risk-neutral robot plans with it where the λ field stays the same during an
-    episode: unlike the mean it counts the time that is lost on slow terrain, and it
-    considers no tail. A lower floor makes immobilising terrain dearer.
+    It suits a risk-neutral robot if the λ field is constant during an episode. In
+    contrast to the mean, it includes the time that is lost on slow terrain; it does not
+    consider a tail. A lower floor makes immobilising terrain more expensive.
 
     Args:
         floor: minimum speed, as a fraction of the commanded one, in (0, 1].
@@ -93,18 +92,19 @@ class ExpectedTime(RiskMeasure):
 
     def __call__(self, distribution: TraversabilityDistribution) -> Tensor:
         """Infer λ̂; see `RiskMeasure`."""
-        return (1 / distribution.expected_time(self.floor)).clamp(self.floor, 1)
+        time = distribution.expected_time(self.floor)
+        return (1 / time).clamp(self.floor, 1)
 
 
 @dataclass(frozen=True)
 class TimeCVaR(RiskMeasure):
-    """1 / CVaR of the time 1 / max(λ, floor): a path's length over it is the path's
-    time on the worst terrain.
+    """1 / CVaR of the time 1 / max(λ, floor).
 
-    CVaR averages λ over its worst fraction; this averages the time over it.
+    A path's length over it is the path's time on the worst fraction of terrain. `CVaR`
+    averages λ over this fraction, and `TimeCVaR` averages the time.
 
     Args:
-        level: α in [0, 1); at 0 it is `ExpectedTime`.
+        level: α in [0, 1); 0 for `ExpectedTime`.
         floor: minimum speed, as a fraction of the commanded one, in (0, 1].
     """
 
@@ -113,7 +113,8 @@ class TimeCVaR(RiskMeasure):
 
     def __call__(self, distribution: TraversabilityDistribution) -> Tensor:
         """Infer λ̂; see `RiskMeasure`."""
-        return (1 / distribution.time_cvar(self.level, self.floor)).clamp(self.floor, 1)
+        time = distribution.time_cvar(self.level, self.floor)
+        return (1 / time).clamp(self.floor, 1)
 
 
 @dataclass(frozen=True)
@@ -152,7 +153,7 @@ def apply(measure: RiskFunction, distribution: TraversabilityDistribution) -> Te
 
     Args:
         measure: any risk measure.
-        distribution: of λ in each cell, shape [B, H, W].
+        distribution: distribution of λ in each cell, shape [B, H, W].
 
     Returns:
         λ̂ in [0, 1], shape [B, H, W].
@@ -161,22 +162,18 @@ def apply(measure: RiskFunction, distribution: TraversabilityDistribution) -> Te
         ConfigError: If the measure returns anything else.
     """
     risk_map = measure(distribution)
-    shape = distribution.shape
-    got = (
-        list(risk_map.shape)
-        if isinstance(risk_map, Tensor)
-        else type(risk_map).__name__
-    )
-    expect(
-        got == list(shape),
-        f"a risk measure to give λ̂ of shape {list(shape)}, got {got}.",
-    )
+    shape = list(distribution.shape)
+    got: object = type(risk_map).__name__
+    if isinstance(risk_map, Tensor):
+        got = list(risk_map.shape)
+    expect(got == shape, f"a risk measure to return λ̂ of shape {shape}, got {got}.")
     expect(
         risk_map.is_floating_point(),
-        f"a risk measure to give λ̂ as floating-point numbers, got {risk_map.dtype}.",
+        f"a risk measure to return λ̂ as floating-point numbers, got {risk_map.dtype}.",
     )
+    in_range = (risk_map >= 0) & (risk_map <= 1)
     expect(
-        ((risk_map >= 0) & (risk_map <= 1)).all(),
-        "a risk measure to give λ̂ in [0, 1], got values outside or NaN.",
+        in_range.all(),
+        "a risk measure to return λ̂ in [0, 1], got values outside or NaN.",
     )
     return risk_map.to(distribution.dtype)

@@ -4,11 +4,10 @@ A robot is a `Robot`, with the members listed there and
 
     F(state [*B, S], action [*B, A], traversability [*B]) -> state [*B, S]
 
-where a state begins with (x, y, θ) in metres and radians. The same F serves the
-planners, with predicted traversability, and the simulation, with the true one. Sources:
-paper II and IV-A; Rajamani (2012), "Vehicle dynamics and control", section 2.2
-(bicycle). Letters in shapes: *B any leading dimensions, S state and A action
-dimensions.
+where a state begins with (x, y, θ) in metres and radians. Planners use F with predicted
+traversability, and the simulation uses it with true traversability. Sources: paper II
+and IV-A; Rajamani (2012), "Vehicle dynamics and control", section 2.2 (bicycle).
+Letters in shapes: *B any leading dimensions, S state and A action dimensions.
 """
 
 import math
@@ -21,8 +20,10 @@ from torch import Tensor
 from benchnav.core.errors import expect
 from benchnav.core.specified import Specified
 
-# Names of actions, by which planners know their meaning.
-SPEED, TURN_RATE, STEERING = "speed_mps", "turn_rate_radps", "steering_rad"
+# Names of actions, which tell planners the meaning of each action.
+SPEED = "speed_mps"
+TURN_RATE = "turn_rate_radps"
+STEERING = "steering_rad"
 
 
 class Robot(Specified, ABC):
@@ -39,7 +40,7 @@ class Robot(Specified, ABC):
     @property
     @abstractmethod
     def action_names(self) -> tuple[str, ...]:
-        """Names of the A actions, with units, by which planners choose how to steer."""
+        """Names of the A actions, with units; they decide how planners steer."""
 
     @property
     @abstractmethod
@@ -75,15 +76,13 @@ class Robot(Specified, ABC):
             traversability: λ at the robots' positions, in [0, 1], shape [*B].
 
         Returns:
-            The next state, shape [*B, S]; no argument is changed.
+            The next state, shape [*B, S]; no argument is modified.
         """
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Vehicle(Robot):
-    """Common part of the shipped robots: a bounded speed, and a state that begins with
-    the pose.
-    """
+    """Common part of the shipped robots: a time step, and a speed within bounds."""
 
     dt_s: float = 0.1
     speed_mps: tuple[float, float] = (0.0, 1.0)
@@ -105,15 +104,14 @@ class _Vehicle(Robot):
 
 @dataclass(frozen=True, kw_only=True)
 class Unicycle(_Vehicle):
-    """The paper's unicycle: traversability scales both the linear and the angular
-    velocity.
+    """The paper's unicycle, whose traversability scales both velocities.
 
     State (x, y, θ), action (v, ω). Source: paper IV-A.
 
     Args:
-        dt_s: time step.
-        speed_mps: least and greatest linear velocity v.
-        turn_rate_radps: least and greatest angular velocity ω.
+        dt_s: time step in seconds.
+        speed_mps: minimum and maximum linear velocity v in m/s.
+        turn_rate_radps: minimum and maximum angular velocity ω in rad/s.
     """
 
     action_names = SPEED, TURN_RATE
@@ -136,25 +134,23 @@ class Unicycle(_Vehicle):
 
     def __call__(self, state: Tensor, action: Tensor, traversability: Tensor) -> Tensor:
         """Return the state after one time step; see `Robot`."""
-        return _stack(
-            _drive(state, action[..., 0], action[..., 1], traversability * self.dt_s)
-        )
+        scale = traversability * self.dt_s
+        return _stack(_drive(state, action[..., 0], action[..., 1], scale))
 
 
 @dataclass(frozen=True, kw_only=True)
 class DifferentialDrive(Unicycle):
-    """A differential drive: a unicycle whose velocities follow the command within
-    accelerations.
+    """A differential drive: a unicycle with limited accelerations.
 
-    State (x, y, θ, v, ω), action (v, ω) as commanded. The velocities in the state are
-    those of the wheels; traversability scales the motion over ground.
+    State (x, y, θ, v, ω), commanded action (v, ω). The velocities in the state are
+    those of the wheels; traversability scales the resulting motion.
 
     Args:
-        dt_s: time step.
-        speed_mps: least and greatest linear velocity v.
-        turn_rate_radps: least and greatest angular velocity ω.
-        acceleration_mps2: greatest change of v.
-        turn_acceleration_radps2: greatest change of ω.
+        dt_s: time step in seconds.
+        speed_mps: minimum and maximum linear velocity v in m/s.
+        turn_rate_radps: minimum and maximum angular velocity ω in rad/s.
+        acceleration_mps2: maximum change of v in m/s².
+        turn_acceleration_radps2: maximum change of ω in rad/s².
     """
 
     acceleration_mps2: float = 0.5
@@ -176,40 +172,33 @@ class DifferentialDrive(Unicycle):
 
     def initial_state(self, pose: Tensor) -> Tensor:
         """Return a standing state at the pose; see `Robot`."""
-        return torch.cat((pose, torch.zeros_like(pose[..., :2])), dim=-1)
+        no_velocity = torch.zeros_like(pose[..., :2])
+        return torch.cat((pose, no_velocity), dim=-1)
 
     def __call__(self, state: Tensor, action: Tensor, traversability: Tensor) -> Tensor:
         """Return the state after one time step; see `Robot`."""
-        reach, turn_reach = (
-            self.acceleration_mps2 * self.dt_s,
-            self.turn_acceleration_radps2 * self.dt_s,
-        )
-        speed = state[..., 3] + (action[..., 0] - state[..., 3]).clamp(-reach, reach)
-        turn_rate = state[..., 4] + (action[..., 1] - state[..., 4]).clamp(
-            -turn_reach, turn_reach
-        )
-        return _stack(
-            (
-                *_drive(state, speed, turn_rate, traversability * self.dt_s),
-                speed,
-                turn_rate,
-            )
-        )
+        limit = self.acceleration_mps2 * self.dt_s
+        turn_limit = self.turn_acceleration_radps2 * self.dt_s
+        change = action[..., 0] - state[..., 3]
+        turn_change = action[..., 1] - state[..., 4]
+        speed = state[..., 3] + change.clamp(-limit, limit)
+        turn_rate = state[..., 4] + turn_change.clamp(-turn_limit, turn_limit)
+        pose = _drive(state, speed, turn_rate, traversability * self.dt_s)
+        return _stack((*pose, speed, turn_rate))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Bicycle(_Vehicle):
     """A kinematic bicycle, referred to the rear axle: it turns only while it drives.
 
-    State (x, y, θ), action (v, δ) with θ' = v tan(δ) / wheelbase; traversability scales
-    v, and with it the
-    turn. Source: Rajamani (2012).
+    State (x, y, θ), action (v, δ) with θ' = v tan(δ) / wheelbase. Traversability scales
+    v, and hence also the turn rate. Source: Rajamani (2012).
 
     Args:
-        dt_s: time step.
-        speed_mps: least and greatest velocity v of the rear axle.
-        steering_rad: greatest steering angle δ, to both sides.
-        wheelbase_m: distance of the axles.
+        dt_s: time step in seconds.
+        speed_mps: minimum and maximum velocity v of the rear axle in m/s.
+        steering_rad: maximum steering angle δ to both sides in radians.
+        wheelbase_m: distance between the axles in metres.
     """
 
     action_names = SPEED, STEERING
@@ -237,23 +226,21 @@ class Bicycle(_Vehicle):
 
     def __call__(self, state: Tensor, action: Tensor, traversability: Tensor) -> Tensor:
         """Return the state after one time step; see `Robot`."""
-        turn_rate = action[..., 0] * action[..., 1].tan() / self.wheelbase_m
-        return _stack(
-            _drive(state, action[..., 0], turn_rate, traversability * self.dt_s)
-        )
+        speed = action[..., 0]
+        turn_rate = speed * action[..., 1].tan() / self.wheelbase_m
+        scale = traversability * self.dt_s
+        return _stack(_drive(state, speed, turn_rate, scale))
 
 
 def _drive(
     state: Tensor, speed: Tensor, turn_rate: Tensor, scale: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return (x, y, θ) after a step; `scale` is λ·dt."""
-    x, y, heading = state[..., 0], state[..., 1], state[..., 2]
-    moved = scale * speed
-    return (
-        x + moved * heading.cos(),
-        y + moved * heading.sin(),
-        heading + scale * turn_rate,
-    )
+    heading = state[..., 2]
+    step_m = scale * speed
+    x = state[..., 0] + step_m * heading.cos()
+    y = state[..., 1] + step_m * heading.sin()
+    return x, y, heading + scale * turn_rate
 
 
 def steps_in(time_s: float, dt_s: float) -> int:
@@ -262,17 +249,20 @@ def steps_in(time_s: float, dt_s: float) -> int:
 
 
 def component_wise(values: Tensor) -> Tensor:
-    """The same states or actions, shape [*B, S], laid out in memory as `Robot` returns
-    them, see `_stack`.
+    """Return states or actions [*B, S] in the memory layout that a `Robot` returns.
+
+    Each component is contiguous in memory; see `_stack`.
     """
     return values.movedim(-1, 0).contiguous().movedim(0, -1)
 
 
 def _stack(parts: tuple[Tensor, ...]) -> Tensor:
-    # Stacked outermost in memory, each component is contiguous: compiled rollouts are
-    # four times faster.
-    return torch.stack(torch.broadcast_tensors(*parts)).movedim(0, -1)
+    # The component dimension is outermost in memory, so that each component is
+    # contiguous: compiled rollouts are four times faster.
+    components = torch.broadcast_tensors(*parts)
+    return torch.stack(components).movedim(0, -1)
 
 
 def _check_bounds(name: str, bounds: tuple[float, float]) -> None:
-    expect(bounds[0] < bounds[1], f"`{name}` as (least, greatest), got {bounds}.")
+    low, high = bounds
+    expect(low < high, f"`{name}` as (minimum, maximum), got {bounds}.")

@@ -98,7 +98,7 @@ def gap(work: Work, folder: Path, maps: int = 50) -> dict[str, Rows]:
             converged_s = lower_bound_s(*arguments)
         with without(_reached=no_reach):
             without_reach_s = lower_bound_s(*arguments)
-        with without(_reached=no_reach, _deepest_m=lambda motion, immobile: -1.0):
+        with without(_reached=no_reach, _max_depth_m=lambda motion, immobile: -1.0):
             without_dips_s = lower_bound_s(*arguments)
         reference_s = times_s[index]
         steps = (

@@ -24,7 +24,7 @@ from benchnav.core import rng
 from benchnav.core.registry import make, read_part
 from benchnav.planning import Optimal, Problem
 from benchnav.planning.free_space import Immobile
-from benchnav.planning.planners.optimal.ways import ways_from
+from benchnav.planning.planners.optimal.primitives import primitives_from
 from studies.study import Rows, Work
 from studies.units import STAKES, build_unit, one_unit, stakes_suite
 
@@ -51,13 +51,13 @@ def cost_from_start(
     state = Optimal.init(planner, problem, rng.generator(0))  # value iteration only
     elapsed_s = time.perf_counter() - started
     cost = (
-        ways_from(problem.start, state.dwell_s, state)
+        primitives_from(problem.start, state.dwell_s, state)
         .cost.min(1)
         .values.double()
         .numpy()
     )
     return np.where(
-        cost < planner.no_way(state.costs).double().numpy(), cost, np.inf
+        cost < planner.no_path_cost(state.costs).double().numpy(), cost, np.inf
     ), elapsed_s / len(problem)
 
 

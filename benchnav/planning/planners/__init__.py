@@ -1,3 +1,4 @@
-"""Planners: the protocol they share, and the shipped ones; `pyproject.toml` gives each
-its name.
+"""Planners: their common protocol, and the shipped planners.
+
+Entry points in `pyproject.toml` name the planners.
 """

@@ -1,7 +1,7 @@
 """The boundary between a planner and the loop: inputs are copied, outputs are checked.
 
-A planner may write into its inputs without moving a robot or changing a map. An action
-that no robot can execute is a fault of its episodes, never an error of the loop.
+A planner that writes into its inputs neither moves a robot nor changes a map. An action
+that no robot can execute is a fault of its episode, and not an error of the loop.
 Letters in shapes: B episodes, S state and A action dimensions.
 """
 
@@ -24,12 +24,12 @@ class Answer:
     """A planner's output after checks.
 
     Args:
-        action: finite actions; zeros within the bounds for faulty episodes, shape
+        action: finite actions; zeros, clipped to the bounds, for faulty episodes, shape
             [B, A].
         plan_state: plan state for the next step.
-        plan: its status has shape [B]; invalid layers are removed.
+        plan: plan without invalid layers; its status has shape [B].
         faulty: mask of episodes with an invalid output, bool, shape [B].
-        reason: what is wrong with the faulty ones, one line.
+        reason: fault of the faulty episodes, in one line.
     """
 
     action: Tensor
@@ -44,7 +44,7 @@ def begin(planner: Planner[Any], problem: Problem, generator: torch.Generator) -
 
     Args:
         planner: any planner; its exceptions pass through.
-        problem: B problems; not changed, whatever the planner does.
+        problem: B problems; not modified, whatever the planner does.
         generator: the planner's randomness.
 
     Returns:
@@ -60,17 +60,18 @@ def revise(
 
     Args:
         planner: any planner; its exceptions pass through.
-        plan_state: from the last answer.
-        problem: B problems that start at the robots' current states; not changed,
+        plan_state: plan state of the last answer.
+        problem: B problems that start at the robots' current states; not modified,
             whatever the planner does.
         generator: the planner's randomness, if it starts again.
 
     Returns:
         The next plan state.
     """
-    copy = problem.clone()
-    revised = planner.revise(plan_state, copy)
-    return begin(planner, problem, generator) if revised is NotImplemented else revised
+    revised = planner.revise(plan_state, problem.clone())
+    if revised is NotImplemented:
+        return begin(planner, problem, generator)
+    return revised
 
 
 def act(planner: Planner[Any], step: Step, plan_state: Any, problem: Problem) -> Answer:
@@ -78,13 +79,13 @@ def act(planner: Planner[Any], step: Step, plan_state: Any, problem: Problem) ->
 
     Args:
         planner: any planner; its exceptions pass through.
-        step: robot states; not changed, whatever the planner does.
-        plan_state: from `begin` or the last answer.
-        problem: problem with the bounds of the actions; the planner does not get it.
+        step: robot states; not modified, whatever the planner does.
+        plan_state: plan state from `begin` or the last answer.
+        problem: problem with the bounds of the actions, not passed to the planner.
 
     Returns:
-        The answer. A wrong type, shape, dtype or device makes every episode faulty, a
-        non-finite action only its own.
+        The answer. A wrong type, shape, dtype or device makes every episode faulty, and
+        a non-finite action only its own episode.
     """
     output = planner.plan(step.clone(), plan_state)
     standing = standing_actions(problem)
@@ -92,23 +93,20 @@ def act(planner: Planner[Any], step: Step, plan_state: Any, problem: Problem) ->
     if fault := find_fault(output, problem):
         everyone = torch.ones_like(step.traversability, dtype=torch.bool)
         return Answer(standing, plan_state, no_layers, everyone, fault)
-    action, following, plan = output
-    faulty = ~action.detach().isfinite().all(dim=1)
+    action, next_state, plan = output
+    action = action.detach()
+    faulty = ~action.isfinite().all(dim=1)
+    action = torch.where(faulty[:, None], standing, action)
     if find_layer_faults(plan, problem):
         plan = replace(no_layers, status=plan.status)
-    return Answer(
-        torch.where(faulty[:, None], standing, action.detach()),
-        following,
-        plan,
-        faulty,
-        NOT_FINITE,
-    )
+    return Answer(action, next_state, plan, faulty, NOT_FINITE)
 
 
 def standing_actions(problem: Problem) -> Tensor:
-    """Return actions for episodes without a valid one: zeros within the bounds, [B, A]."""
+    """Return actions for faulty episodes: zeros, clipped to the bounds, shape [B, A]."""
     low, high = problem.action_bounds
-    return torch.zeros_like(low).clamp(low, high).expand(len(problem), -1)
+    standing = torch.zeros_like(low).clamp(low, high)
+    return standing.expand(len(problem), -1)
 
 
 def find_fault(output: Any, problem: Problem) -> str:
@@ -118,23 +116,23 @@ def find_fault(output: Any, problem: Problem) -> str:
         output: return value of `plan`.
         problem: B problems, for the shape, dtype and device of actions.
     """
+    got = type(output).__name__
+    if isinstance(output, tuple):
+        got = f"{len(output)} values"
     if not isinstance(output, tuple) or len(output) != 3:
-        got = (
-            f"{len(output)} values"
-            if isinstance(output, tuple)
-            else type(output).__name__
-        )
         return f"Expected (action, plan_state, Plan) from `plan`, got {got}."
     action, _, plan = output
-    batch, like = len(problem), problem.start
-    shape = batch, len(problem.robot.action_low)
-    fault = find_tensor_fault("actions", action, like.dtype, shape, like.device)
+    start = problem.start
+    n_episodes = len(problem)
+    shape = n_episodes, len(problem.robot.action_low)
+    fault = find_tensor_fault("actions", action, start.dtype, shape, start.device)
     if fault:
         return fault
     if not isinstance(plan, Plan):
-        return f"Expected a Plan beside the actions, got {type(plan).__name__}."
+        return f"Expected a Plan as the last output, got {type(plan).__name__}."
+    status = plan.status
     return find_tensor_fault(
-        "`Plan.status`", plan.status, torch.int64, (batch,), like.device
+        "`Plan.status`", status, torch.int64, (n_episodes,), start.device
     )
 
 
@@ -145,14 +143,19 @@ def find_layer_faults(plan: Plan, problem: Problem) -> list[str]:
         plan: any plan.
         problem: B problems.
     """
+    n_episodes = len(problem)
     faults = []
     for name, inner in LAYERS.items():
-        layer, batch = getattr(plan, name), len(problem)
-        got = list(layer.shape) if isinstance(layer, Tensor) else type(layer).__name__
-        fits = isinstance(layer, Tensor) and layer.ndim == len(inner) + 2
-        if not fits or (layer.shape[0], layer.shape[-1]) != (batch, 2):
+        layer = getattr(plan, name)
+        got: object = type(layer).__name__
+        fits = False
+        if isinstance(layer, Tensor):
+            got = list(layer.shape)
+            has_dims = layer.ndim == len(inner) + 2
+            fits = has_dims and (layer.shape[0], layer.shape[-1]) == (n_episodes, 2)
+        if not fits:
             faults.append(
-                f"Expected `Plan.{name}` of shape [{batch}, {', '.join(inner)}, 2], "
-                f"got {got}."
+                f"Expected `Plan.{name}` of shape "
+                f"[{n_episodes}, {', '.join(inner)}, 2], got {got}."
             )
     return faults

@@ -1,12 +1,14 @@
 """Compilation of rollouts by `torch.compile`.
 
-`torch.compile` fuses a rollout's many small operations, which pays if there are many
-rollouts. It needs a C++ compiler at run time; without one the same code runs eagerly,
-and one line reports it. PyTorch's own switch `TORCH_COMPILE_DISABLE=1` turns it off.
+`torch.compile` fuses a rollout's many small operations, which saves time if there are
+many rollouts. It needs a C++ compiler at run time. Without a compiler the same code runs
+eagerly, and one line reports it. PyTorch's switch `TORCH_COMPILE_DISABLE=1` turns
+compilation off.
 
-Whether a planner runs compiled only depends on its settings and the device. It does not
-depend on the number of episodes of a batch, nor on what the process compiled before,
-since compiled and eager results differ in their last bits and much in speed.
+Whether a planner runs compiled depends only on its settings and the device. It depends
+neither on the number of episodes of a batch nor on earlier compilations in the process,
+since compiled and eager results differ in their last bits, and compiled code is much
+faster.
 """
 
 import logging
@@ -25,7 +27,7 @@ R = TypeVar("R")
 def can_compile() -> bool:
     """Return whether compilation is available.
 
-    PyTorch's switch is not off, and there is a C++ compiler.
+    It needs a C++ compiler, and PyTorch's switch must not be off.
     """
     names = (os.environ.get("CXX", ""), "g++", "clang++")
     has_compiler = any(shutil.which(name) for name in names if name)
@@ -35,7 +37,7 @@ def can_compile() -> bool:
 def _is_switched_off() -> bool:
     """Return whether PyTorch's compilation is switched off.
 
-    Its compiler takes a second to import, and is not imported for this.
+    PyTorch's compiler is not imported for this, since its import takes a second.
     """
     if "torch._dynamo" in sys.modules:
         return bool(torch._dynamo.config.disable)
@@ -43,26 +45,25 @@ def _is_switched_off() -> bool:
 
 
 def worth_compiling(rollouts: int, min_rollouts: int, device: torch.device) -> bool:
-    """Return whether that number of rollouts per episode is to be compiled."""
+    """Return whether a number of rollouts per episode should be compiled."""
     return device.type == "cuda" or rollouts >= min_rollouts
 
 
 class Fused(Generic[R]):
-    """A pure function that is compiled at its first call, or runs eagerly if it cannot
-    be.
+    """A pure function that is compiled at its first call if possible.
 
-    It is compiled once for a single episode and once for any number of them, so that a
-    batch may shrink. Each object decides for itself: one that cannot be compiled does
-    not affect others.
+    It is compiled once for a single episode and once for any larger number of episodes,
+    so that a batch may shrink. Objects are independent: a failed compilation of one
+    does not affect others.
 
     Args:
-        function: takes and returns tensors, single or in named tuples, the first of
-            them a tensor; it must not change them.
+        function: function of tensors and named tuples of tensors, the first argument a
+            tensor; it must not modify its arguments.
         rollouts: number of rollouts of an episode in a call.
         min_rollouts: minimum number that is worth the seconds of compilation. Fewer run
-            eagerly, which takes the same time however few they are.
-        batched: indices of the arguments whose first dimension is that of the episodes,
-            each item of a tuple counted.
+            eagerly, in a time that hardly depends on their number.
+        batched: indices of the arguments whose first dimension is that of the episodes;
+            each item of a tuple counts as an argument.
     """
 
     def __init__(
@@ -80,10 +81,10 @@ class Fused(Generic[R]):
         self._fused: Callable[..., R] | None = None
         self._seen: set[tuple[object, ...]] = set()
         self.compiled: bool | None = None
-        """Whether it runs compiled; None before the first call."""
+        """Whether the function runs compiled; None before the first call."""
 
     def __call__(self, *args: Any) -> R:
-        """Call the function, compiled where that pays and is possible."""
+        """Call the function, compiled if that saves time and is possible."""
         if self.compiled is False:
             return self._function(*args)
         items: list[Any] = []
@@ -93,8 +94,9 @@ class Fused(Generic[R]):
             self.compiled = False
             return self._function(*args)
         signature = self._signature(items)
+        kinds = [type(arg) for arg in args]
         try:
-            result = self._call([type(arg) for arg in args], items, signature)
+            result = self._call(kinds, items, signature)
         except (
             torch._dynamo.exc.TorchDynamoException,
             torch._dynamo.exc.FailOnRecompileLimitHit,
@@ -111,7 +113,7 @@ class Fused(Generic[R]):
         return result
 
     def _pays(self, device: torch.device) -> bool:
-        """Return whether the function is to be compiled on a device."""
+        """Return whether the function should be compiled on a device."""
         if _is_switched_off():
             return False
         return worth_compiling(self._rollouts, self._min_rollouts, device)
@@ -119,26 +121,27 @@ class Fused(Generic[R]):
     def _call(
         self, kinds: list[type], items: list[Any], signature: tuple[object, ...]
     ) -> R:
-        """Run the compiled function; a new signature under the settings of compilation."""
+        """Run the compiled function, with options for compilation if it is needed."""
         if self._fused is None:
-            self._fused = torch.compile(
-                _of_items(self._function, kinds), dynamic=False, fullgraph=True
-            )
+            function = _of_items(self._function, kinds)
+            self._fused = torch.compile(function, dynamic=False, fullgraph=True)
         if signature in self._seen:
             try:
                 return self._fused(*items)
             except torch._dynamo.exc.FailOnRecompileLimitHit:
                 # Something changed that the signature does not include.
                 pass
-        with _compiling(checked=not all(map(_is_ours, items))):
+        is_checked = not all(map(_is_ours, items))
+        with _compiling(is_checked):
             for index in self._batched:
-                # The number of episodes may be any, except one.
-                if items[index] is not None and len(items[index]) > 1:
-                    torch._dynamo.maybe_mark_dynamic(items[index], 0)
+                item = items[index]
+                # A single episode has its own compiled code.
+                if item is not None and len(item) > 1:
+                    torch._dynamo.maybe_mark_dynamic(item, 0)
             return self._fused(*items)
 
     def _signature(self, items: list[Any]) -> tuple[object, ...]:
-        """Return the properties of a call that it is compiled for.
+        """Return the properties of a call that require separate compilation.
 
         They are shapes, dtypes and devices of tensors, other arguments, and PyTorch's
         modes.
@@ -149,15 +152,13 @@ class Fused(Generic[R]):
             torch.get_num_threads(),
         ]
         for index, item in enumerate(items):
-            if isinstance(item, torch.Tensor):
-                shape = (
-                    (len(item) > 1, item.shape[1:])
-                    if index in self._batched
-                    else item.shape
-                )
-                parts.append((shape, item.dtype, item.device))
-            else:
+            if not isinstance(item, torch.Tensor):
                 parts.append(_key(item))
+                continue
+            shape: tuple[object, ...] = item.shape
+            if index in self._batched:
+                shape = (len(item) > 1, item.shape[1:])
+            parts.append((shape, item.dtype, item.device))
         return tuple(parts)
 
 
@@ -165,8 +166,8 @@ def _of_items(function: Callable[..., R], kinds: list[type]) -> Callable[..., R]
     """Return a function of single items, whose guards are cheaper than those of tuples.
 
     Args:
-        function: takes arguments of these kinds.
-        kinds: types of its arguments; a named tuple stands for its items.
+        function: function of arguments of these types.
+        kinds: types of the arguments; a named tuple is replaced by its items.
     """
     sizes = [len(kind._fields) if issubclass(kind, tuple) else 0 for kind in kinds]  # type: ignore[attr-defined]
 
@@ -174,7 +175,10 @@ def _of_items(function: Callable[..., R], kinds: list[type]) -> Callable[..., R]
         args: list[Any] = []
         first = 0
         for kind, size in zip(kinds, sizes, strict=True):
-            args.append(kind(*items[first : first + size]) if size else items[first])
+            arg = items[first]
+            if size:
+                arg = kind(*items[first : first + size])
+            args.append(arg)
             first += size or 1
         return function(*args)
 
@@ -185,14 +189,14 @@ def _of_items(function: Callable[..., R], kinds: list[type]) -> Callable[..., R]
 def _compiling(checked: bool) -> Iterator[None]:
     """Set PyTorch's options for compilation.
 
-    To set them takes longer than a rollout, so they are only set for it.
+    Setting them takes longer than a rollout, so they are set only for compilation.
 
     Args:
         checked: whether computed indices are checked.
     """
-    import torch._inductor.config  # imported here: it takes a second
+    import torch._inductor.config  # imported here, since its import takes a second
 
-    # It would warn of a CUDA toolkit without a GPU, which does not matter on the CPU.
+    # It warns of a CUDA toolkit without a GPU, which does not matter on the CPU.
     notices = logging.getLogger("torch.utils.cpp_extension")
     level = notices.level
     notices.setLevel(logging.ERROR)
@@ -214,7 +218,7 @@ def _compiling(checked: bool) -> Iterator[None]:
 
 
 def _key(arg: object) -> object:
-    """Return an argument if it has a hash; else its id, as for a frozen robot with a list."""
+    """Return an argument, or its id if it cannot be hashed, as a robot with a list."""
     try:
         hash(arg)
     except TypeError:
@@ -223,9 +227,10 @@ def _key(arg: object) -> object:
 
 
 def _is_ours(arg: object) -> bool:
-    """Return whether an argument is of PyTorch or this package, whose indices are valid.
+    """Return whether PyTorch or this package defines an argument's class.
 
-    A user's robot or objective may compute others. To check each index takes a third of
-    the time.
+    Such arguments compute only valid indices. A custom robot or objective may compute
+    invalid ones. Checking each index takes a third of the time.
     """
-    return type(arg).__module__.split(".")[0] in ("torch", "builtins", "benchnav")
+    package = type(arg).__module__.split(".")[0]
+    return package in ("torch", "builtins", "benchnav")

@@ -1,12 +1,11 @@
-"""Risk of the cost: action sequences are rolled out on joint samples of the λ field, and
-scored by the tail of their costs.
+"""Risk of the cost: the tail of an action sequence's costs on joint samples of λ.
 
-A risk map contains the risk of each cell. The cost of a path adds up over correlated
-cells, and its tail is that of the sum: the CVaR, over M fields, of the cost of a
-sequence of actions on each. On fields and on a risk map alike, low λ may immobilise a
-robot (`advance_entrapped`), which the motion model does not include. Source: Cai et al.
-(2024), "EVORA: Deep evidential traversability learning for risk-aware off-road
-autonomy", CVaR-Cost.
+A risk map contains the risk of each cell. The cost of a path is a sum over correlated
+cells, so its risk is not the sum of the cells' risks. Hence action sequences are rolled
+out on M joint samples of the λ field, and scored by the CVaR of their costs over these
+fields. On a field or a risk map, low λ may immobilise a robot (`advance_entrapped`),
+which the motion model does not include. Source: Cai et al. (2024), "EVORA: Deep
+evidential traversability learning for risk-aware off-road autonomy", CVaR-Cost.
 
 Letters in shapes: B episodes, M fields, K samples, T steps, S state and A action
 dimensions, H×W cells, N cells padded for lookups.
@@ -50,15 +49,18 @@ def within_reach(problem: Problem, state: Tensor, seconds: float) -> Tensor:
     Args:
         problem: B problems.
         state: robot states, shape [B, S].
-        seconds: the time in seconds.
+        seconds: time in seconds.
 
     Returns:
         Mask, bool, shape [B, H, W].
     """
     grid = problem.grid
-    row, column = (torch.arange(size, device=state.device) for size in grid.shape)
+    row = torch.arange(grid.height, device=state.device)
+    column = torch.arange(grid.width, device=state.device)
     x, y = grid.centre_of(row[:, None], column)
-    distance_m = torch.hypot(x - state[:, 0, None, None], y - state[:, 1, None, None])
+    dx = x - state[:, 0, None, None]
+    dy = y - state[:, 1, None, None]
+    distance_m = torch.hypot(dx, dy)
     reach_m = problem.robot.top_speed_mps * seconds
     return distance_m <= reach_m + grid.resolution_m  # beyond a cell's corner
 
@@ -68,10 +70,11 @@ def tail_cost(cost: Tensor, level: float) -> Tensor:
 
     Args:
         cost: cost on each field, shape [B, M, K].
-        level: α in [0, 1); at 0 the mean.
+        level: α in [0, 1); 0 for the mean.
 
     Returns:
-        CVaR, shape [B, K]. A field that is only partly in that fraction has that weight.
+        CVaR, shape [B, K]. A field that is only partly within the worst fraction counts
+        with that part.
     """
     if level == 0:
         return cost.mean(1)
@@ -79,7 +82,8 @@ def tail_cost(cost: Tensor, level: float) -> Tensor:
     count = math.ceil(n_worst - 1e-9)
     worst_costs = cost.topk(count, dim=1).values
     last_weight = n_worst - count + 1
-    total = worst_costs[:, :-1].sum(1) + last_weight * worst_costs[:, -1]
+    full_sum = worst_costs[:, :-1].sum(1)
+    total = full_sum + last_weight * worst_costs[:, -1]
     return total / n_worst
 
 
@@ -87,9 +91,9 @@ class Entrapment(NamedTuple):
     """Permanent immobilisation of a robot, and its cost.
 
     Args:
-        goal: (x, y) of the goal, shape [B, 1, 2].
-        steps_left: remaining steps from the start of a rollout, shape [B, 1].
-        goal_radius_m: distance to the goal below which a robot has reached it.
+        goal: goal (x, y) in metres, shape [B, 1, 2].
+        steps_left: number of remaining steps at the start of a rollout, shape [B, 1].
+        goal_radius_m: distance in metres below which a robot has reached the goal.
         below: λ below which terrain immobilises a robot.
         max_steps: consecutive steps on such terrain after which a robot is immobilised.
     """
@@ -115,8 +119,8 @@ def advance_entrapped(
 
     A robot on such terrain for `max_steps` consecutive steps stops there. It pays J of
     standing there, with the penalty of non-free cells, until its time is over. Its
-    states continue, at no further cost. A robot that has reached the goal is not
-    immobilised behind it.
+    states continue at no further cost. A robot that has reached the goal is no longer
+    immobilised.
 
     Args:
         states: robot states, shape [B, K, S].
@@ -125,9 +129,9 @@ def advance_entrapped(
             that has stopped, −1 for one that has reached the goal, shape [B, K].
         sampled: action sequences.
         padded_ground: padded maps as in `Problem`, shape [B, N].
-        target: target (x, y), shape [B, 1, 2].
-        entrapment: what immobilises a robot.
-        dynamics: of the problem.
+        target: target (x, y) in metres, shape [B, 1, 2].
+        entrapment: conditions of immobilisation.
+        dynamics: dynamics of the problem.
 
     Returns:
         States, cost and `dwell_steps` after these steps.
@@ -142,14 +146,16 @@ def advance_entrapped(
         dx = states[..., 0] - goal[..., 0]
         dy = states[..., 1] - goal[..., 1]
         longer_dwell = torch.where(traversability < below, dwell_steps + 1, 0)
-        has_arrived = (dwell_steps < 0) | (torch.hypot(dx, dy) < goal_radius_m)
+        at_goal = torch.hypot(dx, dy) < goal_radius_m
+        has_arrived = (dwell_steps < 0) | at_goal
         longer_dwell = torch.where(has_arrived, -1, longer_dwell)
         stops = going & (longer_dwell >= max_steps)
-        paid = stage_cost(objective, states, action, ground, target)
+        step_cost = stage_cost(objective, states, action, ground, target)
         no_action = torch.zeros_like(action)
-        standing = stage_cost(objective, states, no_action, ground, target)
-        remaining = (steps_left - (step + 1)).clamp(min=0) * standing
-        step_cost = paid + torch.where(stops, remaining, 0)
+        standing_cost = stage_cost(objective, states, no_action, ground, target)
+        remaining_steps = (steps_left - (step + 1)).clamp(min=0)
+        remaining_cost = remaining_steps * standing_cost
+        step_cost = step_cost + torch.where(stops, remaining_cost, 0)
         cost = cost + torch.where(going, step_cost, 0)
         scale = motion_traversability(ground, min_traversability)
         states = robot(states, action, scale)

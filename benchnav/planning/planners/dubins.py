@@ -1,11 +1,10 @@
-"""Dubins paths to a point: shortest paths of a vehicle that only drives forward and
-has a minimum turning radius.
+"""Dubins paths to a point: shortest paths of a vehicle that only drives forward.
 
-A path is a sequence of arcs and straights, "segments", each with a curvature and a
-length. From a pose (x, y, θ) to a point with free heading the shortest path has two
-segments: an arc of the minimum radius and a straight. For a point inside the turning
-circle they are an arc away from it and one back. A point to the right is solved by
-mirroring it to the left.
+The vehicle has a minimum turning radius. A path is a sequence of arcs and straights,
+"segments", each with a curvature and a length. From a pose (x, y, θ) to a point with
+free heading the shortest path has two segments: an arc of the minimum radius and a
+straight. For a point inside the turning circle they are an arc away from it and an arc
+back. A point to the right is mirrored to the left.
 
 Sources: Dubins (1957), "On curves of minimal length with a constraint on average
 curvature"; Boissonnat and Bui (1994), "Accessibility region for a car that only moves
@@ -71,16 +70,20 @@ def sample_segments(
         Poses, shape [*B, N, 3]; headings run on without wrapping.
     """
     arc = torch.arange(count, dtype=start.dtype, device=start.device) * spacing
-    x, y, heading = (start[..., i, None] for i in range(3))
+    x = start[..., 0, None]
+    y = start[..., 1, None]
+    heading = start[..., 2, None]
     begin = torch.zeros_like(heading)
     at_begin = heading
     curvatures = curvature[..., None].unbind(-2)
-    for bend, length in zip(curvatures, length_m[..., None].unbind(-2), strict=True):
+    lengths = length_m[..., None].unbind(-2)
+    for bend, length in zip(curvatures, lengths, strict=True):
         within = torch.minimum((arc - begin).clamp(min=0), length)
         half_turn = within * (0.5 * bend)
         chord = within * torch.sinc(half_turn / math.pi)
-        x = x + chord * (at_begin + half_turn).cos()
-        y = y + chord * (at_begin + half_turn).sin()
+        mean = at_begin + half_turn
+        x = x + chord * mean.cos()
+        y = y + chord * mean.sin()
         heading = heading + 2 * half_turn
         begin = begin + length
         at_begin = at_begin + bend * length
@@ -90,8 +93,11 @@ def sample_segments(
 def _to_point(
     start: Tensor, point: Tensor, radius: float | Tensor, far_side: bool = False
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return lengths of both segments in radii, the side of the first circle (±1), and
-    whether it contains the point.
+    """Return the segments of shortest paths; arguments as `dubins_segments_to_point`.
+
+    Returns:
+        Lengths of both segments in radii, the side of the first circle (1 left, −1
+        right), and a mask of points inside that circle, each of shape [*B].
     """
     # The point relative to the pose, x ahead and y to the left, in radii.
     scale = 1 / radius
@@ -104,26 +110,31 @@ def _to_point(
     side = torch.where(y < 0, -1.0, 1.0).to(y)
     y = y.abs()
     if far_side:
-        side, y = -side, -y
-    power = x * x + y * (y - 2)  # of the point over the left circle, centre (0, 1)
+        side = -side
+        y = -y
+    # The point's power with respect to the left circle, whose centre is (0, 1).
+    power = x * x + y * (y - 2)
     inside = power < 0
     # The arc ends where its tangent meets the point.
     straight = power.clamp(min=0).sqrt()
     tangent = torch.atan2(torch.ones_like(straight), straight)
     arc = _wrap(torch.atan2(y - 1, x) + tangent)
-    # Triangle of the right circle's centre (0, -1), the last circle's centre (2 away)
-    # and the point.
+    # A triangle of the centre of the right circle, (0, −1), the centre of the last
+    # circle at distance 2 from it, and the point at distance 1 from the latter.
     square = x * x + (y + 1) * (y + 1)
-    apex = torch.acos(((square + 3) / (4 * square.sqrt())).clamp(-1, 1))
-    away = _wrap(math.pi / 2 + apex - torch.atan2(y + 1, x))
-    back = math.tau - torch.acos(((5 - square) / 4).clamp(-1, 1))
+    apex_cos = (square + 3) / (4 * square.sqrt())
+    apex = torch.acos(apex_cos.clamp(-1, 1))
+    bearing = torch.atan2(y + 1, x)
+    away = _wrap(math.pi / 2 + apex - bearing)
+    back_cos = (5 - square) / 4
+    back = math.tau - torch.acos(back_cos.clamp(-1, 1))
     first = torch.where(inside, away, arc)
     second = torch.where(inside, back, straight)
     return first, second, side, inside
 
 
 def _wrap(angle: Tensor) -> Tensor:
-    """Return angles in [0, 2π); rounding just below a full turn counts as 0."""
+    """Return angles in [0, 2π); angles within rounding below a full turn become 0."""
     wrapped = torch.remainder(angle, math.tau)
-    limit = math.tau - torch.finfo(angle.dtype).eps ** 0.75
-    return torch.where(wrapped > limit, 0, wrapped)
+    tolerance = torch.finfo(angle.dtype).eps ** 0.75
+    return torch.where(wrapped > math.tau - tolerance, 0, wrapped)

@@ -1,32 +1,33 @@
 """Model predictive path integral control (MPPI).
 
-Samples K action sequences about the current mean, rolls out each through F under λ̂, and
-averages them by their exponentiated cost. There is no global path. Sources: Williams et
-al. (2017), "Information theoretic MPC for model-based reinforcement learning",
-algorithm 2; for γ, α and bounds Williams et al. (2018), "Information-theoretic model
-predictive control", algorithms 1 and 2; paper IV-A3. Letters in shapes: B episodes, K
-samples, T horizon steps, S state, A action dimensions; in formulas u is the mean, ε the
-noise, Σ its covariance.
+MPPI samples K action sequences about the current mean, rolls out each through F under
+λ̂, and averages them with weights that decrease exponentially with their costs. There is
+no global path. Sources: Williams et al. (2017), "Information theoretic MPC for
+model-based reinforcement learning", algorithm 2; for γ, α and bounds Williams et al.
+(2018), "Information-theoretic model predictive control", algorithms 1 and 2; paper
+IV-A3. Letters in shapes: B episodes, K samples, T horizon steps, S state, A action
+dimensions; in formulas u is the mean, ε the noise, Σ its covariance.
 
 As in Williams et al. (2018), rollouts use clipped actions F(x, clip(u + ε)), while the
-mean is moved by the unclipped noise: u ← clip(u + Σwε). If clipped samples were
-averaged, the mean would drift to the middle of the bounds wherever costs are flat,
-since samples beyond a bound are moved back onto it. The mean is clipped too, so that it
-cannot wind up beyond the bounds, where no sample would reach back.
+unclipped noise moves the mean: u ← clip(u + Σwε). If clipped samples were averaged, the
+mean would drift to the middle of the bounds wherever costs are flat, since clipping
+moves samples beyond a bound back onto it. The mean is clipped too. Otherwise it could
+move so far beyond the bounds that no sample would return.
 
-Risk is that of λ in each cell, from the risk map, or that of the cost (`risk_on:
-cost`): each sequence is rolled out on M fields of λ, and its cost is the CVaR over
-them; see `benchnav.planning.planners.cost_risk`. Beyond the horizon J assumes a
-straight line over good terrain; `cost_to_go` uses the map's cheapest paths instead.
+`risk_on` selects the risk. With `map` it is the risk of λ in each cell, from the risk
+map. With `cost` it is the risk of the cost: each sequence is rolled out on M fields of
+λ, and its cost is the CVaR over them; see `benchnav.planning.planners.cost_risk`.
+Beyond the horizon J assumes a straight line over good terrain; `cost_to_go` uses the
+map's cheapest paths instead.
 
 A robot that is steered by an angle also considers turns (`turns`) if its mean is no
 better than standing.
 
 Differences from the sources: noise and temperature are relative by default, so that one
-setting serves robots and objectives of any unit. The control cost is off by default.
-The mean is not smoothed. Noise is read from one bank, a pure function of seed and step
-(`NoiseBank`), which the episodes of a batch share. Hence an episode has the same noise
-alone as in any batch.
+setting suits robots and objectives of any unit. The control cost is off by default. The
+mean is not smoothed. Noise comes from one bank (`NoiseBank`), a pure function of seed
+and step, which the episodes of a batch share. Hence the noise of an episode does not
+depend on the batch.
 """
 
 from dataclasses import dataclass, replace
@@ -60,20 +61,10 @@ from benchnav.planning.planners.mppi_rollouts import (
     total_cost,
     weigh,
 )
-from benchnav.planning.planners.noise_bank import (
-    NoiseBank,
-    Sampled,
-    draw_bank,
-)
-from benchnav.planning.planners.planner import (
-    LocalPlanner,
-    Plan,
-)
+from benchnav.planning.planners.noise_bank import NoiseBank, Sampled, draw_bank
+from benchnav.planning.planners.planner import LocalPlanner, Plan
 from benchnav.planning.planners.turns import choose, is_steered
-from benchnav.planning.problem import (
-    Problem,
-    Task,
-)
+from benchnav.planning.problem import Problem, Task
 from benchnav.planning.robots import steps_in
 from benchnav.planning.sensing.sensor import Step
 
@@ -86,9 +77,9 @@ class MPPIState(Batch):
         problem: the problem.
         mean: mean action sequence, shape [B, T, A].
         dwell_steps: consecutive steps on immobilising terrain, shape [B].
-        follows: mask of robots that follow a Dubins path, see `turns.choose`, bool,
-            shape [B].
-        ground: fields of λ that were drawn once, as in `framed_fields`, shape
+        follows: mask of robots that follow a Dubins path, bool, shape [B]; see
+            `turns.choose`.
+        ground: fields of λ that are drawn once, as in `framed_fields`, shape
             [B, M, N]; None if they are drawn at each step, or not used.
         to_go: costs of the cheapest paths, as in `astar.framed`, shape [B, 2, N]; None
             if the terminal cost is that of J.
@@ -109,8 +100,7 @@ class MPPIState(Batch):
 
 
 class MPPI(LocalPlanner[MPPIState]):
-    """Model predictive path integral control: sampled action sequences, weighted by
-    cost.
+    """MPPI as a local planner, for robots with any actions.
 
     Args:
         config: settings.
@@ -118,32 +108,32 @@ class MPPI(LocalPlanner[MPPIState]):
 
     name = "MPPI"
     worth_compiling: ClassVar[int] = 2000
-    """Minimum number of rollouts of an episode and step for which it is compiled."""
+    """Minimum number of rollouts per episode and step for compilation."""
 
     def __init__(self, config: MPPIConfig | None = None) -> None:
         """Store the settings."""
         self.config = config or MPPIConfig()
         rollouts = self.config.samples * self._fields
         minimum = self.worth_compiling
-        self._advance = Fused(advance_chunk, rollouts, minimum, batched=OF_EPISODES)
+        self._advance = Fused(advance_chunk, rollouts, minimum, OF_EPISODES)
         self._advance_entrapped = Fused(
-            advance_entrapped, rollouts, minimum, batched=ENTRAPPED_OF_EPISODES
+            advance_entrapped, rollouts, minimum, ENTRAPPED_OF_EPISODES
         )
-        # 12 and 13 are `going` and `to_go`.
-        batched = (*OF_EPISODES, 12, 13)
-        self._weigh = Fused(weigh, rollouts, minimum, batched=batched)
+        of_weigh = (*OF_EPISODES, 12, 13)  # 12 and 13 are `going` and `to_go`
+        self._weigh = Fused(weigh, rollouts, minimum, of_weigh)
 
     @property
     def seeks_goal(self) -> bool:
-        """Whether the terminal cost is a cost-to-go.
+        """Whether the terminal cost is a cost to go.
 
-        Costs of the steps must then also run to the goal: if they ended at a waypoint,
-        standing on it would cost nothing.
+        Then the costs of steps must also be costs to the goal: if they ended at a
+        waypoint, standing at the waypoint would cost nothing.
         """
         return self.config.cost_to_go != "objective"
 
     @property
     def _fields(self) -> int:
+        """Number of fields M of each rollout."""
         return self.config.fields if self.config.risk_on == "cost" else 1
 
     @property
@@ -152,20 +142,26 @@ class MPPI(LocalPlanner[MPPIState]):
         rollout = self._advance_entrapped.compiled
         if rollout is None:
             rollout = self._advance.compiled
-        verdicts = (rollout, self._weigh.compiled)
-        return None if None in verdicts else all(verdicts)
+        weighing = self._weigh.compiled
+        if rollout is None or weighing is None:
+            return None
+        return rollout and weighing
 
     def uses(self, task: Task) -> frozenset[str]:
-        """Return the inputs of rollouts, free space and cost-to-go; see `Planner`."""
-        to_go = {"map": {"risk_map"}, "expected-time": {"distribution"}}.get(
-            self.config.cost_to_go, set()
-        )
-        rollouts = "fields" if self.config.risk_on == "cost" else "risk_map"
-        return frozenset({rollouts, task.rules.free_space.source, *to_go})
+        """Return the inputs of rollouts, free space and cost to go; see `Planner`."""
+        config = self.config
+        inputs = {"fields" if config.risk_on == "cost" else "risk_map"}
+        inputs.add(task.rules.free_space.source)
+        if config.cost_to_go == "map":
+            inputs.add("risk_map")
+        if config.cost_to_go == "expected-time":
+            inputs.add("distribution")
+        return frozenset(inputs)
 
     def follows(self, task: Task) -> str:
         """Return what it minimises instead of J; see `Planner`."""
-        config, parts = self.config, []
+        config = self.config
+        parts = []
         if config.risk_on == "cost":
             tail = f"CVaR {config.level:g} of J" if config.level else "mean of J"
             parts.append(f"{tail} over {config.fields} fields of λ")
@@ -182,10 +178,11 @@ class MPPI(LocalPlanner[MPPIState]):
         """Return the plan state of standing robots; see `Planner`.
 
         Raises:
-            ConfigError: If `noise` has another number of values than the robot has
+            ConfigError: If the number of values of `noise` is not that of the robot's
                 actions, or `cost_to_go` needs an objective with a path cost.
         """
-        names, config = problem.robot.action_names, self.config
+        names = problem.robot.action_names
+        config = self.config
         expect(
             config.noise is None or len(names) == len(config.noise),
             f"option `noise` of MPPI with {len(names)} values, for "
@@ -216,12 +213,11 @@ class MPPI(LocalPlanner[MPPIState]):
     def revise(self, plan_state: MPPIState, problem: Problem) -> MPPIState:
         """Return the plan state with the same mean; see `Planner`."""
         ground = self._drawn_once(problem, plan_state.key)
-        return replace(
-            plan_state, problem=problem, ground=ground, to_go=self._to_go(problem)
-        )
+        to_go = self._to_go(problem)
+        return replace(plan_state, problem=problem, ground=ground, to_go=to_go)
 
     def _to_go(self, problem: Problem) -> Tensor | None:
-        """Return padded costs of cheapest paths; None if J gives the terminal cost."""
+        """Return padded costs of cheapest paths; None if the terminal cost is of J."""
         option = self.config.cost_to_go
         if option == "objective":
             return None
@@ -232,15 +228,18 @@ class MPPI(LocalPlanner[MPPIState]):
             f"{name}.",
         )
         if option == "expected-time":
-            risk_map = risk.ExpectedTime()(problem.distribution).to(problem.risk_map)
+            expected_time = risk.ExpectedTime()
+            risk_map = expected_time(problem.distribution).to(problem.risk_map)
             problem = replace(problem, risk_map=risk_map)
-        return astar.framed(problem, astar.search(problem))
+        field = astar.search(problem)
+        return astar.framed(problem, field)
 
     def _drawn_once(self, problem: Problem, key: int) -> Tensor | None:
-        """Return fields that serve all steps, [B, M, N]; None without the option."""
+        """Return padded fields for all steps, [B, M, N]; None without option `once`."""
         if self.config.risk_on == "map" or not self.config.once:
             return None
-        ground = framed_fields(problem, problem.sample_fields(self._fields, key))
+        fields = problem.sample_fields(self._fields, key)
+        ground = framed_fields(problem, fields)
         return ground.unflatten(0, (len(problem), -1))
 
     def plan_toward(
@@ -261,11 +260,13 @@ class MPPI(LocalPlanner[MPPIState]):
             per_episode = control_cost(mean, noise, plan_state.noise.scale)
             control = per_episode.repeat_interleave(self._fields, 0)
             cost = cost + config.control_cost * control
+        sampled = Sampled(mean, noise, *problem.action_bounds)
+        ends = self._ends(plan_state, target_m, ground, going)
         weights, updated = self._weigh(
             states,
             cost,
-            Sampled(mean, noise, *problem.action_bounds),
-            self._ends(plan_state, target_m, ground, going),
+            sampled,
+            ends,
             config.temperature,
             config.temperature_share,
         )
@@ -276,9 +277,8 @@ class MPPI(LocalPlanner[MPPIState]):
         if step.draw:
             layers = drawn_paths(problem, step.state, updated, mean, noise, weights)
         plan = Plan.empty(len(problem), step.state.device, **layers)
-        after = replace(
-            plan_state, mean=shifted, follows=follows, step=plan_state.step + 1
-        )
+        next_step = plan_state.step + 1
+        after = replace(plan_state, mean=shifted, follows=follows, step=next_step)
         if dwell is not None:
             after = replace(after, dwell_steps=dwell.dwell_steps)
         return updated[:, 0], after, plan
@@ -289,7 +289,7 @@ class MPPI(LocalPlanner[MPPIState]):
         target_m: Tensor,
         ground: Tensor,
         going: Tensor | None,
-    ) -> "Ends":
+    ) -> Ends:
         """Return the terminal costs of rollouts on this step's maps."""
         problem = plan_state.problem
         target = target_m[:, None].repeat_interleave(self._fields, 0).contiguous()
@@ -298,10 +298,10 @@ class MPPI(LocalPlanner[MPPIState]):
             target,
             problem.grid,
             problem.objective,
-            self._fields,
-            self.config.level,
-            going,
-            plan_state.to_go,
+            fields=self._fields,
+            level=self.config.level,
+            going=going,
+            to_go=plan_state.to_go,
         )
 
     def _turned(
@@ -310,28 +310,29 @@ class MPPI(LocalPlanner[MPPIState]):
         plan_state: MPPIState,
         target_m: Tensor,
         ground: Tensor,
-        dwell: "Dwell | None",
+        dwell: Dwell | None,
     ) -> tuple[Tensor, Tensor]:
         """Return mean action sequences or turns, and a mask of Dubins paths.
 
         See `turns.choose`.
         """
-        problem, mean = plan_state.problem, plan_state.mean
+        problem = plan_state.problem
+        state = step.state
+        mean = plan_state.mean
+        follows = plan_state.follows
         if not is_steered(problem.robot):
-            return mean, plan_state.follows
+            return mean, follows
 
         def cost_of(base: Tensor, offset: Tensor) -> Tensor:
             advance = advance_chunk if dwell is None else advance_entrapped
             states, cost, going = roll_out(
-                problem, step.state, base, offset, target_m, advance, ground, dwell
+                problem, state, base, offset, target_m, advance, ground, dwell
             )
-            return total_cost(
-                states, cost, self._ends(plan_state, target_m, ground, going)
-            )[0]
+            ends = self._ends(plan_state, target_m, ground, going)
+            cost, _ = total_cost(states, cost, ends)
+            return cost
 
-        return choose(
-            cost_of, mean, problem, step.state, target_m, ground, plan_state.follows
-        )
+        return choose(cost_of, mean, problem, state, target_m, ground, follows)
 
     def _ground(self, plan_state: MPPIState, state: Tensor) -> Tensor:
         """Return the padded maps of rollouts from these states, shape [B·M, N]."""
@@ -341,15 +342,16 @@ class MPPI(LocalPlanner[MPPIState]):
         if plan_state.ground is not None:
             return plan_state.ground.flatten(0, 1)
         key = rng.stream_key(plan_state.key, plan_state.step)
-        cells = within_reach(problem, state, plan_state.mean.shape[1] * problem.dt_s)
-        return framed_fields(problem, problem.sample_fields(self._fields, key, cells))
+        horizon_s = plan_state.mean.shape[1] * problem.dt_s
+        cells = within_reach(problem, state, horizon_s)
+        fields = problem.sample_fields(self._fields, key, cells)
+        return framed_fields(problem, fields)
 
-    def _dwell(self, plan_state: MPPIState, step: Step) -> "Dwell | None":
+    def _dwell(self, plan_state: MPPIState, step: Step) -> Dwell | None:
         """Return dwell times on immobilising terrain; None without entrapment."""
         immobile = plan_state.problem.immobile
         if not self.config.entrapment or immobile is None:
             return None
-        dwell_steps = torch.where(
-            step.traversability < immobile.below, plan_state.dwell_steps + 1, 0
-        )
+        immobilises = step.traversability < immobile.below
+        dwell_steps = torch.where(immobilises, plan_state.dwell_steps + 1, 0)
         return Dwell(dwell_steps, step.time_s)

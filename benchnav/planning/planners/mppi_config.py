@@ -5,43 +5,40 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from benchnav.core.errors import expect
-from benchnav.planning.planners.planner import (
-    check_finite,
-)
+from benchnav.planning.planners.planner import check_finite
 
-_MIN_TAIL = 10  # minimum number of fields in the tail whose mean is a cost
+_MIN_TAIL = 10  # minimum number of fields in the tail of the cost
 
 
 @dataclass(frozen=True, kw_only=True)
 class MPPIConfig:
-    """Settings of MPPI; the paper gives none, these are ours.
+    """Settings of MPPI. The defaults are ours, since the paper states no values.
 
     Args:
         horizon_s: horizon in seconds; T is the nearest number of steps, at least 1.
         samples: number of action sequences K.
         noise_share: standard deviation of each sampled action, as a fraction of the
             range between its bounds; rejected together with `noise`.
-        noise: the same in the units of the actions, such as m/s and rad/s, instead of
-            `noise_share`.
+        noise: standard deviation of each sampled action in its unit, such as m/s and
+            rad/s, instead of `noise_share`.
         temperature_share: temperature as a fraction of the spread of costs
             (`cost_spread`) of the episode and step; rejected together with
             `temperature`.
-        temperature: the same in the units of J, instead of `temperature_share`; λ in
+        temperature: temperature in the units of J, instead of `temperature_share`; λ in
             the source.
-        control_cost: weight γ of the information-theoretic control cost γ·uᵀΣ⁻¹ε. With
-            0 the base distribution is the current mean (α = 1 in the source), with the
-            value of `temperature` it is 0 (α = 0).
-        risk_on: `map`: rollouts are on λ̂; `cost`: on fields of λ, while λ̂ only sets the
-            free mask where the rules use it.
-        level: α of the CVaR of the cost, in [0, 1); at 0 its mean.
-        fields: number of fields M for each sequence; at least 10 in the tail,
-            M ≥ 10 / (1 − α), if α > 0.
-        once: whether fields are drawn once per map as it is known, instead of at each
-            step.
+        control_cost: weight γ of the information-theoretic control cost γ·uᵀΣ⁻¹ε. At 0
+            the mean of the base distribution is the current mean (α = 1 in the source);
+            at the value of `temperature` it is 0 (α = 0).
+        risk_on: maps of the rollouts. `map`: λ̂; `cost`: fields of λ, with λ̂ only in the
+            free mask, if the rules use it.
+        level: α of the CVaR of the cost, in [0, 1); 0 for the mean.
+        fields: number of fields M for each sequence; if α > 0, at least 10 in the tail,
+            M ≥ 10 / (1 − α).
+        once: whether fields are drawn once per predicted map, instead of at each step.
         entrapment: whether rollouts stop for good on terrain that immobilises robots.
-        cost_to_go: terminal cost of a rollout. `objective`: that of J; `map`: the cost
-            of A*'s cheapest path to the goal under λ̂; `expected-time`: the same under
-            the λ̂ of that risk setting, whatever the problem's own.
+        cost_to_go: terminal cost of a rollout. `objective`: terminal cost of J; `map`:
+            cost of A*'s cheapest path to the goal under λ̂; `expected-time`: cost of
+            that path under the λ̂ of the risk setting `expected-time`.
     """
 
     added: ClassVar = ("risk_on", "level", "fields", "once", "entrapment", "cost_to_go")
@@ -62,7 +59,7 @@ class MPPIConfig:
 
     def __post_init__(self) -> None:
         """Validate the settings."""
-        above = (
+        above_zero = (
             "horizon_s",
             "samples",
             "noise_share",
@@ -70,33 +67,30 @@ class MPPIConfig:
             "temperature",
             "fields",
         )
-        check_finite("MPPI", self, above, ("control_cost",))
-        fits = self.noise is None or (
-            self.noise and all(0 < scale < math.inf for scale in self.noise)
-        )
-        expect(fits, f"`noise` > 0 for each action of MPPI, got {self.noise}.")
+        check_finite("MPPI", self, above_zero, ("control_cost",))
+        if self.noise is not None:
+            is_valid = self.noise and all(0 < scale < math.inf for scale in self.noise)
+            expect(is_valid, f"`noise` > 0 for each action of MPPI, got {self.noise}.")
         for name in ("noise", "temperature"):
-            fraction, default = (
-                getattr(self, f"{name}_share"),
-                getattr(type(self), f"{name}_share"),
-            )
+            value = getattr(self, name)
+            fraction = getattr(self, f"{name}_share")
+            default = getattr(type(self), f"{name}_share")
             expect(
-                getattr(self, name) is None or fraction == default,
+                value is None or fraction == default,
                 f"`{name}` or `{name}_share` for MPPI, got both, "
-                f"{getattr(self, name)} and {fraction}. Leave one out.",
+                f"{value} and {fraction}. Omit one of them.",
             )
         expect(
             self.risk_on in ("map", "cost"),
             f"`risk_on` 'map' or 'cost' for MPPI, got {self.risk_on!r}.",
         )
         expect(0 <= self.level < 1, f"`level` in [0, 1) for MPPI, got {self.level}.")
-        is_default = (
-            self.level == 0 and not self.once and self.fields == MPPIConfig.fields
-        )
+        has_default_fields = self.fields == MPPIConfig.fields
+        is_default = self.level == 0 and not self.once and has_default_fields
         expect(
             self.risk_on == "cost" or is_default,
             "`risk_on: cost` for `level`, `fields` and `once` of MPPI, got 'map', "
-            "whose risk is the risk setting's.",
+            "for which the risk setting decides.",
         )
         choices = "objective", "map", "expected-time"
         expect(

@@ -14,18 +14,9 @@ from benchnav.core.grid import Grid
 from benchnav.planning.free_space import PENALTY
 from benchnav.planning.objective import Objective
 from benchnav.planning.planners.astar import astar
-from benchnav.planning.planners.cost_risk import (
-    Entrapment,
-    tail_cost,
-)
-from benchnav.planning.planners.noise_bank import (
-    Sampled,
-    perturb,
-    sampled_actions,
-)
-from benchnav.planning.planners.planner import (
-    rollout_path,
-)
+from benchnav.planning.planners.cost_risk import Entrapment, tail_cost
+from benchnav.planning.planners.noise_bank import Sampled, perturb, sampled_actions
+from benchnav.planning.planners.planner import rollout_path
 from benchnav.planning.problem import (
     Dynamics,
     Problem,
@@ -42,11 +33,11 @@ OF_EPISODES = (0, 1, 2, 6, 7)
 padded_ground, target.
 """
 ENTRAPPED_OF_EPISODES = (0, 1, 2, 3, 7, 8, 9, 10)
-"""Those of `advance_entrapped`: states, cost, dwell_steps, mean, padded_ground, target,
-goal, steps_left.
+"""Arguments of `advance_entrapped` with an episode dimension: states, cost,
+dwell_steps, mean, padded_ground, target, goal, steps_left.
 """
 _DRAWN_SAMPLES = 40
-_MIN_SPREAD = 1e-30  # if all samples cost the same, all have the same weight
+_MIN_SPREAD = 1e-30  # > 0, so that samples of equal cost have equal weights
 
 
 def control_cost(mean: Tensor, noise: Tensor, scale: Tensor) -> Tensor:
@@ -60,14 +51,15 @@ def control_cost(mean: Tensor, noise: Tensor, scale: Tensor) -> Tensor:
     Returns:
         Cost, shape [B, K].
     """
-    return torch.einsum("bta,tak->bk", mean / scale**2, noise)
+    precision_mean = mean / scale**2
+    return torch.einsum("bta,tak->bk", precision_mean, noise)
 
 
 class Dwell(NamedTuple):
     """Dwell times of robots on immobilising terrain.
 
     Args:
-        dwell_steps: consecutive steps, shape [B].
+        dwell_steps: consecutive steps on such terrain, shape [B].
         time_s: time since the start in seconds.
     """
 
@@ -80,13 +72,13 @@ class Ends(NamedTuple):
 
     Args:
         padded_ground: padded maps, M for each episode in turn, shape [B·M, N].
-        target: target (x, y), shape [B·M, 1, 2].
+        target: target (x, y) in metres, shape [B·M, 1, 2].
         grid: size and resolution of the maps.
         objective: J.
-        fields: M.
+        fields: number of fields M.
         level: α of the CVaR over fields.
-        going: mask of rollouts that have not stopped, bool, shape [B·M, K]; None if
-            none stops.
+        going: mask of rollouts that have not stopped, bool, shape [B·M, K]; None
+            without entrapment.
         to_go: costs of the cheapest paths, as in `astar.framed`, shape [B, 2, N]; None
             if the terminal cost is that of J.
     """
@@ -117,17 +109,19 @@ def roll_out(
         problem: B problems.
         state: initial states, shape [B, S].
         mean: mean action sequences, shape [B, T, A].
-        noise: offsets of every mean, clipped to the action bounds, shape [T, A, K].
+        noise: offsets of every mean, shape [T, A, K]; their sum with the mean is
+            clipped to the action bounds.
         target_m: targets (x, y) in metres, shape [B, 2].
-        advance: `advance_chunk`, with `dwell` `advance_entrapped`, or the same
-            compiled.
+        advance: `advance_chunk`, or `advance_entrapped` with `dwell`, or its compiled
+            form.
         ground: padded maps, M for each episode, as in `framed_fields`, shape [B·M, N];
             None for λ̂.
         dwell: dwell times on immobilising terrain; None without entrapment.
 
     Returns:
-        The last states, shape [B·M, K, S], the cost without terminal cost, shape
-        [B·M, K], and, with `dwell`, a mask of those that have not stopped, bool.
+        The last states, shape [B·M, K, S]; the cost without terminal cost, shape
+        [B·M, K]; and, with `dwell`, a mask of rollouts that have not stopped, bool,
+        shape [B·M, K].
     """
     ground = problem.padded_ground if ground is None else ground
     count = len(ground) // len(problem)
@@ -135,38 +129,32 @@ def roll_out(
     mean = mean.repeat_interleave(count, 0)
     target_m = target_m.repeat_interleave(count, 0)
     states = component_wise(state[:, None].expand(-1, noise.shape[2], -1))
-    # Contiguous, as all arguments: another layout would be compiled again.
+    # All arguments are contiguous, since each layout is compiled separately.
     target = target_m[:, None].contiguous()
     cost = state.new_zeros(states.shape[:2])
-    horizon = mean.shape[1]
-    chunks = [
-        slice(begin, min(begin + _CHUNK_STEPS, horizon))
-        for begin in range(0, horizon, _CHUNK_STEPS)
-    ]
-    parts = [
-        Sampled(mean[:, chunk].contiguous(), noise[chunk], *problem.action_bounds)
-        for chunk in chunks
-    ]
+    low, high = problem.action_bounds
+    chunks = []
+    for begin in range(0, mean.shape[1], _CHUNK_STEPS):
+        chunk = slice(begin, begin + _CHUNK_STEPS)
+        chunk_mean = mean[:, chunk].contiguous()
+        chunks.append(Sampled(chunk_mean, noise[chunk], low, high))
     dynamics = problem.dynamics
-    if dwell is None or problem.immobile is None:
-        for sampled in parts:
+    immobile = problem.immobile
+    if dwell is None or immobile is None:
+        for sampled in chunks:
             states, cost = advance(states, cost, sampled, ground, target, dynamics)
         return states, cost, None
-    max_steps = steps_in(problem.immobile.for_s, problem.dt_s)
+    max_steps = steps_in(immobile.for_s, problem.dt_s)
     dwell_steps = dwell.dwell_steps.repeat_interleave(count, 0)[:, None]
     dwell_steps = dwell_steps.expand_as(cost).clamp(max=max_steps - 1).contiguous()
-    steps_left = (
-        ((problem.time_budget_s - dwell.time_s) / problem.dt_s).round().to(state)
-    )
+    time_left_s = problem.time_budget_s - dwell.time_s
+    steps_left = (time_left_s / problem.dt_s).round().to(state)
     steps_left = steps_left.repeat_interleave(count, 0)[:, None]
     goal = problem.goal_m.repeat_interleave(count, 0)[:, None].contiguous()
-    for chunk, sampled in zip(chunks, parts, strict=True):
+    for index, sampled in enumerate(chunks):
+        chunk_steps_left = steps_left - index * _CHUNK_STEPS
         rules = Entrapment(
-            goal,
-            steps_left - chunk.start,
-            problem.goal_radius_m,
-            problem.immobile.below,
-            max_steps,
+            goal, chunk_steps_left, problem.goal_radius_m, immobile.below, max_steps
         )
         states, cost, dwell_steps = advance(
             states, cost, dwell_steps, sampled, ground, target, rules, dynamics
@@ -182,18 +170,26 @@ def advance_chunk(
     target: Tensor,
     dynamics: Dynamics,
 ) -> tuple[Tensor, Tensor]:
-    """Roll out samples over a chunk of the horizon, and add up their costs.
+    """Roll out samples over a chunk of the horizon, and add their costs.
 
-    Arguments are parts of a problem.
+    Args:
+        states: robot states, shape [B, K, S].
+        cost: cost so far, shape [B, K].
+        sampled: action sequences of the chunk.
+        padded_ground: padded maps as in `Problem`, shape [B, N].
+        target: target (x, y) in metres, shape [B, 1, 2].
+        dynamics: dynamics of the problem.
+
+    Returns:
+        States and cost after these steps.
     """
     grid, robot, objective, min_traversability = dynamics
     for step in range(sampled.mean.shape[1]):
         action = sampled_actions(sampled, step)
         ground = grid.lookup(padded_ground, states[..., 0], states[..., 1])
         cost = cost + stage_cost(objective, states, action, ground, target)
-        states = robot(
-            states, action, motion_traversability(ground, min_traversability)
-        )
+        traversability = motion_traversability(ground, min_traversability)
+        states = robot(states, action, traversability)
     return component_wise(states), cost
 
 
@@ -207,6 +203,14 @@ def weigh(
 ) -> tuple[Tensor, Tensor]:
     """Add terminal costs, weigh samples by exp(−cost / temperature) and move the mean.
 
+    Args:
+        states: last states of the rollouts, shape [B·M, K, S].
+        cost: cost of the rollouts without terminal cost, shape [B·M, K].
+        sampled: action sequences of the whole horizon.
+        ends: terminal costs.
+        temperature: temperature in the units of J; None for a relative one.
+        temperature_share: relative temperature, as a fraction of `cost_spread`.
+
     Returns:
         Weights of the samples, shape [B, K], and the mean action sequences, shape
         [B, T, A].
@@ -218,7 +222,8 @@ def weigh(
         if ends.going is not None:
             stopped = (~ends.going).unflatten(0, (-1, ends.fields)).sum(1)
         scale = temperature_share * cost_spread(cost, cost_per_field, stopped)
-    weights = torch.softmax((cost.amin(dim=1, keepdim=True) - cost) / scale, dim=1)
+    min_cost = cost.amin(dim=1, keepdim=True)
+    weights = torch.softmax((min_cost - cost) / scale, dim=1)
     mean = average(sampled.mean, sampled.noise, weights, sampled.low, sampled.high)
     return weights, mean
 
@@ -229,40 +234,49 @@ def total_cost(states: Tensor, cost: Tensor, ends: Ends) -> tuple[Tensor, Tensor
     The cost of rollouts on M fields is the CVaR over them. Stopped rollouts have no
     terminal cost.
 
+    Args:
+        states: last states of the rollouts, shape [B·M, K, S].
+        cost: cost of the rollouts without terminal cost, shape [B·M, K].
+        ends: terminal costs.
+
     Returns:
         Cost of the samples, shape [B, K], and on each field, shape [B, M, K].
     """
     padded_ground, target, grid, objective, fields, level, going, to_go = ends
     ground = grid.lookup(padded_ground, states[..., 0], states[..., 1])
     if to_go is None:
-        last = terminal_cost(objective, states, ground, target)
+        end_cost = terminal_cost(objective, states, ground, target)
     else:
         # All fields of an episode share one map of costs.
-        of_episode = states.unflatten(0, (-1, fields)).flatten(1, 2)
-        paths = astar.cost_at(grid, to_go, of_episode[..., 0], of_episode[..., 1])
-        last = paths.view_as(cost) + PENALTY * (ground <= 0)
-    cost = cost + (last if going is None else torch.where(going, last, 0))
+        episode_states = states.unflatten(0, (-1, fields)).flatten(1, 2)
+        x, y = episode_states[..., 0], episode_states[..., 1]
+        path_cost = astar.cost_at(grid, to_go, x, y)
+        end_cost = path_cost.view_as(cost) + PENALTY * (ground <= 0)
+    if going is not None:
+        end_cost = torch.where(going, end_cost, 0)
+    cost = cost + end_cost
     cost_per_field = cost.unflatten(0, (-1, fields))
-    return tail_cost(cost_per_field, level) if fields > 1 else cost, cost_per_field
+    if fields > 1:
+        cost = tail_cost(cost_per_field, level)
+    return cost, cost_per_field
 
 
 def cost_spread(
     cost: Tensor, cost_per_field: Tensor | None = None, stopped: Tensor | None = None
 ) -> Tensor:
-    """Return the mean excess of costs over the minimum, the unit of the relative
-    temperature.
+    """Return the mean excess of costs over the minimum: the unit of temperature.
 
     Samples that pay the penalty of non-free cells for more steps than the best sample,
-    over all fields, are left out. Otherwise the temperature near such cells would be
-    that of the penalty, and all paths over free terrain would have equal weight. Steps
-    are counted by the cost on each field in units of the penalty, so J itself should
-    spread by less than half of it. For the same reason, samples that stop for good on
-    more fields than the best are left out.
+    over all fields, are excluded. Otherwise the penalty would set the temperature near
+    such cells, and all paths over free terrain would have equal weight. Steps are
+    counted by the cost on each field in units of the penalty, so the spread of J itself
+    should be less than half of the penalty. For the same reason, samples that stop for
+    good on more fields than the best sample are excluded.
 
     Args:
         cost: cost of each sample, shape [B, K].
         cost_per_field: cost on each field, shape [B, M, K]; None for a single field.
-        stopped: number of fields on which a sample stops, shape [B, K]; None for 0.
+        stopped: number of fields on which each sample stops, shape [B, K]; None for 0.
 
     Returns:
         Mean excess, > 0, shape [B, 1].
@@ -272,7 +286,8 @@ def cost_spread(
     best = cost.argmin(dim=1, keepdim=True)
     index = best[:, None].expand(-1, cost_per_field.shape[1], -1)
     excess_per_field = cost_per_field - cost_per_field.gather(2, index)
-    counted = (excess_per_field / PENALTY + 0.5).floor().sum(1) <= 0
+    penalties_per_field = (excess_per_field / PENALTY + 0.5).floor()
+    counted = penalties_per_field.sum(1) <= 0
     if stopped is not None:
         counted = counted & (stopped <= stopped.gather(1, best))
     excess = cost - cost.amin(dim=1, keepdim=True)
@@ -285,7 +300,8 @@ def average(
     mean: Tensor, noise: Tensor, weights: Tensor, low: Tensor, high: Tensor
 ) -> Tensor:
     """Return the mean moved by weighted noise, clip(u + Σ w·ε), shape [B, T, A]."""
-    return torch.clamp(mean + (noise * weights[:, None, None]).sum(-1), low, high)
+    offset = (noise * weights[:, None, None]).sum(-1)
+    return torch.clamp(mean + offset, low, high)
 
 
 def drawn_paths(
@@ -296,8 +312,9 @@ def drawn_paths(
     noise: Tensor,
     weights: Tensor,
 ) -> dict[str, Tensor]:
-    """Return the path of the updated mean, and those of the best samples."""
-    best = weights.topk(min(_DRAWN_SAMPLES, weights.shape[1]), dim=1).indices
+    """Return layers of a plan: the updated mean's path, and those of the best samples."""
+    count = min(_DRAWN_SAMPLES, weights.shape[1])
+    best = weights.topk(count, dim=1).indices
     best_noise = noise[..., best].movedim(2, 0)
     samples = perturb(mean[..., None], best_noise, *problem.action_bounds)
     actions = torch.cat((updated[..., None], samples), dim=3)

@@ -1,8 +1,9 @@
-"""Interfaces of planners and local planners, and of what they return.
+"""Interfaces of planners and local planners, and the plans that they return.
 
-A planner is stateless: `init` creates a plan state, `plan` receives one and returns the
-next. Both are pure: the same arguments give the same result. Letters in shapes: B
-episodes, N points, M samples, E edges, S state and A action dimensions.
+A planner is stateless: `init` creates a plan state, and `plan` receives a plan state and
+returns the next. Both are pure functions: their results depend only on the arguments.
+Letters in shapes: B episodes, N points, M samples, E edges, S state and A action
+dimensions.
 """
 
 import math
@@ -21,19 +22,18 @@ from benchnav.planning.problem import Problem, Task
 from benchnav.planning.robots import STEERING, Robot
 from benchnav.planning.sensing.sensor import Step
 
-# Layers of a `Plan`, with the dimensions between that of the episodes and (x, y).
+# Layers of a `Plan`, with their dimensions between the episodes and (x, y).
 LAYERS = {"path": "N", "samples": "MN", "reference": "N", "tree": "EN"}
 
 # Remedies for a robot that a planner does not steer.
-_SAMPLED = "Take a planner that samples actions, such as mppi."
+_SAMPLED = "Use a planner that samples actions, such as mppi."
 _STEERED = (
     "The planner commands a turn rate; this robot is steered by an angle, and turns "
-    "only while it drives. "
-    "Take mppi, astar_mppi or straight."
+    "only while it drives. Use mppi, astar_mppi or straight."
 )
 
-# Fields of a `Problem` that a prediction decides; free space comes from one of the
-# first two, as the rules say.
+# Fields of a `Problem` that depend on a prediction. By the rules of the task, free space
+# depends on one of the first two.
 INPUTS = frozenset({"risk_map", "distribution", "fields"})
 
 
@@ -50,7 +50,7 @@ class PlanStatus(IntEnum):
 class Plan:
     """Status of planning, and the layers that playback draws.
 
-    Unused points are NaN; layers that a planner does not have are of size 0.
+    Unused points are NaN. Layers that a planner does not return have size 0.
 
     Args:
         status: `PlanStatus` of each episode, int64, shape [B].
@@ -73,20 +73,19 @@ class Plan:
         cls, batch: int, device: torch.device | str = "cpu", **layers: Tensor
     ) -> "Plan":
         """Return a plan with status OK and only the given layers."""
-        blank = {
-            name: torch.empty(batch, *[0] * len(inner), 2, device=device)
-            for name, inner in LAYERS.items()
-        }
-        status = torch.zeros(batch, dtype=torch.int64, device=device)
-        return cls(**{"status": status, **blank, **layers})
+        values = {"status": torch.zeros(batch, dtype=torch.int64, device=device)}
+        for name, inner in LAYERS.items():
+            no_points = [0] * len(inner)
+            values[name] = torch.empty(batch, *no_points, 2, device=device)
+        return cls(**{**values, **layers})
 
     def lines(self, member: int) -> dict[str, Tensor]:
         """Return the layers of one episode as polylines, shape [lines, N, 2]."""
-        layers = {name: getattr(self, name)[member] for name in LAYERS}
-        return {
-            name: layer if layer.dim() == 3 else layer[None]
-            for name, layer in layers.items()
-        }
+        lines = {}
+        for name in LAYERS:
+            layer = getattr(self, name)[member]
+            lines[name] = layer if layer.dim() == 3 else layer[None]
+        return lines
 
 
 State = TypeVar("State")
@@ -95,31 +94,35 @@ State = TypeVar("State")
 class Planner(Specified, ABC, Generic[State]):
     """Base class of planners; `benchnav.testing.check_planner` checks the contract.
 
-    `init` and `plan` are required, all else has a default. A planner only holds its
-    settings. Everything that changes is in the plan state, so that one planner serves
-    any batch in any order.
+    `init` and `plan` are required; the other members have defaults. A planner stores
+    only its settings. Everything that changes is in the plan state, so that one planner
+    can plan for any batch in any order.
     """
 
     steers: tuple[tuple[str, ...], ...] | None = None
-    """Action names of the robots that it steers, others are rejected; None: any robot."""
+    """Action names of the robots that it steers; None for any robot."""
 
     robots: tuple[type[Robot], ...] | None = None
-    """Kinds of robots that it plans for, among those that it steers; None: all."""
+    """Classes of robots that it plans for, among those that it steers; None for all."""
 
     blind: bool = False
-    """On the class: whether it uses no map; one run then stands for all models and risk
-    settings. See `uses`.
+    """Whether it uses no map; a class attribute.
+
+    One run then represents all models and risk settings. See `uses`.
     """
 
     plans_once: bool = False
-    """Whether it plans only at the start; robots that learn are then rejected."""
+    """Whether it plans only at the start; beliefs that learn are then rejected."""
 
     given_truth: bool = False
     """Whether it receives λ itself; models other than `clairvoyant` are then rejected."""
 
     @property
     def compiled(self) -> bool | None:
-        """Whether it runs compiled; None before the first plan, or if it never is."""
+        """Whether it runs compiled.
+
+        None before the first plan, and for a planner without compiled functions.
+        """
         return None
 
     @abstractmethod
@@ -128,10 +131,7 @@ class Planner(Specified, ABC, Generic[State]):
 
         Args:
             problem: B problems, with predictions.
-            generator: source of randomness on the CPU; only drawn from in this call.
-
-        Returns:
-            The first plan state.
+            generator: source of randomness on the CPU, for use in this call only.
         """
 
     @abstractmethod
@@ -139,8 +139,8 @@ class Planner(Specified, ABC, Generic[State]):
         """Return the next action of every episode.
 
         Args:
-            step: robot states, and the λ that they observed.
-            plan_state: from `init` or the previous call; it is not changed.
+            step: robot states, and the λ that the robots observed.
+            plan_state: plan state from `init` or the last call; not modified.
 
         Returns:
             Actions within the bounds, shape [B, A]; the next plan state; the plan.
@@ -150,12 +150,12 @@ class Planner(Specified, ABC, Generic[State]):
         """Return the plan state of some episodes, so that ended ones cost no time.
 
         Args:
-            plan_state: plan state of all episodes; it is not changed.
+            plan_state: plan state of all episodes; not modified.
             members: indices of the episodes to keep, int64, shape [M].
 
         Returns:
-            Their plan state; `NotImplemented`, the default, if ended episodes must stay
-            in the batch.
+            The plan state of these episodes; `NotImplemented`, the default, if ended
+            episodes must stay in the batch.
         """
         return NotImplemented
 
@@ -163,7 +163,7 @@ class Planner(Specified, ABC, Generic[State]):
         """Replan for an updated λ̂ map.
 
         Args:
-            plan_state: from the last call; it is not changed.
+            plan_state: plan state from the last call; not modified.
             problem: problems of the same episodes that start at the robots' current
                 states; only prediction, λ̂ and free mask may differ.
 
@@ -179,11 +179,12 @@ class Planner(Specified, ABC, Generic[State]):
         Conditions that differ only in other inputs run once.
 
         Args:
-            task: the task; its rules define which input free space comes from, see
+            task: the task; its rules define the input of free space, see
                 `FreeSpace.source`.
 
         Returns:
-            A subset of `INPUTS`; by default all of them, for a blind planner none.
+            A subset of `INPUTS`; by default all of them, or no input for a blind
+            planner.
         """
         return frozenset() if self.blind else INPUTS
 
@@ -192,14 +193,15 @@ class Planner(Specified, ABC, Generic[State]):
         return ""
 
     def remarks(self, task: Task) -> tuple[str, ...]:
-        """Return notes for tables, a line each, such as limits that the robot lacks."""
+        """Return notes for tables, a line each, such as limits that it adds."""
         return ()
 
 
 class LocalPlanner(Planner[State]):
     """Base class of local planners: planners that receive a target at each step.
 
-    Their plan states are a `Batch` with a `problem`. As planners they head for the goal.
+    The plan state is a `Batch` with a `problem`. Used as a planner, it drives toward the
+    goal.
     """
 
     name: str
@@ -207,7 +209,7 @@ class LocalPlanner(Planner[State]):
 
     @property
     def seeks_goal(self) -> bool:
-        """Whether its cost runs to the goal, whatever the target is."""
+        """Whether its cost is a cost to the goal, whatever the target is."""
         return False
 
     def plan(self, step: Step, plan_state: Any) -> tuple[Tensor, State, Plan]:
@@ -223,7 +225,7 @@ class LocalPlanner(Planner[State]):
     def commit_action(self, plan_state: State, action: Tensor) -> State:
         """Return the plan state after executed actions, shape [B, A].
 
-        They may differ from the actions that it chose.
+        The executed actions may differ from those of `plan_toward`.
         """
         return plan_state
 
@@ -239,25 +241,27 @@ class LocalPlanner(Planner[State]):
 def check_finite(
     owner: str,
     settings: Any,
-    above: tuple[str, ...],
+    above_zero: tuple[str, ...],
     at_least_zero: tuple[str, ...] = (),
 ) -> None:
     """Check that settings are finite and not negative; None is always valid.
 
     Args:
         owner: owner of the settings, for the message.
-        settings: a dataclass.
-        above: names of fields that must not be 0.
+        settings: dataclass of settings.
+        above_zero: names of fields that must not be 0.
         at_least_zero: names of fields that may be 0.
 
     Raises:
-        ConfigError: If one is not.
+        ConfigError: If a setting is out of its range.
     """
-    for name in (*above, *at_least_zero):
+    for name in (*above_zero, *at_least_zero):
         value = getattr(settings, name)
-        sign = ">" if name in above else "≥"
-        is_in_range = value is None or 0 <= value < math.inf
-        fits = is_in_range and (value != 0 or sign == "≥")
+        if value is None:
+            continue
+        may_be_zero = name in at_least_zero
+        fits = 0 <= value < math.inf and (value != 0 or may_be_zero)
+        sign = "≥" if may_be_zero else ">"
         expect(fits, f"`{name}` {sign} 0 and finite for {owner}, got {value}.")
 
 
@@ -270,30 +274,30 @@ def check_steers(planner: Planner[Any], robot: Robot, name: str) -> None:
         name: name of the planner, for the message.
 
     Raises:
-        ConfigError: If the planner does not know the robot's actions, or the robot is
-            of another kind.
+        ConfigError: If the planner does not steer robots with these actions, or of this
+            class.
     """
+    robot_name = type(robot).__name__
     if planner.robots is not None and type(robot) not in planner.robots:
         kinds = " or ".join(kind.__name__ for kind in planner.robots)
         raise ConfigError(
-            f"Expected robot {kinds} for planner {name!r}, got {type(robot).__name__}."
+            f"Expected robot {kinds} for planner {name!r}, got {robot_name}."
         )
     names = tuple(robot.action_names)
     steered_names = (names,) if planner.steers is None else planner.steers
-    actions = " or ".join(f"({', '.join(option)})" for option in steered_names)
+    options = " or ".join(f"({', '.join(option)})" for option in steered_names)
     knows_angle = any(STEERING in option for option in steered_names)
-    steered = STEERING in names and not knows_angle
-    steered = STEERING in names and not any(STEERING in each for each in steered_names)
+    needs_angle = STEERING in names and not knows_angle
+    remedy = _STEERED if needs_angle else _SAMPLED
     expect(
         names in steered_names,
-        f"a robot with actions {actions} for planner {name!r}, got "
-        f"{type(robot).__name__} with "
-        f"({', '.join(names)}). {_STEERED if steered else _SAMPLED}",
+        f"a robot with actions {options} for planner {name!r}, got "
+        f"{robot_name} with ({', '.join(names)}). {remedy}",
     )
 
 
 def rollout_path(problem: Problem, state: Tensor, actions: Tensor) -> Tensor:
-    """Return positions along action sequences, the first included.
+    """Return positions along action sequences, including the initial positions.
 
     Args:
         problem: B problems.
@@ -306,6 +310,7 @@ def rollout_path(problem: Problem, state: Tensor, actions: Tensor) -> Tensor:
     states = state[:, None].expand(-1, actions.shape[-1], -1)
     positions = [states[..., :2]]
     for action in actions.movedim(-1, 2).unbind(1):
-        states = problem.robot(states, action, problem.traversability_at(states))
+        traversability = problem.traversability_at(states)
+        states = problem.robot(states, action, traversability)
         positions.append(states[..., :2])
     return torch.stack(positions, dim=2)

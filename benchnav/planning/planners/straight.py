@@ -1,7 +1,7 @@
 """Straight driving to the goal: the blind baseline.
 
-`Straight` uses only the goal. Planners with a global path recover by the same control
-law.
+`Straight` uses only the goal. Planners with a global path use the same control law in
+their recovery.
 Letters in shapes: B episodes, S state and A action dimensions.
 """
 
@@ -15,14 +15,14 @@ from benchnav.planning.problem import Problem, Task
 from benchnav.planning.robots import SPEED, STEERING, TURN_RATE, Robot
 from benchnav.planning.sensing.sensor import Step
 
-# Turn commanded for a radian of heading error: rad/s of turn rate, or rad of steering.
+# Turn rate in rad/s, or steering angle in rad, per radian of heading error.
 _TURN_GAIN = 4.0
 # A robot with a larger heading error turns before it drives, so that it leaves narrow
 # passages straight.
 _AWAY_RAD = 0.2
-# Maximum speed per metre of remaining distance, 1/s, so that it does not overshoot.
+# Maximum speed per metre of remaining distance, 1/s, to prevent overshooting.
 _APPROACH = 2.0
-# Minimum fraction of the top speed of a robot that cannot turn in place.
+# Minimum fraction of the top speed for a robot that cannot turn in place.
 _CREEP = 0.3
 
 STEERS = ((SPEED, TURN_RATE), (SPEED, STEERING))
@@ -36,8 +36,9 @@ def turn_toward(state: Tensor, target_m: Tensor) -> Tensor:
         target_m: positions (x, y) in metres, shape [*B, 2].
     """
     offset = target_m - state[..., :2]
-    missing = torch.atan2(offset[..., 1], offset[..., 0]) - state[..., 2]
-    return torch.remainder(missing + math.pi, 2 * math.pi) - math.pi
+    direction = torch.atan2(offset[..., 1], offset[..., 0])
+    angle = direction - state[..., 2]
+    return torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
 
 
 def steer_toward(state: Tensor, target_m: Tensor, robot: Robot) -> Tensor:
@@ -46,23 +47,26 @@ def steer_toward(state: Tensor, target_m: Tensor, robot: Robot) -> Tensor:
     Args:
         state: states that begin with (x, y, θ), shape [B, S].
         target_m: targets (x, y) in metres, shape [B, 2].
-        robot: a robot with one of the actions `STEERS`.
+        robot: robot with one of the pairs of actions in `STEERS`.
 
     Returns:
         Actions within the bounds, shape [B, 2].
     """
-    missing = turn_toward(state, target_m)
-    low, high, rates = robot.action_low, robot.action_high, robot.action_rates
-    # A robot of limited acceleration must be able to stop its turn in time.
-    gain = _TURN_GAIN if rates is None else min(_TURN_GAIN, 2 * rates[1] / high[1])
+    heading_error = turn_toward(state, target_m)
+    low = robot.action_low
+    high = robot.action_high
+    gain = _TURN_GAIN
+    if robot.action_rates is not None:
+        # A robot of limited acceleration must be able to stop its turn in time.
+        _, max_rate = robot.action_rates
+        gain = min(gain, 2 * max_rate / high[1])
     min_fraction = 0.0 if TURN_RATE in robot.action_names else _CREEP
-    aligned = high[0] * (1 - missing.abs() / _AWAY_RAD).clamp(min=min_fraction)
+    fraction = (1 - heading_error.abs() / _AWAY_RAD).clamp(min=min_fraction)
     distance_m = torch.linalg.vector_norm(target_m - state[:, :2], dim=1)
-    speed = torch.minimum(aligned, _APPROACH * distance_m)
-    actions = zip((speed, gain * missing), low, high, strict=True)
-    return torch.stack(
-        [action.clamp(lower, upper) for action, lower, upper in actions], dim=1
-    )
+    speed = torch.minimum(high[0] * fraction, _APPROACH * distance_m)
+    turn = gain * heading_error
+    speed = speed.clamp(low[0], high[0])
+    return torch.stack((speed, turn.clamp(low[1], high[1])), dim=1)
 
 
 class Straight(Planner[Problem]):
@@ -83,7 +87,8 @@ class Straight(Planner[Problem]):
         """Return actions toward the goal; see `Planner`."""
         action = steer_toward(step.state, plan_state.goal_m, plan_state.robot)
         line = torch.stack((step.state[:, :2], plan_state.goal_m), dim=1)
-        return action, plan_state, Plan.empty(len(action), action.device, path=line)
+        plan = Plan.empty(len(action), action.device, path=line)
+        return action, plan_state, plan
 
     def revise(self, plan_state: Problem, problem: Problem) -> Problem:
         """Return the new problem as the plan state; see `Planner`."""

@@ -1,14 +1,14 @@
 """Turning manoeuvres of robots that are steered by an angle.
 
 Noise that is independent from step to step hardly turns a bicycle, since its steering
-averages out. Samples about a mean at rest then contain no turn to a goal behind the
-robot, and all of them lead away from it. A turn is therefore an action sequence of its
-own: full steering at full speed for a while, then straight ahead. Source: after
-Trevisan and Alonso-Mora (2024), "Biased-MPPI: Informing sampling-based model predictive
-control by fusing ancillary controllers", whose controllers add such sequences to the
-samples. If no turn pays within the horizon, the robot drives a Dubins path. Letters in
-shapes: B episodes, M fields, N cells of a padded map, T horizon steps, A action
-dimensions, P primitives.
+averages out. If the goal is behind a standing robot, no sample then contains a turn to
+it, and all samples lead away from it. Turns are therefore separate action sequences:
+full steering at full speed for a while, then straight ahead. Source: after Trevisan and
+Alonso-Mora (2024), "Biased-MPPI: Informing sampling-based model predictive control by
+fusing ancillary controllers", whose controllers add such sequences to the samples. If no
+turn pays within the horizon, the robot drives a Dubins path. Letters in shapes: B
+episodes, M fields, N cells of a padded map, T horizon steps, A action dimensions, P
+primitives.
 """
 
 import math
@@ -25,7 +25,7 @@ from benchnav.planning.problem import (
 )
 from benchnav.planning.robots import SPEED, STEERING, Robot
 
-_DURATIONS = 16  # of turns from 0 on, equally spaced in the horizon
+_DURATIONS = 16  # number of equal parts of the horizon that a turn may last for
 _SPACING = 0.5  # between points at which a Dubins path is checked, in cells
 
 
@@ -45,10 +45,10 @@ def choose(
 ) -> tuple[Tensor, Tensor]:
     """Replace mean action sequences that are no better than standing by turns.
 
-    A turn replaces the mean instead of being a sample, since the average of a turn to
-    the left and one to the right is neither. If none pays within the horizon, since its
-    gain comes later, the robot follows a Dubins path until it faces the target; samples
-    would only slow it down.
+    A turn replaces the mean instead of being a sample, since the average of a left turn
+    and a right turn is not a turn. A turn may pay only after the horizon. If none pays
+    within it, the robot follows a Dubins path until it faces the target; samples would
+    only slow it down.
 
     Args:
         cost_of: returns the cost of action sequences, [B, K], for means [B, T, A] and
@@ -65,22 +65,26 @@ def choose(
         Action sequences, shape [B, T, A], and a mask of those on Dubins paths, which
         must be used unchanged, bool, shape [B].
     """
-    robot = problem.robot
-    primitives = turning_primitives(robot, mean.shape[1], mean)
+    horizon = mean.shape[1]
+    primitives = turning_primitives(problem.robot, horizon, mean)
     no_offset = torch.zeros_like(primitives[..., :1])
     mean_cost = cost_of(mean, no_offset)
-    standing_cost = cost_of(0 * mean, no_offset)
+    standing = 0 * mean
+    standing_cost = cost_of(standing, no_offset)
     stands = (mean_cost >= standing_cost)[:, 0]
     # Only on the CPU: another device would have to synchronise.
-    if mean.device.type == "cpu" and not bool((stands | following).any()):
-        return mean, following
-    turn_cost, best = cost_of(0 * mean, primitives).min(dim=1)
+    if mean.device.type == "cpu":
+        needs_turn = stands | following
+        if not bool(needs_turn.any()):
+            return mean, following
+    turn_cost, best = cost_of(standing, primitives).min(dim=1)
     pays = stands & (turn_cost < standing_cost[:, 0])
-    path, turns = follow_dubins(problem, state, target_m, ground, mean.shape[1])
+    path, turns = follow_dubins(problem, state, target_m, ground, horizon)
     follows = turns & (following | (stands & ~pays))
     best_turn = primitives.movedim(2, 0)[best]
     turn = torch.where(follows[:, None, None], path, best_turn)
-    return torch.where((pays | follows)[:, None, None], turn, mean), follows
+    replaces = (pays | follows)[:, None, None]
+    return torch.where(replaces, turn, mean), follows
 
 
 def follow_dubins(
@@ -89,8 +93,8 @@ def follow_dubins(
     """Return actions at full speed along the shortest forward path to a target.
 
     The path starts to the side of the target or, if that path is not clear, to the
-    other. A path is clear if it keeps to free terrain that does not immobilise, as far
-    as the robot gets within the horizon at λ = 1.
+    other side. A path is clear if it stays on free terrain that does not immobilise, as
+    far as the robot gets within the horizon at λ = 1.
 
     Args:
         problem: B problems of a robot that is steered by an angle.
@@ -107,23 +111,16 @@ def follow_dubins(
     low, high = problem.action_bounds
     speed = robot.action_names.index(SPEED)
     steering = robot.action_names.index(STEERING)
-    extremes = torch.zeros_like(torch.stack((low, high)))
-    extremes[:, speed] = high[speed]
-    extremes[:, steering] = torch.stack((low[steering], high[steering]))
-    before = state[:, None].expand(-1, 2, -1)
-    actions = extremes.expand(len(state), -1, -1)
-    motion = robot(before, actions, torch.ones_like(before[..., 0])) - before
-    step_m = torch.hypot(motion[..., 0], motion[..., 1]).amin(dim=1)
-    turned = motion[..., 2].abs().amin(dim=1)
-    can_turn = (step_m > 0) & (turned > 0)
-    radius = torch.where(can_turn, step_m / turned, 1.0)
+    step_m, turn_rad = _full_steering(problem, state)
+    can_turn = (step_m > 0) & (turn_rad > 0)
+    radius = torch.where(can_turn, step_m / turn_rad, 1.0)
 
-    near = dubins_segments_to_point(state[:, :3], target_m, radius)
-    far = dubins_segments_to_point(state[:, :3], target_m, radius, far_side=True)
+    pose = state[:, :3]
+    near = dubins_segments_to_point(pose, target_m, radius)
+    far = dubins_segments_to_point(pose, target_m, radius, far_side=True)
     reach_m = robot.top_speed_mps * horizon * problem.dt_s
-    near_clear, far_clear = (
-        _is_clear(problem, state, segments, ground, reach_m) for segments in (near, far)
-    )
+    near_clear = _is_clear(problem, state, near, ground, reach_m)
+    far_clear = _is_clear(problem, state, far, ground, reach_m)
     curvature = torch.where(near_clear[:, None], near[0], far[0])
     length = torch.where(near_clear[:, None], near[1], far[1])
 
@@ -132,23 +129,43 @@ def follow_dubins(
     own_ground = problem.grid.lookup(ground, x, y)
     min_traversability = problem.task.rules.min_traversability
     traversability = motion_traversability(own_ground, min_traversability)
-    step_m = step_m * traversability.unflatten(0, (len(state), -1)).mean(dim=1)
-    along = torch.arange(horizon + 1, device=state.device) * step_m[:, None]
-    first, second = length[:, :1], length[:, 1:]
-    on_second = (along - first).clamp(min=0).minimum(second)
-    heading = curvature[:, :1] * along.minimum(first) + curvature[:, 1:] * on_second
-    turn_fraction = (
-        heading.diff(dim=1) * radius[:, None] / step_m[:, None].clamp(min=1e-9)
-    )
+    mean_traversability = traversability.unflatten(0, (len(state), -1)).mean(dim=1)
+    step_m = step_m * mean_traversability
+    along_m = torch.arange(horizon + 1, device=state.device) * step_m[:, None]
+    first_m = length[:, :1]
+    second_m = length[:, 1:]
+    on_first_m = along_m.minimum(first_m)
+    on_second_m = (along_m - first_m).clamp(min=0).minimum(second_m)
+    heading = curvature[:, :1] * on_first_m + curvature[:, 1:] * on_second_m
+    min_step_m = step_m[:, None].clamp(min=1e-9)
+    turn_fraction = heading.diff(dim=1) * radius[:, None] / min_step_m
+    right_turn = -turn_fraction * low[steering]
+    left_turn = turn_fraction * high[steering]
     actions = state.new_zeros(len(state), horizon, len(low))
     actions[..., speed] = high[speed]
-    actions[..., steering] = torch.where(
-        turn_fraction < 0,
-        -turn_fraction * low[steering],
-        turn_fraction * high[steering],
-    )
-    is_straight = (curvature * length).abs().sum(dim=1) <= turned
+    actions[..., steering] = torch.where(turn_fraction < 0, right_turn, left_turn)
+    is_straight = (curvature * length).abs().sum(dim=1) <= turn_rad
     return actions, can_turn & ~is_straight & (near_clear | far_clear)
+
+
+def _full_steering(problem: Problem, state: Tensor) -> tuple[Tensor, Tensor]:
+    """Return distance and turn of a step at λ = 1 with full steering, shape [B] each.
+
+    Both are the minimum over a step to the right and one to the left.
+    """
+    robot = problem.robot
+    low, high = problem.action_bounds
+    speed = robot.action_names.index(SPEED)
+    steering = robot.action_names.index(STEERING)
+    extremes = torch.zeros_like(torch.stack((low, high)))
+    extremes[:, speed] = high[speed]
+    extremes[:, steering] = torch.stack((low[steering], high[steering]))
+    before = state[:, None].expand(-1, 2, -1)
+    actions = extremes.expand(len(state), -1, -1)
+    motion = robot(before, actions, torch.ones_like(before[..., 0])) - before
+    step_m = torch.hypot(motion[..., 0], motion[..., 1]).amin(dim=1)
+    turn_rad = motion[..., 2].abs().amin(dim=1)
+    return step_m, turn_rad
 
 
 def _is_clear(
@@ -158,14 +175,14 @@ def _is_clear(
     ground: Tensor,
     reach_m: float,
 ) -> Tensor:
-    """Return whether paths keep to free terrain that does not immobilise, bool, [B].
+    """Return whether paths stay on free terrain that does not immobilise, bool, [B].
 
     Args:
         problem: B problems.
         state: states of the robots, shape [B, S].
         segments: paths, as returned by `dubins_segments_to_point`.
         ground: padded maps, M for each episode, shape [B·M, N].
-        reach_m: length of the paths that is checked.
+        reach_m: checked length of the paths in metres.
     """
     grid = problem.grid
     spacing_m = _SPACING * grid.resolution_m
@@ -177,36 +194,38 @@ def _is_clear(
     by_field = (len(state), -1)
     mean = predicted_traversability(values).unflatten(0, by_field).mean(dim=1)
     is_firm = (mean >= min_traversability).all(dim=1)
-    return is_firm & (values > 0).unflatten(0, by_field).flatten(1).all(dim=1)
+    is_free = (values > 0).unflatten(0, by_field).flatten(1)
+    return is_firm & is_free.all(dim=1)
 
 
 def turning_primitives(robot: Robot, horizon: int, like: Tensor) -> Tensor:
     """Return turns to both sides.
 
-    They are forward and, if the robot can reverse, also backward, and backward then
-    forward.
+    They are forward. If the robot can reverse, there are also turns backward, and turns
+    backward that are followed by straight driving forward.
 
     Args:
         robot: robot that is steered by an angle.
         horizon: number of steps T.
-        like: tensor of the dtype and device.
+        like: tensor with the dtype and device of the result.
 
     Returns:
         Action sequences within the bounds, shape [T, A, P].
     """
     names = tuple(robot.action_names)
-    speed, steering = names.index(SPEED), names.index(STEERING)
-    low, high = robot.action_low, robot.action_high
-    forward, backward = max(high[speed], 0.0), min(low[speed], 0.0)
+    speed = names.index(SPEED)
+    steering = names.index(STEERING)
+    low = robot.action_low
+    high = robot.action_high
+    forward = max(high[speed], 0.0)
+    backward = min(low[speed], 0.0)
     gears = [(forward, forward)]
     if backward < 0:
         gears += [(backward, backward), (backward, forward)]
     step = torch.arange(horizon, device=like.device)[:, None]
     part = torch.arange(_DURATIONS + 1, device=like.device)
     turns = step * _DURATIONS < part * horizon  # [T, durations]
-    straight = torch.zeros(
-        horizon, len(names), _DURATIONS + 1, dtype=like.dtype, device=like.device
-    )
+    straight = like.new_zeros(horizon, len(names), _DURATIONS + 1)
     primitives = []
     for first_speed, second_speed in gears:
         for angle in (low[steering], high[steering]):

@@ -1,1 +1,1 @@
-"""The world: what traversability does to a robot, and how an episode ends."""
+"""The world: the effect of traversability on robots, and the ends of episodes."""

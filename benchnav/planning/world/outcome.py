@@ -20,7 +20,7 @@ class Outcome(IntEnum):
     RUNNING = 0
     SUCCESS = 1
     TIMEOUT = 2
-    # a timeout; in its last 10 s the robot was driven and moved under 0.5 m: low λ
+    # a timeout on low λ: in its last 10 s the robot was driven and moved under 0.5 m
     STUCK = 3
     OUT_OF_BOUNDS = 4
     PLANNER_FAILURE = 5  # the planner returned `PlanStatus.FAILED`
@@ -48,9 +48,10 @@ def tell_standstill(
     Args:
         outcome: outcomes, int64, shape [B].
         steps: number of steps of each episode, int64, shape [B].
-        positions_m: positions, those beyond an episode's end ignored, shape
+        positions_m: positions (x, y) in metres, ignored after an episode's end, shape
             [B, N + 1, 2].
-        driven_m: commanded distance of each step, that at λ = 1, shape [B, N].
+        driven_m: commanded distance of each step in metres, the distance at λ = 1,
+            shape [B, N].
         dt_s: time step in seconds.
 
     Returns:

@@ -1,15 +1,14 @@
 """Realised λ: a value for each episode, step and position.
 
 Noise is keyed by (root key, map, step), or by (root key, map) if λ is constant during
-an episode. Hence all planners and settings meet common random numbers, whatever the
-batch or the order.
+an episode. Hence all planners and settings are evaluated on common random numbers,
+whatever the batch or the order.
 
 Frozen λ is drawn once per episode as a correlated field: a field of correlated standard
 normals passes through each cell's quantile function (`benchnav.core.copula`). If
 terrain can immobilise a robot, draws without a feasible path from start to goal are
-rejected: the benchmark asks which path to take, so one must exist. Letters in shapes: B
+rejected, since an episode without a path cannot compare planners. Letters in shapes: B
 episodes, N steps, H×W cells, K components.
-cells, K components.
 """
 
 from collections.abc import Sequence
@@ -18,6 +17,7 @@ import numpy as np
 import torch
 from scipy.ndimage import generate_binary_structure, label
 from torch import Tensor
+from torch.nn.functional import pad
 
 from benchnav.core import rng
 from benchnav.core.batch import map_tensors
@@ -66,11 +66,11 @@ class Realisation:
             ConfigError: If λ of some cells is missing.
         """
         check_known(terrain, world)
-        self._grid, self._truth = terrain.grid, terrain.truth
-        truth = self._truth
-        self.attempts = torch.ones(
-            len(terrain), dtype=torch.int64, device=terrain.traversability.device
-        )
+        truth = terrain.truth
+        self._grid = terrain.grid
+        self._truth = truth
+        device = terrain.traversability.device
+        self.attempts = torch.ones(len(terrain), dtype=torch.int64, device=device)
         self.field: Tensor | None = None
         if world.noise == "stored":
             self.field = terrain.traversability.clone()
@@ -80,13 +80,12 @@ class Realisation:
             layers = self.field[:, None]
         else:
             layers = torch.cat((truth.weights, truth.means, truth.stds), dim=1)
-            # A stream each, so that another time budget leaves the noise of the first
-            # steps as it is.
-            noise = [
-                rng.normal(rng.stream_key(key, int(i)), _FIRST, (steps,)) for i in maps
-            ]
+            # One stream per map, so that the time budget does not change the noise of
+            # the first steps.
+            streams = [rng.stream_key(key, int(index)) for index in maps]
+            noise = [rng.normal(stream, _FIRST, (steps,)) for stream in streams]
             self._noise = torch.from_numpy(np.concatenate(noise)).to(layers)
-        # Framed for lookups, shape [B, 1 or 3·K, N].
+        # Padded for lookups, shape [B, 1 or 3·K, (H + 2)·(W + 2)].
         self._ground = self._grid.pad(layers, outside=0.0)
 
     def at(self, state: Tensor, step: Tensor) -> Tensor:
@@ -103,13 +102,13 @@ class Realisation:
         if self.field is not None:
             return self._grid.lookup(self._ground[:, 0], x, y)
         last = self._noise.shape[1] - 1
-        noise = self._noise.gather(1, step.clamp(max=last)[:, None])[:, :, None]
+        index = step.clamp(max=last)[:, None]
+        noise = self._noise.gather(1, index)[:, :, None]
         count = self._ground.shape[1]
-        values = self._grid.lookup(
-            self._ground.flatten(0, 1),
-            x.repeat_interleave(count),
-            y.repeat_interleave(count),
-        )
+        layers = self._ground.flatten(0, 1)
+        layer_x = x.repeat_interleave(count)
+        layer_y = y.repeat_interleave(count)
+        values = self._grid.lookup(layers, layer_x, layer_y)
         weights, means, stds = values.view(len(x), 3, count // 3, 1, 1).unbind(1)
         mixture = TraversabilityMixture(weights, means, stds)
         traversability = mixture.from_normal(noise)[:, 0, 0]
@@ -123,7 +122,8 @@ class Realisation:
         Args:
             step: number of steps taken; steps beyond the last repeat it.
         """
-        noise = self._noise[:, min(step, self._noise.shape[1] - 1), None, None]
+        index = min(step, self._noise.shape[1] - 1)
+        noise = self._noise[:, index, None, None]
         return self._truth.from_normal(noise.expand(-1, *self._grid.shape))
 
     def exchange_(self, members: Tensor, others: "Realisation") -> None:
@@ -142,12 +142,12 @@ class Realisation:
             self.field.index_copy_(0, members, others.field)
             return
         # Time budgets may differ; noise beyond an episode's own budget is never used.
-        n_steps = max(self._noise.shape[1], others._noise.shape[1])
-        old, new = (
-            torch.nn.functional.pad(noise, (0, n_steps - noise.shape[1]))
-            for noise in (self._noise, others._noise)
-        )
-        self._noise = old.index_copy(0, members, new)
+        old_noise = self._noise
+        new_noise = others._noise
+        difference = old_noise.shape[1] - new_noise.shape[1]
+        old_noise = pad(old_noise, (0, max(-difference, 0)))
+        new_noise = pad(new_noise, (0, max(difference, 0)))
+        self._noise = old_noise.index_copy(0, members, new_noise)
 
 
 def check_known(terrain: Terrain, world: World) -> None:
@@ -158,15 +158,14 @@ def check_known(terrain: Terrain, world: World) -> None:
     """
     if bool(terrain.truth.means.isnan().any()):
         raise ConfigError(
-            "Expected maps with a class in every cell to drive on, got some without: "
-            "their λ is not known. "
-            "Maps with unlabelled cells are there to train and measure models on."
+            "Expected maps with a class in each cell for episodes, got some cells "
+            "without a class, whose λ is missing. "
+            "Use maps with unlabelled cells only to train and evaluate models."
         )
     if world.noise == "stored" and bool(terrain.traversability.isnan().any()):
         raise ConfigError(
-            "Expected maps with λ in every cell for `noise` 'stored', got some that "
-            "were not observed. "
-            "Take `noise` 'resampled'."
+            "Expected maps with λ in each cell for `noise` 'stored', got some cells "
+            "that were not observed. Use `noise` 'resampled'."
         )
 
 
@@ -177,7 +176,8 @@ def draw_frozen(
 
     Args:
         terrain: the true maps.
-        world: correlation length, kernel, and what immobilises a robot.
+        world: world with the correlation length, the kernel and the conditions of
+            immobilisation.
         places: starts and goals.
         key: root key of the noise.
         maps: index of each episode's stream under that root, B of them.
@@ -192,27 +192,23 @@ def draw_frozen(
     """
     grid = terrain.grid
     correlation_cells = world.correlation_m / grid.resolution_m
-    longest = LONGEST_CORRELATION * min(grid.extent_m)
+    max_m = LONGEST_CORRELATION * min(grid.extent_m)
     expect(
-        world.correlation_m <= longest,
-        f"`world.correlation_m` of at most {longest:g} m, a quarter of the maps' "
-        "shorter side, got "
-        f"{world.correlation_m:g} m.",
+        world.correlation_m <= max_m,
+        f"`world.correlation_m` of at most {max_m:g} m, a quarter of the maps' "
+        f"shorter side, got {world.correlation_m:g} m.",
     )
     field = torch.zeros_like(terrain.traversability)
     attempts = torch.zeros(len(terrain), dtype=torch.int64, device=field.device)
     pending = torch.arange(len(terrain), device=field.device)
     for attempt in range(MOST_ATTEMPTS):
-        normals = [
-            correlated_normal(
-                rng.stream_key(key, int(maps[i]), "field", attempt),
-                _FIRST,
-                grid.shape,
-                correlation_cells,
-                world.kernel,
+        normals = []
+        for episode in pending.tolist():
+            stream = rng.stream_key(key, int(maps[episode]), "field", attempt)
+            normal = correlated_normal(
+                stream, _FIRST, grid.shape, correlation_cells, world.kernel
             )
-            for i in pending.tolist()
-        ]
+            normals.append(normal)
         scores = torch.from_numpy(np.concatenate(normals)).to(field)
         drawn = terrain.truth.select(pending).from_normal(scores)
         field[pending] = drawn
@@ -225,36 +221,31 @@ def draw_frozen(
         if len(pending) == 0:
             return field, attempts
     raise ConfigError(
-        f"Expected a feasible path from start to goal, but {MOST_ATTEMPTS} draws of λ "
-        "gave none for map "
-        f"{maps[int(pending[0])]}. Lower `immobile.below`, or take easier maps."
+        f"Expected a feasible path from start to goal within {MOST_ATTEMPTS} draws of "
+        f"λ, got none for map {maps[int(pending[0])]}. "
+        "Lower `immobile.below`, or use easier maps."
     )
 
 
 def joined(ground: Tensor, grid: Grid, places: Endpoints) -> Tensor:
-    """Return in which episodes a mask connects start and goal over shared edges.
+    """Return a mask of episodes whose start and goal are connected over shared edges.
 
     Cells that only touch at a corner are not connected.
 
     Args:
         ground: mask of traversable cells, bool, shape [B, H, W].
-        grid: size and resolution.
+        grid: grid of the maps.
         places: starts and goals.
 
     Returns:
-        Mask of the episodes, bool, shape [B].
-        grid: size and resolution.
-        places: starts and goals.
-
-    Returns:
-        bool, shape [B].
+        Mask, bool, shape [B].
     """
-    connectivity = np.zeros((3, 3, 3))  # none between maps
+    connectivity = np.zeros((3, 3, 3))  # maps are not connected
     connectivity[1] = generate_binary_structure(2, 1)
-    parts = torch.from_numpy(label(ground.cpu().numpy(), connectivity)[0])
-    member = torch.arange(len(parts))
-    start, goal = (
-        parts[member, *grid.cell_of(*position.cpu().T)]
-        for position in (places.start_m, places.goal_m)
-    )
-    return ((start > 0) & (start == goal)).to(ground.device)
+    labels, _ = label(ground.cpu().numpy(), connectivity)
+    regions = torch.from_numpy(labels)
+    member = torch.arange(len(regions))
+    start = regions[member, *grid.cell_of(*places.start_m.cpu().T)]
+    goal = regions[member, *grid.cell_of(*places.goal_m.cpu().T)]
+    is_connected = (start > 0) & (start == goal)
+    return is_connected.to(ground.device)

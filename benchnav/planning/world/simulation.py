@@ -1,6 +1,6 @@
 """Simulation of true episodes, stepped as one batch.
 
-It holds the true terrain. λ is read at the robot's position and scales its motion.
+The simulation contains the true terrain. λ at the robot's position scales its motion.
 Letters in shapes: B episodes, S state and A action dimensions.
 """
 
@@ -26,11 +26,8 @@ class SimulationState:
     Args:
         state: robot states, shape [B, S].
         outcome: `Outcome` of each episode, int64, shape [B].
-        step: number of steps taken in each, int64, shape [B].
+        step: number of steps taken in each episode, int64, shape [B].
         dwell_steps: consecutive steps on immobilising terrain, int64, shape [B].
-        step: steps taken by each, int64, shape [B].
-        held: steps in a row, up to now, on ground that immobilises a robot, int64,
-            shape [B].
     """
 
     state: Tensor
@@ -56,8 +53,8 @@ class Simulation:
         maps: index of each episode's stream under that root, B of them.
 
     Attributes:
-        robot: F.
-        time_budget_s: T of each episode in seconds, shape [B].
+        robot: robot with the motion F.
+        time_budget_s: time budget T of each episode in seconds, shape [B].
         steps: T in time steps, int64, shape [B].
         field: λ of all cells if it is constant, shape [B, H, W]; None if it is
             resampled.
@@ -75,36 +72,43 @@ class Simulation:
         maps: Sequence[int],
     ) -> None:
         """Draw all noise."""
-        self.robot = task.robot
+        robot = task.robot
+        goal_m = places.goal_m
+        self.robot = robot
         self.time_budget_s = world.budget_s(
-            places.reference_time_s, task.robot.top_speed_mps
+            places.reference_time_s, robot.top_speed_mps
         )
-        self.steps = world.steps(self.time_budget_s, task.robot.dt_s)
+        self.steps = world.steps(self.time_budget_s, robot.dt_s)
         self._grid = terrain.grid
-        self._goal_m = places.goal_m
+        self._goal_m = goal_m
         self._goal_radius_m = task.rules.goal_radius_m
-        self._realisation = Realisation(
-            terrain, world, places, int(self.steps.max()), noise_key, maps
-        )
-        # `exchange_` changes them in place.
-        self.field, self.attempts = self._realisation.field, self._realisation.attempts
+        max_steps = int(self.steps.max())
+        realisation = Realisation(terrain, world, places, max_steps, noise_key, maps)
+        self._realisation = realisation
+        # `exchange_` of the realisation modifies both in place.
+        self.field = realisation.field
+        self.attempts = realisation.attempts
         self._immobile = world.immobile
-        self._low = places.goal_m.new_tensor(task.robot.action_low)
-        self._high = places.goal_m.new_tensor(task.robot.action_high)
+        self._low = goal_m.new_tensor(robot.action_low)
+        self._high = goal_m.new_tensor(robot.action_high)
 
     @property
     def immobilising(self) -> Tensor:
         """Mask of immobilising cells, bool, shape [B, H, W].
 
-        Empty if λ is resampled or the world does not immobilise robots.
+        No cell is immobilising if λ is resampled or the world does not immobilise
+        robots.
         """
         if self.field is None or self._immobile is None:
-            return self._goal_m.new_zeros(len(self._goal_m), *self._grid.shape).bool()
+            shape = len(self._goal_m), *self._grid.shape
+            return self._goal_m.new_zeros(shape).bool()
         return self.field < self._immobile.below
 
     def field_at(self, step: int) -> Tensor:
         """Return λ of all cells at a step, shape [B, H, W]."""
-        return self._realisation.field_at(step) if self.field is None else self.field
+        if self.field is not None:
+            return self.field
+        return self._realisation.field_at(step)
 
     def init(self, start: Tensor) -> SimulationState:
         """Return the state at the start, from robot states [B, S]."""
@@ -117,7 +121,7 @@ class Simulation:
         """Advance the running episodes by one step; ended ones do not change.
 
         Args:
-            now: current state; it is not changed.
+            now: current state; not modified.
             action: actions, clipped to the bounds, shape [B, A].
 
         Returns:
@@ -133,14 +137,12 @@ class Simulation:
         inside = self._grid.contains(state[:, 0], state[:, 1])
         outcome = torch.where(step >= self.steps, Outcome.TIMEOUT, Outcome.RUNNING)
         dwell_steps = now.dwell_steps
-        if self._immobile is not None:
-            dwell_steps = torch.where(
-                traversability < self._immobile.below, dwell_steps + 1, 0
-            )
-            max_steps = steps_in(self._immobile.for_s, self.robot.dt_s)
-            outcome = torch.where(
-                dwell_steps >= max_steps, Outcome.IMMOBILISED, outcome
-            )
+        immobile = self._immobile
+        if immobile is not None:
+            immobilises = traversability < immobile.below
+            dwell_steps = torch.where(immobilises, dwell_steps + 1, 0)
+            is_stuck = dwell_steps >= steps_in(immobile.for_s, self.robot.dt_s)
+            outcome = torch.where(is_stuck, Outcome.IMMOBILISED, outcome)
         outcome = torch.where(inside, outcome, Outcome.OUT_OF_BOUNDS)
         outcome = torch.where(arrived, Outcome.SUCCESS, outcome)
         outcome = torch.where(now.running, outcome, now.outcome)
@@ -149,7 +151,8 @@ class Simulation:
     def unhindered(self, now: SimulationState, action: Tensor) -> Tensor:
         """Return the commanded motion: states after an action at λ = 1, shape [B, S]."""
         ones = torch.ones_like(now.state[:, 0])
-        return self.robot(now.state.clone(), action.clamp(self._low, self._high), ones)
+        action = action.clamp(self._low, self._high)
+        return self.robot(now.state.clone(), action, ones)
 
     def exchange_(self, members: Tensor, others: "Simulation") -> None:
         """Replace episodes by those of another simulation, in place.
@@ -160,7 +163,8 @@ class Simulation:
         """
         for name in ("_goal_m", "time_budget_s", "steps"):
             values = getattr(self, name)
-            setattr(self, name, values.index_copy(0, members, getattr(others, name)))
+            other_values = getattr(others, name)
+            setattr(self, name, values.index_copy(0, members, other_values))
         self._realisation.exchange_(members, others._realisation)
 
 
@@ -172,4 +176,5 @@ def end(now: SimulationState, which: Tensor, outcome: Outcome) -> SimulationStat
         which: mask of the episodes, bool, shape [B].
         outcome: an outcome that the simulation cannot determine itself.
     """
-    return replace(now, outcome=torch.where(now.running & which, outcome, now.outcome))
+    ends = now.running & which
+    return replace(now, outcome=torch.where(ends, outcome, now.outcome))

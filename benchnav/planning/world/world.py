@@ -1,4 +1,4 @@
-"""Worlds: how traversability affects a robot; the presets of world and rules; endpoints.
+"""Worlds (how λ affects a robot), presets of a world and its rules, and endpoints.
 
 Letters in shapes: B episodes.
 """
@@ -18,7 +18,7 @@ from benchnav.planning.free_space import FreeSpace, Immobile, Rules
 
 NOISES = ("resampled", "stored", "frozen")
 
-MAX_STEPS = 10**6  # of an episode; a day at 0.1 s is 864 000
+MAX_STEPS = 10**6  # of an episode; a day with time steps of 0.1 s has 864 000
 
 _BUDGETS = ("time_budget_s", "time_budget_ratio")
 
@@ -47,17 +47,17 @@ class World:
         noise: `resampled` at each step; `stored`, the map's own realised λ; or
             `frozen`, drawn once per episode as a correlated field with each cell's own
             distribution.
-        correlation_m: ℓ of frozen noise in metres: normal scores of cells at distance d
-            have the correlation exp(−d²/2ℓ²).
+        correlation_m: correlation length ℓ of frozen noise in metres: normal scores of
+            cells at distance d have the correlation exp(−d²/2ℓ²).
         kernel: kernel of frozen noise: `gaussian`, or `matern32`, a rougher field with
-            the same correlation at distance ℓ; beliefs assume the Gaussian.
-        immobile: what ends an episode as immobilised; None for nothing.
-        time_budget_s: T in seconds; an episode that has not reached the goal by then
-            fails.
+            the same correlation at distance ℓ; beliefs assume the Gaussian kernel.
+        immobile: rule by which episodes end as immobilised; None without such a rule.
+        time_budget_s: time budget T in seconds; an episode that has not reached the
+            goal by then fails.
         time_budget_ratio: T in multiples of the map's grid reference time at the
             robot's top speed, instead of `time_budget_s`.
-        preset: the entry of `PRESETS` from which the world was derived, and whose rules
-            apply.
+        preset: name of the entry of `PRESETS` from which the world was derived, and
+            whose rules apply.
     """
 
     noise: str = "resampled"
@@ -83,25 +83,22 @@ class World:
             0 <= self.correlation_m < float("inf"),
             f"`correlation_m` ≥ 0 and finite, got {self.correlation_m}.",
         )
-        budgets = {
-            name: getattr(self, name)
-            for name in _BUDGETS
-            if getattr(self, name) is not None
-        }
+        is_ratio = self.time_budget_s is None
         expect(
-            len(budgets) == 1,
+            is_ratio != (self.time_budget_ratio is None),
             "either `time_budget_s` or `time_budget_ratio`, got "
             f"{self.time_budget_s} and {self.time_budget_ratio}.",
         )
-        for name, value in budgets.items():
-            expect(0 < value < float("inf"), f"`{name}` > 0 and finite, got {value}.")
+        name = "time_budget_ratio" if is_ratio else "time_budget_s"
+        value = getattr(self, name)
+        expect(0 < value < float("inf"), f"`{name}` > 0 and finite, got {value}.")
 
     @classmethod
     def paper(cls, **changes: Any) -> "World":
         """Return the paper's world: λ is resampled at each step and only slows a robot.
 
         Args:
-            **changes: fields with other values than the preset's.
+            **changes: fields whose values differ from the preset's.
         """
         return _changed_preset("paper", changes)
 
@@ -110,18 +107,19 @@ class World:
         """Return a world of constant λ in which low λ immobilises a robot.
 
         Args:
-            **changes: fields with other values than the preset's.
+            **changes: fields whose values differ from the preset's.
         """
         return _changed_preset("stakes", changes)
 
     @property
     def spec(self) -> dict[str, Any]:
         """The preset by name, and all fields that differ from it, for `read_world`."""
-        base, now = plain(PRESETS[self.preset].world), plain(self)
-        return {
-            "preset": self.preset,
-            **{name: value for name, value in now.items() if value != base[name]},
-        }
+        base = plain(PRESETS[self.preset].world)
+        spec: dict[str, Any] = {"preset": self.preset}
+        for name, value in plain(self).items():
+            if value != base[name]:
+                spec[name] = value
+        return spec
 
     def budget_s(self, reference_time_s: Tensor, top_speed_mps: float) -> Tensor:
         """Return T of each episode.
@@ -144,10 +142,10 @@ class World:
         if bool(is_missing.any()):
             raise ConfigError(
                 "Expected a reference time on each map for `time_budget_ratio`, "
-                f"got none on {int(is_missing.sum())} of {len(is_missing)} maps, which were "
-                "not asked to be solvable. Make "
+                f"got none on {int(is_missing.sum())} of {len(is_missing)} maps, whose "
+                "recipe does not require solvable maps. Create "
                 "such maps: benchnav-datagen create RECIPE id=NAME "
-                "splits.SPLIT.solvable=true; or give "
+                "splits.SPLIT.solvable=true; or set "
                 "`time_budget_s`, as in world={'preset': 'stakes', 'time_budget_s': "
                 "60}."
             )
@@ -157,10 +155,12 @@ class World:
         """Return time budgets in time steps, int64, shape of `budget_s`.
 
         Raises:
-            ConfigError: If one has no step, or more than `MAX_STEPS`.
+            ConfigError: If a time budget has less than one step, or more than
+                `MAX_STEPS`.
         """
         steps = (budget_s / dt_s).round()
-        if bool((~(steps >= 1)).any()):
+        has_step = steps >= 1  # false for NaN
+        if not bool(has_step.all()):
             raise ConfigError(
                 f"Expected a time budget of at least one time step of {dt_s:g} s, got "
                 f"{float(budget_s.min()):g} s."
@@ -168,26 +168,26 @@ class World:
         if bool((steps > MAX_STEPS).any()):
             raise ConfigError(
                 f"Expected a time budget of at most {MAX_STEPS:,} time steps of "
-                f"{dt_s:g} s, got "
-                f"{float(budget_s.max()):g} s."
+                f"{dt_s:g} s, got {float(budget_s.max()):g} s."
             )
         return steps.long()
 
     def to_dict(self) -> dict[str, Any]:
         """Return all settings that affect episodes, as plain data for JSON.
 
-        Settings that the noise does not use are omitted, and so is the first kernel,
-        which was the only one in version 1, so that ids do not change.
+        Settings that the noise does not use are omitted. The first kernel is omitted
+        too: version 1 had no other, and ids must not change.
         """
-        unused = () if self.noise == "frozen" else ("correlation_m", "kernel")
+        unused = {"preset"}
+        if self.noise != "frozen":
+            unused |= {"correlation_m", "kernel"}
         if self.kernel == KERNELS[0]:
-            unused = (*unused, "kernel")
-        unused = (*unused, "preset")
-        return {
-            n: value
-            for n, value in plain(self).items()
-            if value is not None and n not in unused
-        }
+            unused.add("kernel")
+        settings = {}
+        for name, value in plain(self).items():
+            if value is not None and name not in unused:
+                settings[name] = value
+        return settings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -195,9 +195,9 @@ class Preset:
     """A world, and the rules of a task that belong to it.
 
     Args:
-        purpose: one line.
+        purpose: purpose in one line.
         world: the model of λ.
-        rules: free space, `min_traversability`, goal radius.
+        rules: rules of the task.
     """
 
     purpose: str
@@ -228,8 +228,10 @@ PRESETS: Mapping[str, Preset] = {
 
 
 def _changed_preset(name: str, changes: Mapping[str, Any]) -> World:
-    # Either way of giving a time budget replaces the other.
-    no_budget = dict.fromkeys(_BUDGETS) if changes.keys() & set(_BUDGETS) else {}
+    no_budget = {}
+    if changes.keys() & set(_BUDGETS):
+        # Each setting of the time budget replaces the other.
+        no_budget = dict.fromkeys(_BUDGETS)
     return replace(PRESETS[name].world, **{**no_budget, **changes})
 
 
@@ -238,8 +240,8 @@ def read_world(world: Any, task: Any = None) -> tuple[World, Rules, str]:
 
     Args:
         world: name of a preset, or a mapping of changes with the preset's name under
-            `preset`; without it they change the paper's.
-        task: a mapping of changes to the preset's rules, if there are any.
+            `preset`; by default they change the paper's world.
+        task: mapping of changes to the preset's rules; None without changes.
 
     Returns:
         World, rules, and their name in tables: the preset's name and all changes.
@@ -247,53 +249,51 @@ def read_world(world: Any, task: Any = None) -> tuple[World, Rules, str]:
     Raises:
         ConfigError: If a preset or field does not exist, or a value has the wrong type.
     """
-    world = world.spec if isinstance(world, World) else world
+    if isinstance(world, World):
+        world = world.spec
     expect(
         isinstance(world, Mapping | str),
         f"`world` as a mapping of settings, got {world!r}.",
     )
-    changes_given = {"preset": world} if isinstance(world, str) else dict(world)
-    name = changes_given.pop("preset", "paper")
+    changes = {"preset": world} if isinstance(world, str) else dict(world)
+    name = changes.pop("preset", "paper")
     check_known("a world", name, PRESETS)
     preset = PRESETS[name]
-    budgets = [key for key in _BUDGETS if changes_given.get(key) is not None]
-    if len(budgets) == 1:  # either way of giving a time budget replaces the other
-        changes_given |= dict.fromkeys(set(_BUDGETS) - set(budgets))
-    changed_world = read(World, changes_given, "`{}`".format, "world", preset.world)
+    budgets = [key for key in _BUDGETS if changes.get(key) is not None]
+    if len(budgets) == 1:  # each setting of the time budget replaces the other
+        changes |= dict.fromkeys(set(_BUDGETS) - set(budgets))
+    as_option = "`{}`".format
+    changed_world = read(World, changes, as_option, "world", preset.world)
     for key in ("correlation_m", "kernel"):
         expect(
-            key not in changes_given or changed_world.noise == "frozen",
+            key not in changes or changed_world.noise == "frozen",
             f"`world.{key}` with `world.noise` frozen, got it with "
             f"{changed_world.noise!r}.",
         )
-    rules = read(
-        Rules, {} if task is None else task, "`{}`".format, "task", preset.rules
-    )
-    changes = _differences(preset.world, changed_world) + _differences(
-        preset.rules, rules
-    )
-    return changed_world, rules, " ".join([name, *changes])
+    task = {} if task is None else task
+    rules = read(Rules, task, as_option, "task", preset.rules)
+    world_changes = _differences(preset.world, changed_world)
+    rule_changes = _differences(preset.rules, rules)
+    label = " ".join([name, *world_changes, *rule_changes])
+    return changed_world, rules, label
 
 
 def _differences(preset: Any, value: Any) -> list[str]:
-    """Return the names in tables of fields that differ from the preset."""
+    """Return fields that differ from the preset, as they are written in tables."""
     changed = []
-    for f in fields(preset):
-        before, after = getattr(preset, f.name), getattr(value, f.name)
-        if before == after or (after is None and f.name != "immobile"):
+    for entry in fields(preset):
+        name = entry.name
+        before = getattr(preset, name)
+        after = getattr(value, name)
+        if before == after or (after is None and name != "immobile"):
             continue
         if isinstance(after, FreeSpace):
             changed += _differences(before, after)
-        elif f.name == "immobile":
-            changed.append(
-                f"immobile={after.below:g}/{after.for_s:g}s"
-                if after
-                else "immobile=none"
-            )
-        else:
-            changed.append(
-                f"{f.name}={after:g}"
-                if isinstance(after, float)
-                else f"{f.name}={after}"
-            )
+            continue
+        text = str(after)
+        if isinstance(after, float):
+            text = f"{after:g}"
+        elif name == "immobile":
+            text = f"{after.below:g}/{after.for_s:g}s" if after else "none"
+        changed.append(f"{name}={text}")
     return changed

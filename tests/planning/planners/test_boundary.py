@@ -117,7 +117,7 @@ WHOLE = {
     "one number an action": ((ahead()[:, :1], None, Plan.empty(BATCH)), "got torch.float32 of shape [3, 1] on cpu."),
     "doubles": ((ahead().double(), None, Plan.empty(BATCH)), "got torch.float64 of shape [3, 2] on cpu."),
     "elsewhere": ((ahead().to("meta"), None, Plan.empty(BATCH)), "got torch.float32 of shape [3, 2] on meta."),
-    "no plan": ((ahead(), None, None), "Expected a Plan beside the actions, got NoneType."),
+    "no plan": ((ahead(), None, None), "Expected a Plan as the last output, got NoneType."),
     "a status for all": (
         (ahead(), None, Plan.empty(BATCH, status=torch.zeros(1, dtype=torch.int64))),
         "`Plan.status` as torch.int64 of shape [3] on cpu, got torch.int64 of shape [1] on cpu.",

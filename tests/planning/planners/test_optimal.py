@@ -16,8 +16,8 @@ from benchnav.planning.planners.optimal.optimal import (
     Optimal,
     OptimalConfig,
 )
+from benchnav.planning.planners.optimal.primitives import path_of, primitives_from
 from benchnav.planning.planners.optimal.value import UNREACHED, Moves, headings_of
-from benchnav.planning.planners.optimal.ways import path_of, ways_from
 from benchnav.planning.planners.planner import Plan, PlanStatus
 from benchnav.planning.planners.straight import Straight
 from benchnav.planning.problem import Problem
@@ -49,7 +49,7 @@ def problem(
 def time_to_go(planner: Any, posed: Problem) -> Tensor:
     """By value iteration only."""
     state = Optimal.init(planner, posed, generator())
-    return ways_from(posed.start, state.dwell_s, state).cost.min(1).values
+    return primitives_from(posed.start, state.dwell_s, state).cost.min(1).values
 
 
 def curve(x: float, y: float, heading: float, radius_m: float = 1.0) -> float:
@@ -434,7 +434,7 @@ def test_a_robot_that_is_off_its_drive_goes_on_by_value_iteration() -> None:
         step = replace(first(posed, draw=True), state=pose)
         action, following, plan = planner.plan(step, state)
         steered = Optimal.plan(planner, step, state)
-        assert following.taken.tolist() == [1]
+        assert following.n_steps.tolist() == [1]
         if not on:
             assert torch.equal(action, steered[0])
         path = plan.path[0][~plan.path[0].isnan().any(1)]
@@ -449,7 +449,7 @@ def test_who_has_no_time_left_to_leave_such_ground_is_lost_by_every_way(
     """It takes 3.7 s to the last cell of the bar, and 2.6 s to leave that."""
     posed = with_start(wide_bar(18.0), 6.9, 6.25, 0.0)
     state = Optimal.init(NearOptimal(), posed, generator())
-    found = float(ways_from(posed.start, torch.tensor([held]), state).cost.min())
+    found = float(primitives_from(posed.start, torch.tensor([held]), state).cost.min())
     assert (found < 90) is crosses
     assert crosses or found >= UNREACHED / 2
 
@@ -476,7 +476,7 @@ def test_deep_in_a_bar_a_robot_with_little_time_left_takes_the_dearer_side() -> 
     state = Optimal.init(NearOptimal(), posed, generator())
     pose = torch.tensor([[7.75, 5.25, math.pi]])
     some, more, most = (
-        float(ways_from(pose, torch.tensor([held]), state).cost.min())
+        float(primitives_from(pose, torch.tensor([held]), state).cost.min())
         for held in (0.0, 8.0, 15.0)
     )
     across = 3.25 / 0.4 + 2.25 / 0.9
@@ -490,7 +490,7 @@ def test_a_robot_that_was_held_has_less_time_left() -> None:
     state = Optimal.init(NearOptimal(), with_start(posed, 5.3, 2.25, 0.0), generator())
     pose = torch.tensor([[5.6, 2.25, 0.0]])
     some, more = (
-        float(ways_from(pose, torch.tensor([held]), state).cost.min())
+        float(primitives_from(pose, torch.tensor([held]), state).cost.min())
         for held in (0.0, 6.5)
     )
     assert some == pytest.approx(0.4 / 0.08 + 2.25 / 0.9, rel=0.1)
@@ -653,9 +653,7 @@ def test_other_robots_and_maps_that_change_are_refused(kind: type[Optimal]) -> N
         ):
             kind().init(factories.problem(ground, robot=robot), generator())
     uneven = Unicycle(turn_rate_radps=(-1.0, 0.5))
-    with pytest.raises(
-        ConfigError, match=f"alike to both sides for planner '{kind.name}'"
-    ):
+    with pytest.raises(ConfigError, match=f"to both sides for planner '{kind.name}'"):
         kind().init(factories.problem(ground, robot=uneven), generator())
     backward = Unicycle(speed_mps=(-1.0, 1.0))
     with pytest.raises(

@@ -194,7 +194,7 @@ def test_ground_whose_class_is_not_known_is_not_driven_on(noise: str) -> None:
     means = terrain.truth.means.clone()
     means[0, 0, 2, 2] = torch.nan
     terrain = replace(terrain, truth=replace(terrain.truth, means=means))
-    with pytest.raises(ConfigError, match="a class in every cell"):
+    with pytest.raises(ConfigError, match="a class in each cell"):
         Realisation(terrain, World(noise=noise), PLACES, 10, KEY, [0])
 
 

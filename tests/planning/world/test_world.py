@@ -38,7 +38,7 @@ def test_a_time_budget_is_in_seconds_or_in_reference_times_at_top_speed() -> Non
     ratio = World(time_budget_s=None, time_budget_ratio=3.0)
     assert ratio.budget_s(reference, 2.0).tolist() == [30, 45]
     assert ratio.budget_s(reference, 1.0).tolist() == [60, 90]
-    with pytest.raises(ConfigError, match="not asked to be solvable"):
+    with pytest.raises(ConfigError, match="does not require solvable maps"):
         ratio.budget_s(torch.tensor([20.0, torch.nan]), 1.0)
     for both in ({}, {"time_budget_s": None}):
         world = {"time_budget_ratio": 3.0 if not both else None, **both}

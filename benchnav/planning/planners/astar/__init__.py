@@ -1,1 +1,1 @@
-"""Planners led by a path over the grid: A*, and what follows its way-points."""
+"""Planners with a path over the grid: A*, and planners that follow its waypoints."""

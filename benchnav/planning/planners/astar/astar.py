@@ -1,24 +1,26 @@
 """A*: cheapest paths over the cells of a 2.5D map.
 
-The exact cost to go h* of every cell is computed once per λ̂ map, by one compiled
-search, Dijkstra's, backward from the goal, on the host. A* with h* as its heuristic
-only expands the cells of a cheapest path. Hence replanning from any robot position is
-following pointers. Non-free cells cost their penalty per metre, on the half of an edge
-that lies in them, so that every cell has a path. A step between two non-free cells that
-touch at a corner costs the penalty on its whole length (`gridgraph.squeezes`).
-Sources: Hart, Nilsson and Raphael (1968); paper IV-A1. Letters in shapes: B episodes,
-H×W cells, N points, E edges.
+The exact cost to go h* of every cell is computed once per λ̂ map, on the host, by a
+compiled Dijkstra search backward from the goal. A* with h* as its heuristic expands
+only the cells of a cheapest path. Hence replanning from any robot position only follows
+pointers. Non-free cells cost their penalty per metre, on the half of an edge that lies
+in them, so that every cell has a path. A step between two non-free cells that touch at a
+corner costs the penalty on its whole length (`gridgraph.squeezes`). Sources: Hart,
+Nilsson and Raphael (1968); paper IV-A1. Letters in shapes: B episodes, H×W cells, N
+points, E edges.
 """
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from typing import TypeVar
 
 import numpy as np
 import torch
 from numpy import ndarray
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from benchnav.core import gridgraph
 from benchnav.core.batch import Batch
@@ -61,11 +63,11 @@ def edge_costs(problem: Problem) -> Tensor:
     Raises:
         ConfigError: If the objective's `path_cost` is not finite and above 0.
     """
-    source, target, cells = gridgraph.neighbour_pairs(*problem.grid.shape)
-    length_m = (
-        torch.from_numpy(cells).to(problem.start.device) * problem.grid.resolution_m
-    )
-    layers = (partial(_of_cells, values.flatten(1)) for values in _layers(problem))
+    grid = problem.grid
+    source, target, cells = gridgraph.neighbour_pairs(*grid.shape)
+    length_cells = torch.from_numpy(cells).to(problem.start.device)
+    length_m = length_cells * grid.resolution_m
+    layers = [partial(_of_cells, values.flatten(1)) for values in _layers(problem)]
     return _costs(problem, source, target, length_m, *layers)
 
 
@@ -74,24 +76,25 @@ def revised_edge_costs(problem: Problem, before: Tensor, changed: Tensor) -> Ten
 
     Args:
         problem: B problems.
-        before: costs of edges before the change, float64, shape [B, E]; they are not
-            changed.
-        changed: mask of cells with another λ̂, free mask or elevation, one at least,
-            bool, shape [B, H, W].
+        before: costs of edges before the change, float64, shape [B, E]; not modified.
+        changed: mask of cells whose λ̂, free mask or elevation changed, with at least
+            one cell, bool, shape [B, H, W].
     """
-    source, target, cells = gridgraph.neighbour_pairs(*problem.grid.shape)
+    grid = problem.grid
+    source, target, cells = gridgraph.neighbour_pairs(*grid.shape)
     # A diagonal step also depends on the two cells next to it, which touch its source.
-    near = torch.nn.functional.max_pool2d(changed.float(), 3, stride=1, padding=1) > 0
-    member, edge = _of_cells(near.flatten(1), source).nonzero(as_tuple=True)
-    of_map = member * near[0].numel()
+    near = max_pool2d(changed.float(), 3, stride=1, padding=1) > 0
+    is_affected = _of_cells(near.flatten(1), source)
+    member, edge = is_affected.nonzero(as_tuple=True)
+    first_cell = member * near[0].numel()
     edges = edge.cpu().numpy()
     begin = torch.from_numpy(source[edges]).to(edge.device)
     end = torch.from_numpy(target[edges]).to(edge.device)
     length_cells = torch.from_numpy(cells[edges]).to(edge.device)
-    length_m = length_cells * problem.grid.resolution_m
-    layers = (
-        partial(_of_flat_cells, values.flatten(), of_map) for values in _layers(problem)
-    )
+    length_m = length_cells * grid.resolution_m
+    layers = []
+    for values in _layers(problem):
+        layers.append(partial(_of_flat_cells, values.flatten(), first_cell))
     costs = _costs(problem, begin, end, length_m, *layers)
     return before.index_put((member, edge), costs)
 
@@ -110,59 +113,79 @@ def _costs(
     elevation_of: Callable[[Cells], Tensor],
     free_of: Callable[[Cells], Tensor],
 ) -> Tensor:
-    """Return costs of some edges, from functions that return λ̂, elevation and free mask
-    of cells; their shape is that of the costs.
+    """Return costs of some edges.
+
+    Args:
+        problem: B problems.
+        source: cells at which the edges begin, flat indices.
+        target: cells at which the edges end, flat indices.
+        length_m: lengths of the edges in metres.
+        traversability_of: function of cells that returns their λ̂.
+        elevation_of: function of cells that returns their elevation in metres.
+        free_of: function of cells that returns whether they are free.
+
+    Returns:
+        Costs, float64, of the shape that the functions return.
     """
-    traversability, elevation_m, free = (
-        [of(ends) for ends in (source, target)]
-        for of in (traversability_of, elevation_of, free_of)
-    )
-    grade = (elevation_m[1].double() - elevation_m[0].double()) / length_m
+    rise_m = elevation_of(target).double() - elevation_of(source).double()
+    grade = rise_m / length_m
+    source_cost = _cost_per_m(problem, traversability_of(source), grade)
+    target_cost = _cost_per_m(problem, traversability_of(target), grade)
+    squeezed = gridgraph.squeezes(free_of, source, target, problem.grid.width)
+    source_blocked = (~free_of(source)).double()
+    target_blocked = (~free_of(target)).double()
+    penalty = PENALTY * (source_blocked + target_blocked + 2 * squeezed)
+    half_m = 0.5 * length_m
+    return half_m * (source_cost + target_cost) + half_m * penalty
+
+
+def _cost_per_m(problem: Problem, traversability: Tensor, grade: Tensor) -> Tensor:
+    """Return the objective's `path_cost`, checked; float64, of the shape of the grade."""
     objective = problem.objective
+    cost = objective.path_cost(traversability.double(), grade)
     name = f"`path_cost` of {type(objective).__name__}"
-    per_m = [objective.path_cost(values.double(), grade) for values in traversability]
-    for cost in per_m:
-        shape = list(cost.shape) if isinstance(cost, Tensor) else type(cost).__name__
-        expect(
-            shape == list(grade.shape),
-            f"{name} of the shape of λ̂ and grade, {list(grade.shape)}, got {shape}. "
-            "Give a cost for each piece of a "
-            "path.",
-        )
-    extrema = torch.stack([torch.stack(cost.aminmax()) for cost in per_m])
-    min_cost, max_cost = extrema.aminmax()
+    shape = list(cost.shape) if isinstance(cost, Tensor) else type(cost).__name__
+    expect(
+        shape == list(grade.shape),
+        f"{name} of the shape of λ̂ and grade, {list(grade.shape)}, got {shape}. "
+        "Return a cost for each segment of a path.",
+    )
+    min_cost, max_cost = torch.stack(cost.aminmax())
     if not 0 < min_cost <= max_cost < torch.inf:
         raise ConfigError(
             f"Expected {name} as finite numbers > 0, got {min_cost:g} to {max_cost:g}. "
             "Return a cost > 0 per metre."
         )
-    squeezed = gridgraph.squeezes(free_of, source, target, problem.grid.width)
-    penalty = PENALTY * ((~free[0]).double() + (~free[1]).double() + 2 * squeezed)
-    return 0.5 * length_m * (per_m[0] + per_m[1]) + 0.5 * length_m * penalty
+    return cost
 
 
 def _of_cells(values: Tensor, cells: np.ndarray) -> Tensor:
     """Return values [B, H·W] of some cells, shape [B, E].
 
-    On the host NumPy does it in a tenth of PyTorch's time.
+    On the host NumPy is used, which takes a tenth of PyTorch's time.
     """
     if values.device.type == "cpu":
         return torch.from_numpy(np.take(values.numpy(), cells, axis=1))
-    return values[:, torch.from_numpy(cells).to(values.device)]
+    index = torch.from_numpy(cells).to(values.device)
+    return values[:, index]
 
 
-def _of_flat_cells(values: Tensor, of_map: Tensor, cells: Tensor) -> Tensor:
-    """Return values [B·H·W] of N cells, by the first cell of each cell's map and its
-    index in the map.
+def _of_flat_cells(values: Tensor, first_cell: Tensor, cells: Tensor) -> Tensor:
+    """Return values [B·H·W] of N cells of any maps.
+
+    Args:
+        values: values of all maps.
+        first_cell: index in `values` of the first cell of each cell's map, shape [N].
+        cells: index of each cell in its map, shape [N].
     """
-    return values[of_map + cells]
+    return values[first_cell + cells]
 
 
 def search(problem: Problem, costs: Iterable[Tensor] | None = None) -> CostToGo:
     """Return cheapest paths to the goal's own cell and to those within its radius.
 
-    The search runs on the host: maps of another device are copied there and the result
-    back, once.
+    The search runs on the host. Costs on another device are copied to the host, and the
+    result is copied back, once each.
 
     Args:
         problem: B problems.
@@ -171,86 +194,87 @@ def search(problem: Problem, costs: Iterable[Tensor] | None = None) -> CostToGo:
     Returns:
         Cost to go, of the problem's dtype and device.
     """
-    grid, goal_m = problem.grid, problem.goal_m.cpu()
-    centres = cell_centres(grid, torch.arange(grid.height * grid.width))
+    grid = problem.grid
+    goal_m = problem.goal_m.cpu()
+    cells = torch.arange(grid.height * grid.width)
+    centres = cell_centres(grid, cells)
     goals = distance(centres, goal_m[:, None]) < problem.goal_radius_m
     # On coarse grids no centre may be within the radius; the goal's own cell always is
     # a goal.
     goals.scatter_(1, cell_at(grid, goal_m)[:, None], True)
     if costs is None:
         costs = edge_costs(problem)
-    on_host = (of_map.cpu().numpy() for of_map in costs)
+    host_costs = (map_costs.cpu().numpy() for map_costs in costs)
     goal_maps = goals.unflatten(1, grid.shape).numpy()
-    cost, following = gridgraph.cost_to_go(on_host, goal_maps, grid.shape)
-    own = np.arange(following.shape[1])
-    following = np.where(following == gridgraph.NO_CELL, own, following)
+    cost, following = gridgraph.cost_to_go(host_costs, goal_maps, grid.shape)
+    is_end = following == gridgraph.NO_CELL
+    following = np.where(is_end, cells.numpy(), following)
     start = problem.start
-    return CostToGo(
-        torch.from_numpy(cost).to(start), torch.from_numpy(following).to(start.device)
-    )
+    to_go = torch.from_numpy(cost).to(start)
+    return CostToGo(to_go, torch.from_numpy(following).to(start.device))
 
 
 def framed(problem: Problem, field: CostToGo) -> Tensor:
-    """Return padded cost to go and padded costs of a level metre, for `cost_at`.
+    """Return padded cost to go and padded costs per level metre, for `cost_at`.
 
     Args:
         problem: B problems.
-        field: their cheapest paths.
+        field: cheapest paths of the problems.
 
     Returns:
         Shape [B, 2, N], N = (H + 2)·(W + 2).
     """
     traversability = problem.traversability
-    per_m = problem.objective.path_cost(
-        traversability, torch.zeros_like(traversability)
-    )
+    level = torch.zeros_like(traversability)
+    per_m = problem.objective.path_cost(traversability, level)
     per_m = per_m + PENALTY * ~problem.free
-    return problem.grid.pad(
-        torch.stack((field.cost, per_m.to(field.cost)), dim=1), outside=_OUTSIDE
-    )
+    costs = torch.stack((field.cost, per_m.to(field.cost)), dim=1)
+    return problem.grid.pad(costs, outside=_OUTSIDE)
 
 
 def cost_at(grid: Grid, costs: Tensor, x_m: Tensor, y_m: Tensor) -> Tensor:
     """Return the cost to go from any position.
 
-    It is the minimum over the centres of the cell itself and of its neighbours, of the
-    cost from the centre plus that of the straight line to it. A line costs half of each
-    of the two cells' costs per metre, as an edge does. Hence at a centre the cost is
-    that of its cell (if grades cost nothing), and between centres it has no jumps as
-    large as a cell. In cells where paths end it is 0.
+    A path leads straight from the position to the centre of its cell or of a neighbour,
+    and from that centre to the goal. The cost to go is the minimum over these centres.
+    A line costs half of each of the two cells' costs per metre, as an edge does. Hence
+    at a centre the cost is that of its cell (if grades cost nothing), and between
+    centres it has no jumps as large as a cell. In cells where paths end it is 0.
 
     Args:
         grid: grid of the maps.
-        costs: from `framed`, shape [B, 2, N].
+        costs: padded costs from `framed`, shape [B, 2, N].
         x_m: x of the positions in metres, shape [B, J].
         y_m: y of the positions in metres, shape [B, J].
 
     Returns:
-        Shape [B, J].
+        Cost to go, shape [B, J].
     """
     size = grid.resolution_m
     to_go, per_m = costs.unbind(1)
-    column, row = (x_m / size).floor(), (y_m / size).floor()
+    column = (x_m / size).floor()
+    row = (y_m / size).floor()
     own_cost = grid.lookup(per_m, x_m, y_m)
     ended = grid.lookup(to_go, x_m, y_m) == 0
     sides = (-0.5, 0.5, 1.5)
     best = torch.full_like(x_m, torch.inf)
-    centres = {
-        (up, right): ((column + right) * size, (row + up) * size)
-        for up in sides
-        for right in sides
-    }
-    metre = {side: grid.lookup(per_m, *centre) for side, centre in centres.items()}
+    centres = {}
+    for up, right in product(sides, sides):
+        centres[up, right] = (column + right) * size, (row + up) * size
+    cost_per_m = {side: grid.lookup(per_m, *centre) for side, centre in centres.items()}
     for (up, right), (centre_x, centre_y) in centres.items():
-        other_cost = metre[up, right]
+        end_cost = cost_per_m[up, right]
         # Two non-free cells that touch at a corner block the diagonal between them, see
         # `edge_costs`. If they are the cell itself and its neighbour across an edge, an
         # end of the line is not free.
-        closed = torch.minimum(metre[up, 0.5], metre[0.5, right]) >= PENALTY
-        squeezed = closed & (torch.maximum(own_cost, other_cost) < PENALTY)
+        min_corner_cost = torch.minimum(cost_per_m[up, 0.5], cost_per_m[0.5, right])
+        max_end_cost = torch.maximum(own_cost, end_cost)
+        squeezed = (min_corner_cost >= PENALTY) & (max_end_cost < PENALTY)
         length = torch.sqrt((x_m - centre_x) ** 2 + (y_m - centre_y) ** 2)
-        line = length * (0.5 * (own_cost + other_cost) + PENALTY * squeezed)
-        best = torch.minimum(best, grid.lookup(to_go, centre_x, centre_y) + line)
+        mean_cost = 0.5 * (own_cost + end_cost)
+        line = length * (mean_cost + PENALTY * squeezed)
+        centre_to_go = grid.lookup(to_go, centre_x, centre_y)
+        best = torch.minimum(best, centre_to_go + line)
     return torch.where(ended, 0, best)
 
 
@@ -261,24 +285,28 @@ def cell_at(grid: Grid, state: Tensor) -> Tensor:
 
 
 def cell_centres(grid: Grid, cell: Tensor) -> Tensor:
-    """Return centres (x, y) of cells, by flat index [*B], shape [*B, 2]."""
-    return torch.stack(grid.centre_of(cell // grid.width, cell % grid.width), dim=-1)
+    """Return centres (x, y) in metres of cells, by flat index [*B], shape [*B, 2]."""
+    row = cell // grid.width
+    column = cell % grid.width
+    return torch.stack(grid.centre_of(row, column), dim=-1)
 
 
 def path_cells(field: CostToGo, cell: Tensor, count: int) -> Tensor:
     """Return the cells of cheapest paths.
 
     Args:
-        field: from `search`.
+        field: cheapest paths.
         cell: flat indices of the first cells, shape [B].
-        count: points to return.
+        count: number of cells to return.
 
     Returns:
-        Flat indices from the first cell on, the last repeated, int64, shape [B, count].
+        Flat indices that begin with the first cell and repeat the last one, int64,
+        shape [B, count].
     """
     cells = [cell[:, None]]
     for _ in range(count - 1):
-        cells.append(field.following.gather(1, cells[-1]))
+        following = field.following.gather(1, cells[-1])
+        cells.append(following)
     return torch.cat(cells, dim=1)
 
 
@@ -297,15 +325,15 @@ def path_points(problem: Problem, field: CostToGo, state: Tensor, count: int) ->
 
     Args:
         problem: B problems.
-        field: from `search`.
+        field: cheapest paths.
         state: robot states, shape [B, S].
-        count: points to return.
+        count: number of points to return.
 
     Returns:
-        (x, y) of the robot, of the centre of each cell after its own, and of the goal,
-        repeated, shape [B, count, 2].
+        (x, y) in metres of the robot, of the centre of each cell after its own, and of
+        the goal, repeated, shape [B, count, 2].
     """
-    cells = path_cells(field, cell_at(problem.grid, state), count)
-    return torch.cat(
-        (state[:, None, :2], cell_points(problem, field, cells[:, 1:])), dim=1
-    )
+    first_cell = cell_at(problem.grid, state)
+    cells = path_cells(field, first_cell, count)
+    points = cell_points(problem, field, cells[:, 1:])
+    return torch.cat((state[:, None, :2], points), dim=1)

@@ -12,7 +12,7 @@ from benchnav.planning.robots import SPEED, TURN_RATE
 
 @dataclass(frozen=True, kw_only=True)
 class AStarDWAConfig(GuideConfig):
-    """Settings of A*+DWA: those of the global path, and these.
+    """Settings of A*+DWA, in addition to those of the global path.
 
     Args:
         dwa: settings of DWA.

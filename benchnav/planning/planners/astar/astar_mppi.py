@@ -1,8 +1,7 @@
-"""A* + MPPI: a global path over the map's cells, followed by model predictive path
-integral control.
+"""A*+MPPI: a global path over the map's cells, followed by MPPI.
 
-Beyond the paper, which runs MPPI without a global path and combines global and local
-planners.
+The paper runs MPPI without a global path. It also combines global and local planners,
+but not A* and MPPI.
 """
 
 from dataclasses import dataclass, field
@@ -16,7 +15,7 @@ from benchnav.planning.planners.straight import STEERS
 
 @dataclass(frozen=True, kw_only=True)
 class AStarMPPIConfig(GuideConfig):
-    """Settings of A* + MPPI: those of the global path, and these.
+    """Settings of A*+MPPI, in addition to those of the global path.
 
     Args:
         mppi: settings of MPPI.
@@ -25,12 +24,12 @@ class AStarMPPIConfig(GuideConfig):
     mppi: MPPIConfig = field(default_factory=MPPIConfig)
 
     def __post_init__(self) -> None:
-        """Check that `explore` has a path to move."""
+        """Check that `explore` can affect the robot's path."""
         super().__post_init__()
         expect(
             self.explore == 0 or self.mppi.cost_to_go == "objective",
             f"`explore` = 0 for A*+MPPI with `cost_to_go` {self.mppi.cost_to_go!r}, "
-            "whose costs run to the goal "
+            "which minimises costs to the goal "
             f"and not to waypoints of A*, got {self.explore}.",
         )
 
@@ -38,14 +37,14 @@ class AStarMPPIConfig(GuideConfig):
 class AStarMPPI(Guided[MPPIState]):
     """A* provides waypoints to model predictive path integral control.
 
-    With a cost to go, which is A*'s, MPPI minimises a cost that runs to the goal; A*'s
-    path then serves recovery.
+    If `cost_to_go` is an option other than `objective`, MPPI minimises costs to the
+    goal, and A*'s path is used only in recovery.
 
     Args:
         config: settings.
     """
 
-    steers = STEERS  # MPPI drives any robot, the recovery these.
+    steers = STEERS  # MPPI steers any robot, but the recovery only these.
 
     def __init__(self, config: AStarMPPIConfig | None = None) -> None:
         """Store the settings."""

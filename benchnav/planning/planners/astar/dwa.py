@@ -1,15 +1,14 @@
-"""The dynamic window approach (DWA): the best constant (v, ω) that is reachable under
-the acceleration limits.
+"""The dynamic window approach (DWA): the best constant (v, ω) within reach.
 
-Two parts are from Fox, Burgard and Thrun (1997), "The dynamic window approach to
-collision avoidance": the window, the velocity pairs that the robot can reach within one
-step, and the search for the pair with the best arc. A robot without limits reaches all
-pairs within its bounds. The scoring of arcs is ours: each pair is executed for the
-whole horizon, rolled out through F under λ̂, and scored by J toward a waypoint and by
-its final heading. There are no admissible velocities by braking distance, and no terms
-for clearance and speed. A pair that enters non-free cells before it reaches the
-waypoint pays the penalty of each such step. DWA therefore creeps in narrow passages,
-and needs a recovery where it stands.
+The acceleration limits decide which velocities are within reach. Two parts are from Fox,
+Burgard and Thrun (1997), "The dynamic window approach to collision avoidance": the
+window, the velocity pairs that the robot can reach within one step, and the search for
+the pair with the best arc. A robot without limits reaches all pairs within its bounds.
+The scoring of arcs is ours: each pair is rolled out for the whole horizon through F
+under λ̂, and scored by J toward a waypoint and by its final heading. There are no
+admissible velocities by braking distance, and no terms for clearance and speed. A pair
+that enters non-free cells before it reaches the waypoint pays the penalty of each such
+step. DWA is therefore slow in narrow passages, and needs a recovery when it stalls.
 Letters in shapes: B episodes, M velocity pairs, T horizon steps, S state dimensions.
 """
 
@@ -41,28 +40,25 @@ from benchnav.planning.problem import (
 from benchnav.planning.robots import component_wise, steps_in
 from benchnav.planning.sensing.sensor import Step
 
-# A chunk of the horizon compiles in seconds.
-_CHUNK_STEPS = 10
-_WORTH_COMPILING = 100  # pairs
-# Stride of a trajectory's drawn positions.
-_DRAW_EVERY = 5
+_CHUNK_STEPS = 10  # a chunk of the horizon that compiles in seconds
+_WORTH_COMPILING = 100  # minimum number of pairs
+_DRAW_EVERY = 5  # stride of a trajectory's drawn positions
 
 
 @dataclass(frozen=True, kw_only=True)
 class DWAConfig:
-    """Settings of DWA; the paper gives none, these are ours.
+    """Settings of DWA. The defaults are ours, since the paper states no values.
 
     Args:
         speeds: number of linear velocities in the window.
         turn_rates: number of angular velocities in the window; an odd number includes
             straight driving.
-        horizon_s: duration of a pair in seconds, to the nearest number of steps T, at
-            least one.
+        horizon_s: duration of a pair in seconds, rounded to a number of steps T ≥ 1.
         heading_weight: cost of a radian between the last heading and the direction of
             the waypoint, as a fraction of the cost J of standing for the horizon. It
-            lets a robot turn in place, which changes no distance.
-        arrival_m: distance to the waypoint in metres below which a trajectory costs no
-            more, so that a near waypoint does not slow the robot.
+            lets a robot turn in place, although a turn changes no distance.
+        arrival_m: distance to the waypoint in metres below which a trajectory adds no
+            further cost, so that a near waypoint does not slow the robot.
     """
 
     speeds: int = 10
@@ -73,12 +69,9 @@ class DWAConfig:
 
     def __post_init__(self) -> None:
         """Validate the window and the weights."""
-        check_finite(
-            "DWA",
-            self,
-            ("speeds", "turn_rates", "horizon_s"),
-            ("heading_weight", "arrival_m"),
-        )
+        above_zero = "speeds", "turn_rates", "horizon_s"
+        at_least_zero = "heading_weight", "arrival_m"
+        check_finite("DWA", self, above_zero, at_least_zero)
 
 
 @dataclass(frozen=True)
@@ -123,31 +116,35 @@ class DWA(LocalPlanner[DWAState]):
 
     def init(self, problem: Problem, generator: torch.Generator) -> DWAState:
         """Return the plan state of standing robots; draws nothing. See `LocalPlanner`."""
-        return DWAState(problem, problem.start.new_zeros(len(problem), 2))
+        no_velocity = problem.start.new_zeros(len(problem), 2)
+        return DWAState(problem, no_velocity)
 
     def plan_toward(
         self, step: Step, plan_state: DWAState, target_m: Tensor
     ) -> tuple[Tensor, DWAState, Plan]:
         """Return the window's best pair; see `LocalPlanner`."""
+        config = self.config
         problem = plan_state.problem
-        window = velocity_window(problem, plan_state.velocity, self.config)
-        cost = score(problem, step.state, window, target_m, self.config, self._rollout)
+        state = step.state
+        window = velocity_window(problem, plan_state.velocity, config)
+        cost = score(problem, state, window, target_m, config, self._rollout)
         best = cost.argmin(dim=1)[:, None, None]
+        action = window.take_along_dim(best, 1)[:, 0]
         layers = {}
         if step.draw:
-            actions = window.mT[:, None].expand(
-                -1, steps_in(self.config.horizon_s, problem.dt_s), -1, -1
-            )
-            drawn = rollout_path(problem, step.state, actions)
+            horizon = steps_in(config.horizon_s, problem.dt_s)
+            actions = window.mT[:, None].expand(-1, horizon, -1, -1)
+            drawn = rollout_path(problem, state, actions)
             path = drawn.take_along_dim(best[..., None], 1)[:, 0]
             layers = {"path": path, "samples": drawn[:, :, ::_DRAW_EVERY]}
-        plan = Plan.empty(len(problem), step.state.device, **layers)
-        return window.take_along_dim(best, 1)[:, 0], plan_state, plan
+        plan = Plan.empty(len(problem), state.device, **layers)
+        return action, plan_state, plan
 
     def commit_action(self, plan_state: DWAState, action: Tensor) -> DWAState:
         """Return the plan state with the robots' new velocities; see `LocalPlanner`."""
         problem = plan_state.problem
-        return DWAState(problem, action.clamp(*reachable(problem, plan_state.velocity)))
+        low, high = reachable(problem, plan_state.velocity)
+        return DWAState(problem, action.clamp(low, high))
 
 
 def reachable(problem: Problem, velocity: Tensor) -> tuple[Tensor, Tensor]:
@@ -158,14 +155,14 @@ def reachable(problem: Problem, velocity: Tensor) -> tuple[Tensor, Tensor]:
         velocity: current (v, ω), shape [B, 2].
     """
     speed, turn_rate = velocity.unbind(1)
-    # Numbers, since a tensor of them would be copied to the device at every step.
-    reach, turn_reach = (
-        rate * problem.dt_s
-        for rate in problem.robot.action_rates or (math.inf, math.inf)
-    )
-    low = torch.stack((speed - reach, turn_rate - turn_reach), dim=1)
-    high = torch.stack((speed + reach, turn_rate + turn_reach), dim=1)
-    return low.clamp(*problem.action_bounds), high.clamp(*problem.action_bounds)
+    rates = problem.robot.action_rates or (math.inf, math.inf)
+    # Floats, since a tensor of them would be copied to the device at every step.
+    max_change = rates[0] * problem.dt_s
+    max_turn_change = rates[1] * problem.dt_s
+    low = torch.stack((speed - max_change, turn_rate - max_turn_change), dim=1)
+    high = torch.stack((speed + max_change, turn_rate + max_turn_change), dim=1)
+    bounds = problem.action_bounds
+    return low.clamp(*bounds), high.clamp(*bounds)
 
 
 def velocity_window(problem: Problem, velocity: Tensor, config: DWAConfig) -> Tensor:
@@ -179,12 +176,16 @@ def velocity_window(problem: Problem, velocity: Tensor, config: DWAConfig) -> Te
     Returns:
         Pairs (v, ω) within the bounds, shape [B, M, 2].
     """
-    low, high = (bound[:, None] for bound in reachable(problem, velocity))
-    fractions = [
-        torch.linspace(0, 1, count, device=velocity.device, dtype=velocity.dtype)
-        for count in (config.speeds, config.turn_rates)
-    ]
-    return low + (high - low) * torch.cartesian_prod(*fractions)
+    low, high = reachable(problem, velocity)
+    fractions = []
+    for count in (config.speeds, config.turn_rates):
+        steps = torch.linspace(
+            0, 1, count, device=velocity.device, dtype=velocity.dtype
+        )
+        fractions.append(steps)
+    low = low[:, None]
+    span = high[:, None] - low
+    return low + span * torch.cartesian_prod(*fractions)
 
 
 class Arcs(NamedTuple):
@@ -210,18 +211,28 @@ def rollout(
     arrival_m: float,
     steps: int,
 ) -> Arcs:
-    """Roll out each pair for some steps, and add up costs of those under way.
+    """Roll out each pair for some steps, and add the costs of the pairs under way.
 
-    Arguments are parts of a problem.
+    Args:
+        arcs: rollouts so far.
+        pairs: pairs (v, ω), shape [B, M, 2].
+        padded_ground: padded maps of the problem, shape [B, N].
+        target: waypoints (x, y) in metres, shape [B, 1, 2].
+        dynamics: dynamics of the problem.
+        arrival_m: distance in metres at which a pair has reached the target.
+        steps: number of steps to roll out.
     """
     states, cost, under_way = arcs
     grid, robot, objective, min_traversability = dynamics
     for _ in range(steps):
         ground = grid.lookup(padded_ground, states[..., 0], states[..., 1])
-        cost = cost + stage_cost(objective, states, pairs, ground, target) * under_way
-        states = robot(states, pairs, motion_traversability(ground, min_traversability))
+        step_cost = stage_cost(objective, states, pairs, ground, target)
+        cost = cost + step_cost * under_way
+        traversability = motion_traversability(ground, min_traversability)
+        states = robot(states, pairs, traversability)
         offset = states[..., :2] - target
-        under_way = under_way & ((offset * offset).sum(-1) > arrival_m**2)
+        square = (offset * offset).sum(-1)
+        under_way = under_way & (square > arrival_m**2)
     return Arcs(component_wise(states), cost, under_way)
 
 
@@ -241,42 +252,40 @@ def score(
         window: pairs (v, ω), shape [B, M, 2].
         target_m: waypoints (x, y) in metres, shape [B, 2].
         config: settings.
-        advance: `rollout` or the same compiled.
+        advance: `rollout`, or its compiled form.
 
     Returns:
         Cost of each pair, shape [B, M].
     """
     target = target_m[:, None].contiguous()
-    states = component_wise(state[:, None].expand(-1, window.shape[1], -1))
+    begin = state[:, None]
+    states = component_wise(begin.expand(-1, window.shape[1], -1))
     pairs = component_wise(window)
     cost = torch.zeros_like(window[..., 0])
-    arcs = Arcs(states, cost, torch.ones_like(cost, dtype=torch.bool))
+    under_way = torch.ones_like(cost, dtype=torch.bool)
+    arcs = Arcs(states, cost, under_way)
+    ground = problem.padded_ground
+    dynamics = problem.dynamics
+    arrival_m = config.arrival_m
     steps = steps_in(config.horizon_s, problem.dt_s)
     for first in range(0, steps, _CHUNK_STEPS):
         count = min(_CHUNK_STEPS, steps - first)
-        arcs = advance(
-            arcs,
-            pairs,
-            problem.padded_ground,
-            target,
-            problem.dynamics,
-            config.arrival_m,
-            count,
-        )
+        arcs = advance(arcs, pairs, ground, target, dynamics, arrival_m, count)
     states, cost, under_way = arcs
     # The unit of the heading's weight: J, without penalties, of robots that stand for
     # the horizon.
-    standing = problem.start.new_zeros(len(problem), 2).clamp(*problem.action_bounds)
+    no_action = problem.start.new_zeros(len(problem), 2)
+    standing = no_action.clamp(*problem.action_bounds)
     traversability = predicted_traversability(problem.ground_at(state))
     stage = problem.objective.stage(state, standing, traversability, target_m)
     terminal = problem.objective.terminal(state, traversability, target_m)
     unit = (steps * stage + terminal).abs()
     # Angle from the last heading to the waypoint as seen from the robot's current
-    # position. It is not wrapped: a turn past the waypoint counts as such, since a
-    # robot that spins would otherwise score another full turn like stopping.
-    state = state[:, None]
-    turned = states[..., 2] - state[..., 2]
-    heading_error = (turn_toward(state, target) - turned).abs()
+    # position. It is not wrapped, since a robot that spins would otherwise score another
+    # full turn like stopping.
+    turned = states[..., 2] - begin[..., 2]
+    heading_error = (turn_toward(begin, target) - turned).abs()
     weight = config.heading_weight * unit
     terminal = problem.terminal_cost(states, target)
-    return cost + (terminal + weight[:, None] * heading_error) * under_way
+    final_cost = terminal + weight[:, None] * heading_error
+    return cost + final_cost * under_way

@@ -1,9 +1,9 @@
 """A global path that provides waypoints to any local planner.
 
-A* returns the cheapest path from the robot's position; the local planner heads for a
-waypoint on it. A robot that its local planner keeps at one position is steered along
-the path. Source: paper IV-A1, after Fan et al. (2021), "STEP". Letters in shapes: B
-episodes, A action dimensions.
+A* returns the cheapest path from the robot's position, and the local planner drives to a
+waypoint on it. A robot that stalls under its local planner is steered along the path.
+Source: paper IV-A1, after Fan et al. (2021), "STEP". Letters in shapes: B episodes, A
+action dimensions.
 """
 
 from dataclasses import dataclass, replace
@@ -35,8 +35,8 @@ class GuideConfig:
 
     Args:
         lookahead_m: maximum distance along the path to the waypoint, in metres.
-        explore: optimism about terrain that the robot may observe before it is on it;
-            see `optimistic`.
+        explore: optimism about uncertain terrain, as a multiple of the spread of λ; see
+            `optimistic`.
     """
 
     added: ClassVar = ("explore",)
@@ -58,9 +58,9 @@ class GuidedState(Batch, Generic[Local]):
         edge_costs: costs of moving between neighbouring cells, float64, shape [B, E];
             see `astar.edge_costs`.
         field: cheapest paths to the goal.
-        ground: costs of a metre in each cell.
+        ground: costs per metre in each cell.
         local: the local planner's plan state.
-        recovery: recovery of robots that stand.
+        recovery: recovery of robots that stall.
     """
 
     problem: Problem
@@ -81,7 +81,8 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
 
     def __init__(self, config: GuideConfig, local: LocalPlanner[Local]) -> None:
         """Store the settings."""
-        self.config, self.local = config, local
+        self.config = config
+        self.local = local
 
     @property
     def compiled(self) -> bool | None:
@@ -93,43 +94,48 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
 
         See `Planner`.
         """
-        path = set()
+        inputs = self.local.uses(task) | {task.rules.free_space.source}
         if self._cost_uses_map(task):
-            path = {"risk_map", "distribution"} if self.config.explore else {"risk_map"}
-        return self.local.uses(task) | {task.rules.free_space.source} | path
+            inputs |= {"risk_map"}
+            if self.config.explore:
+                inputs |= {"distribution"}
+        return inputs
 
     @staticmethod
     def _cost_uses_map(task: Task) -> bool:
         """Return whether the cost of a path depends on λ̂, on level terrain or slopes."""
-        lowest = task.rules.min_traversability
-        traversability = torch.linspace(lowest, 1.0, 9).expand(3, 9)
+        min_traversability = task.rules.min_traversability
+        traversability = torch.linspace(min_traversability, 1.0, 9).expand(3, 9)
         grade = torch.tensor([-0.3, 0.0, 0.3])[:, None].expand(3, 9)
         cost = task.objective.path_cost(traversability, grade)
-        return bool((cost != cost[:, :1]).any())
+        differs = cost != cost[:, :1]
+        return bool(differs.any())
 
     def follows(self, task: Task) -> str:
         """Return what A* and the local planner minimise instead of J; see `Planner`."""
+        objective = task.objective
         local_aim = self.local.follows(task)
-        if isinstance(task.objective, GoalDistance) or not has_path_cost(
-            task.objective
-        ):
-            return f"3D path length (A*), {local_aim or 'J'} ({self.local.name})"
-        return local_aim and f"J (A*), {local_aim} ({self.local.name})"
+        name = self.local.name
+        is_distance = isinstance(objective, GoalDistance)
+        if is_distance or not has_path_cost(objective):
+            return f"3D path length (A*), {local_aim or 'J'} ({name})"
+        return local_aim and f"J (A*), {local_aim} ({name})"
 
     def remarks(self, task: Task) -> tuple[str, ...]:
         """Return notes on path costs that do not use J or λ̂; see `Planner`."""
-        remarks, objective = [], task.objective
+        remarks = []
+        objective = task.objective
         if not has_path_cost(objective):
             remarks.append(
-                f"A* takes the shortest path: {type(objective).__name__} has no "
+                f"A* returns the shortest path: {type(objective).__name__} has no "
                 "`path_cost`"
             )
         if not self._cost_uses_map(task) and task.rules.free_space.by == "mean":
             remarks.append(
                 "A* finds the same path under every risk setting, since its cost does "
-                "not use λ̂ and free ground is "
-                f"set by the mean; risk moves {self.local.name} alone (objective "
-                "travel_time moves the path)"
+                "not use λ̂ and the mean decides which cells are free; "
+                f"the risk setting affects only {self.local.name} (under objective "
+                "travel_time it also affects the path)"
             )
         return tuple(remarks)
 
@@ -147,27 +153,26 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
         self, step: Step, plan_state: GuidedState[Local]
     ) -> tuple[Tensor, GuidedState[Local], Plan]:
         """Return actions along the cheapest path; see `Planner`."""
-        problem, field, state = plan_state.problem, plan_state.field, step.state
+        problem = plan_state.problem
+        field = plan_state.field
+        state = step.state
+        lookahead_m = self.config.lookahead_m
         # The robot, and as many points as can lie within the look-ahead.
-        count = 2 + int(self.config.lookahead_m / problem.grid.resolution_m)
+        count = 2 + int(lookahead_m / problem.grid.resolution_m)
         points = astar.path_points(problem, field, state, count)
-        target, straight = choose_waypoint(
-            plan_state.ground, points, self.config.lookahead_m
-        )
+        target, straight = choose_waypoint(plan_state.ground, points, lookahead_m)
         aim_m = problem.goal_m if self.local.seeks_goal else target
         action, local, plan = self.local.plan_toward(step, plan_state.local, aim_m)
+        was_active = plan_state.recovery.active
         recovery = watch(plan_state.recovery, state, action, problem.robot)
-        recovery = aim(
-            recovery, plan_state.recovery.active, problem, field, state, straight
-        )
+        recovery = aim(recovery, was_active, problem, field, state, straight)
         steered = steer_toward(state, recovery.target_m, problem.robot)
         action = torch.where(recovery.active[:, None], steered, action)
         if step.draw:
             # Long enough for a path that crosses the map twice; longer ones are cut.
             max_points = 2 * (problem.grid.height + problem.grid.width)
-            plan = replace(
-                plan, reference=astar.path_points(problem, field, state, max_points)
-            )
+            reference = astar.path_points(problem, field, state, max_points)
+            plan = replace(plan, reference=reference)
         local = self.local.commit_action(local, action)
         return action, replace(plan_state, local=local, recovery=recovery), plan
 
@@ -179,30 +184,25 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
         The local planner's motion is kept.
         """
         local = self.local.revise(plan_state.local, self._local_problem(problem))
-        before, costs, field = (
-            plan_state.problem,
-            plan_state.edge_costs,
-            plan_state.field,
-        )
+        before = plan_state.problem
+        costs = plan_state.edge_costs
+        field = plan_state.field
         problem = optimistic(problem, self.config.explore)
-        changed = (problem.traversability != before.traversability) | (
-            problem.free != before.free
-        )
+        changed = problem.traversability != before.traversability
+        changed |= problem.free != before.free
         changed |= problem.elevation_m != before.elevation_m
         members = changed.flatten(1).any(1).nonzero()[:, 0]
         if len(members):
             costs = astar.revised_edge_costs(problem, costs, changed)
-            searched = astar.search(
-                problem.select(members), (costs[member] for member in members.tolist())
-            )
+            member_costs = (costs[member] for member in members.tolist())
+            searched = astar.search(problem.select(members), member_costs)
             field = field.put(members, searched)
-        ground = ground_costs(problem)
         return replace(
             plan_state,
             problem=problem,
             edge_costs=costs,
             field=field,
-            ground=ground,
+            ground=ground_costs(problem),
             local=local,
         )
 
@@ -212,27 +212,26 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
         """Return the plan state of some episodes; see `Planner`."""
         # Only the local planner knows which of its tensors have an episode dimension.
         shared: GuidedState[Any] = replace(plan_state, local=None)  # type: ignore[arg-type]
-        return replace(
-            shared.select(members), local=self.local.select(plan_state.local, members)
-        )
+        local = self.local.select(plan_state.local, members)
+        return replace(shared.select(members), local=local)
 
     def _local_problem(self, problem: Problem) -> Problem:
         """Return the local planner's problem: J to the goal, or to the next waypoint."""
         if self.local.seeks_goal:
             return problem
         objective = toward_waypoints(problem.objective)
-        return replace(problem, task=replace(problem.task, objective=objective))
+        task = replace(problem.task, objective=objective)
+        return replace(problem, task=task)
 
 
 def optimistic(problem: Problem, explore: float) -> Problem:
-    """Return the problem with λ̂ raised, to 1 at most, by a multiple of its spread.
+    """Return the problem with λ̂ raised, up to 1, by a multiple of its spread.
 
-    A path through uncertain terrain is then worth trying, since the robot observes that
-    terrain before it is on it, and can still turn away. No distance limits the bonus.
-    Under a belief that learns, terrain that is sensed early, or correlated with such
-    terrain, has hardly any spread left. Under one that does not learn, nothing is
-    settled during the episode, and the bonus only favours risk. The free mask does not
-    change.
+    Paths through uncertain terrain then become cheaper. A robot observes the terrain
+    before it drives there and can still turn away. The bonus applies at any distance.
+    Under a belief that learns, sensed terrain and terrain correlated with it have hardly
+    any spread left. Under a belief that does not learn, the spread stays during the
+    episode, and the bonus only favours risk. The free mask does not change.
 
     Args:
         problem: B problems.

@@ -1,9 +1,9 @@
-"""Recovery of robots that a local planner keeps at one position.
+"""Recovery of robots that stall under a local planner.
 
-If a robot has been kept at one position for a second, it is steered along the path,
-cell by cell, until it has left that position. A robot that drives but is slowed by the
-terrain is left to its planner. Recovery is not part of
-the paper. Letters in shapes: B episodes, S state and A action dimensions.
+A robot that its planner has not moved for a second is steered along the path, cell by
+cell, until it has left its position. A robot that drives but is slowed by the terrain
+continues with its planner. Recovery is not part of the paper. Letters in shapes: B
+episodes, S state and A action dimensions.
 """
 
 from dataclasses import dataclass, replace
@@ -23,17 +23,15 @@ from benchnav.planning.planners.astar.astar import (
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Robot
 
-# A robot that has moved less than this
+# A recovery begins if a robot has moved less than `_STANDING_M` in `_PATIENCE_S`, at a
+# commanded speed below the fraction `_IDLE` of its top speed.
 _STANDING_M = 0.05
-# for so long,
 _PATIENCE_S = 1.0
-# at less than this share of its top speed as commanded, is steered along the path,
 _IDLE = 0.2
-# from one of its points to within this share of a cell's width of the next,
+# A point of the path is reached within this fraction of a cell's width.
 _REACHED = 0.1
-# until it is this far away
+# A recovery ends if the robot has moved `_LEFT_M`, or after `_RECOVERY_S`.
 _LEFT_M = 0.5
-# or so much time has passed.
 _RECOVERY_S = 20.0
 
 
@@ -42,12 +40,12 @@ class Recovery(Batch):
     """Standing times of robots, and the recoveries in progress.
 
     Args:
-        anchor_m: position (x, y) that a robot has not left, shape [B, 2].
+        anchor_m: position (x, y) in metres that a robot has not left, shape [B, 2].
         steps: number of steps at that position, int64, shape [B].
-        driven_m: commanded distance in these steps, shape [B].
+        driven_m: commanded distance in these steps in metres, shape [B].
         active: mask of robots in recovery, bool, shape [B].
-        target_m: target (x, y) of the recovery, shape [B, 2].
-        cell: flat index of the path's cell at or behind the target, int64, shape [B].
+        target_m: target (x, y) of the recovery in metres, shape [B, 2].
+        cell: flat index of the path's cell at or after the target, int64, shape [B].
     """
 
     anchor_m: Tensor
@@ -60,9 +58,10 @@ class Recovery(Batch):
     @classmethod
     def none(cls, state: Tensor) -> "Recovery":
         """Return the state of robots, shape [B, S], before the first step."""
-        zero = torch.zeros_like(state[:, 0])
+        zero_m = torch.zeros_like(state[:, 0])
+        zero = zero_m.long()
         nowhere = torch.full_like(state[:, :2], torch.inf)
-        return cls(nowhere, zero.long(), zero, zero.bool(), nowhere, zero.long())
+        return cls(nowhere, zero, zero_m, zero.bool(), nowhere, zero)
 
 
 def watch(recovery: Recovery, state: Tensor, action: Tensor, robot: Robot) -> Recovery:
@@ -82,11 +81,12 @@ def watch(recovery: Recovery, state: Tensor, action: Tensor, robot: Robot) -> Re
     is_idle = recovery.driven_m < _IDLE * robot.top_speed_mps * time_s
     is_standing = (time_s >= _PATIENCE_S) & is_idle
     step_m = action[:, 0].abs() * robot.dt_s
+    driven_m = torch.where(restarts, 0, recovery.driven_m)
     return replace(
         recovery,
         anchor_m=torch.where(restarts[:, None], state[:, :2], recovery.anchor_m),
         steps=torch.where(restarts, 0, recovery.steps + 1),
-        driven_m=torch.where(restarts, 0, recovery.driven_m) + step_m,
+        driven_m=driven_m + step_m,
         active=~restarts & (recovery.active | is_standing),
     )
 
@@ -101,9 +101,9 @@ def aim(
 ) -> Recovery:
     """Return the recovery state with targets along the path, from cell centre to centre.
 
-    If the line to the next cell crosses more expensive terrain, the cell is reached by
-    the corner that the two cells share, which no other cell is part of. A robot keeps
-    its target until it is there.
+    If the line to the next cell crosses more expensive terrain, the first target is the
+    middle of the edge, or the corner, that both cells share. A robot keeps its target
+    until it is there.
 
     Args:
         recovery: state from `watch`, with the targets of the last step.
@@ -111,30 +111,26 @@ def aim(
         problem: B problems.
         field: cheapest paths to the goal.
         state: current robot states, shape [B, S].
-        straight: mask of robots whose line to the next cell is worth it, bool, shape [B].
-
-    Returns:
-        The recovery with the targets of this step.
+        straight: mask of robots that can drive straight to the next cell, bool, shape
+            [B].
     """
     grid = problem.grid
     arrived = distance(state, recovery.target_m) < _REACHED * grid.resolution_m
-    ahead = path_cells(field, recovery.cell, 2)
-    points = cell_points(problem, field, ahead)
-    on = (arrived & (recovery.target_m == points[:, 0]).all(dim=1)).long()[:, None]
-    cell = ahead.gather(1, on)[:, 0]
-    target = torch.where(
-        arrived[:, None],
-        points.take_along_dim(on[..., None], 1)[:, 0],
-        recovery.target_m,
-    )
+    # A robot at a centre drives to the next one, and a robot at a gate to its cell's.
+    cells = path_cells(field, recovery.cell, 2)
+    points = cell_points(problem, field, cells)
+    was_centre = (recovery.target_m == points[:, 0]).all(dim=1)
+    index = (arrived & was_centre).long()[:, None]
+    cell = cells.gather(1, index)[:, 0]
+    next_m = points.take_along_dim(index[..., None], 1)[:, 0]
+    target_m = torch.where(arrived[:, None], next_m, recovery.target_m)
 
-    ahead = path_cells(field, cell_at(grid, state), 2)
-    gate = 0.5 * cell_centres(grid, ahead).to(state).sum(dim=1)
-    first_m = torch.where(
-        straight[:, None], cell_points(problem, field, ahead)[:, 1], gate
-    )
+    first_cells = path_cells(field, cell_at(grid, state), 2)
+    gate_m = 0.5 * cell_centres(grid, first_cells).to(state).sum(dim=1)
+    centre_m = cell_points(problem, field, first_cells)[:, 1]
+    first_m = torch.where(straight[:, None], centre_m, gate_m)
     return replace(
         recovery,
-        target_m=torch.where(begun[:, None], target, first_m),
-        cell=torch.where(begun, cell, ahead[:, 1]),
+        target_m=torch.where(begun[:, None], target_m, first_m),
+        cell=torch.where(begun, cell, first_cells[:, 1]),
     )

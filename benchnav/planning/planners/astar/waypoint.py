@@ -1,9 +1,9 @@
-"""Waypoints of local planners: the farthest point of a path to which a straight line
-is worth it.
+"""Waypoints of local planners, chosen on A*'s path.
 
-The waypoint is the farthest point of the path, within the look-ahead, whose straight
-line costs at most 1.1 times the path under A*'s own costs. Both are integrated exactly
-over the cells that they cross, so no corner between two sampled points is missed.
+The waypoint is the farthest point of the path, within the look-ahead, to which a
+straight line costs at most 1.1 times the path under A*'s own costs. Both costs are
+integrated exactly over the cells that the line and the path cross, so no corner between
+two sampled points is missed.
 Letters in shapes: B episodes, J lines, N points, H×W cells.
 """
 
@@ -20,8 +20,7 @@ from benchnav.planning.free_space import PENALTY
 from benchnav.planning.planners.astar.astar import cell_at, cell_centres
 from benchnav.planning.problem import Problem
 
-# Maximum cost of a straight line relative to the path that it shortens.
-_SHORT_CUT = 1.1
+_SHORT_CUT = 1.1  # maximum cost of a straight line relative to the path
 
 
 @dataclass(frozen=True)
@@ -35,8 +34,8 @@ class GroundCosts(Batch):
         path_cost: function of λ̂ and grade that returns the cost of a metre.
         traversability: λ̂, shape [B, (H + 2)·(W + 2)].
         penalty_per_m: penalty of non-free cells, shape [B, (H + 2)·(W + 2)].
-        rise_x: rise of a metre along x, shape [B, (H + 2)·(W + 2)].
-        rise_y: rise of a metre along y, shape [B, (H + 2)·(W + 2)].
+        rise_x: rise per metre along x, shape [B, (H + 2)·(W + 2)].
+        rise_y: rise per metre along y, shape [B, (H + 2)·(W + 2)].
     """
 
     grid: Grid
@@ -48,18 +47,19 @@ class GroundCosts(Batch):
 
 
 def ground_costs(problem: Problem) -> GroundCosts:
-    """Return A*'s own costs of a metre, for B problems."""
+    """Return A*'s costs per metre, for B problems."""
     grid = problem.grid
-    along_y, along_x = torch.gradient(
-        problem.elevation_m, spacing=grid.resolution_m, dim=(1, 2)
-    )
+    elevation_m = problem.elevation_m
+    gradient = torch.gradient(elevation_m, spacing=grid.resolution_m, dim=(1, 2))
+    rise_y, rise_x = gradient
+    penalty = PENALTY * (~problem.free).to(problem.risk_map)
     return GroundCosts(
         grid,
         problem.objective.path_cost,
-        grid.pad(problem.traversability, outside=1.0),
-        grid.pad(PENALTY * (~problem.free).to(problem.risk_map), outside=PENALTY),
-        grid.pad(along_x, outside=0.0),
-        grid.pad(along_y, outside=0.0),
+        traversability=grid.pad(problem.traversability, outside=1.0),
+        penalty_per_m=grid.pad(penalty, outside=PENALTY),
+        rise_x=grid.pad(rise_x, outside=0.0),
+        rise_y=grid.pad(rise_y, outside=0.0),
     )
 
 
@@ -69,9 +69,9 @@ def line_costs(
     """Return the cost of straight lines, integrated over the cells that they cross.
 
     Args:
-        ground: costs of a metre.
-        start_m: (x, y) of one end in metres, shape [B, J, 2].
-        end_m: (x, y) of the other end, shape [B, J, 2].
+        ground: costs per metre.
+        start_m: starts (x, y) of the lines in metres, shape [B, J, 2].
+        end_m: ends (x, y) of the lines in metres, shape [B, J, 2].
         crossings: maximum number of columns, and of rows, that a line enters after its
             first.
 
@@ -81,61 +81,67 @@ def line_costs(
     offset = end_m - start_m
     cuts = _grid_cuts(start_m, offset, ground.grid.resolution_m, crossings)
     fraction = cuts.diff(dim=-1)
-    centre = (0.5 * (cuts[..., 1:] + cuts[..., :-1]))[..., None]
-    middle = start_m[:, :, None] + centre * offset[:, :, None]
+    centre = 0.5 * (cuts[..., 1:] + cuts[..., :-1])
+    middle = start_m[:, :, None] + centre[..., None] * offset[:, :, None]
+    x, y = middle[..., 0], middle[..., 1]
     length = torch.linalg.vector_norm(offset, dim=-1)[..., None]
-
-    def at_pieces(padded: Tensor) -> Tensor:
-        return ground.grid.lookup(padded, middle[..., 0], middle[..., 1])
-
-    rise_x = at_pieces(ground.rise_x) * offset[..., :1]
-    rise_y = at_pieces(ground.rise_y) * offset[..., 1:]
-    # The grade of a line without length does not matter: it costs nothing.
+    grid = ground.grid
+    rise_x = grid.lookup(ground.rise_x, x, y) * offset[..., :1]
+    rise_y = grid.lookup(ground.rise_y, x, y) * offset[..., 1:]
+    # A line without length costs nothing, whatever its grade.
     grade = (rise_x + rise_y) / length.clamp(min=1e-9)
-    per_m = ground.path_cost(at_pieces(ground.traversability), grade)
-    per_m = per_m + at_pieces(ground.penalty_per_m)
+    traversability = grid.lookup(ground.traversability, x, y)
+    per_m = ground.path_cost(traversability, grade)
+    per_m = per_m + grid.lookup(ground.penalty_per_m, x, y)
     return (per_m * fraction * length).sum(dim=-1)
 
 
 def choose_waypoint(
     ground: GroundCosts, points_m: Tensor, lookahead_m: float
 ) -> tuple[Tensor, Tensor]:
-    """Return the farthest point of a path whose straight line costs hardly more than
-    the path.
+    """Return the waypoint of each path: its farthest point that a line should lead to.
+
+    A line should lead to a point if it costs at most 1.1 times the path to that point.
 
     Args:
-        ground: A*'s costs of a metre.
+        ground: A*'s costs per metre.
         points_m: the robot, the centres of the next cells of its path, and the goal,
             (x, y) in metres, shape [B, N, 2].
         lookahead_m: look-ahead along the path in metres.
 
     Returns:
-        Waypoint (x, y), shape [B, 2]: the path's next point if no line is worth it; and
-        a mask of episodes in which the line to that next point is, bool, shape [B].
+        Waypoints (x, y) in metres, the path's next point if no line is cheap enough,
+        shape [B, 2]; and a mask of episodes in which the line to that next point is
+        cheap enough, bool, shape [B].
     """
     grid = ground.grid
-    robot, ahead = points_m[:, :1], points_m[:, 1:]
-    # The edge or corner that two cells share is half-way to the next cell's centre.
-    gate = 0.5 * (cell_centres(grid, cell_at(grid, robot)).to(robot) + ahead[:, :1])
+    robot = points_m[:, :1]
+    ahead = points_m[:, 1:]
+    next_point = ahead[:, :1]
     count = ahead.shape[1]
-    # Straight lines to each point, the path's legs, and the first leg by way of the
-    # gate.
+    # The gate is the edge or corner that the robot's cell shares with the next cell. It
+    # is half-way between their centres.
+    centre = cell_centres(grid, cell_at(grid, robot)).to(robot)
+    gate = 0.5 * (centre + next_point)
+    # Straight lines to each point, the path's legs, and the first leg through the gate.
     begin = torch.cat((robot.expand_as(ahead), ahead[:, :-1], robot, gate), dim=1)
-    end = torch.cat((ahead, ahead[:, 1:], gate, ahead[:, :1]), dim=1)
-    # Lines within the look-ahead cross no more columns or rows than this.
+    end = torch.cat((ahead, ahead[:, 1:], gate, next_point), dim=1)
+    # Maximum number of columns or rows that a line within the look-ahead enters.
     crossings = math.ceil(lookahead_m / grid.resolution_m) + 1
     costs = line_costs(ground, begin, end, crossings)
-    lines, legs, by_gate = costs.split((count, count - 1, 2), dim=1)
+    line_cost, leg_cost, gate_cost = costs.split((count, count - 1, 2), dim=1)
     # The line to a neighbour across a corner may cut a cell that the path does not
     # touch.
-    first = torch.minimum(lines[:, :1], by_gate.sum(dim=1, keepdim=True))
-    path = torch.cat((first, legs), dim=1).cumsum(dim=1)
-    along_m = torch.linalg.vector_norm(points_m.diff(dim=1), dim=2).cumsum(dim=1)
-    in_range = along_m <= lookahead_m
+    gate_cost = gate_cost.sum(dim=1, keepdim=True)
+    first_cost = torch.minimum(line_cost[:, :1], gate_cost)
+    path_cost = torch.cat((first_cost, leg_cost), dim=1).cumsum(dim=1)
+    leg_m = torch.linalg.vector_norm(points_m.diff(dim=1), dim=2)
+    in_range = leg_m.cumsum(dim=1) <= lookahead_m
     rank = torch.arange(count, device=ahead.device)
-    is_worth = lines <= _SHORT_CUT * path
-    farthest = torch.where(is_worth & in_range, rank, 0).amax(dim=1)
-    return ahead.take_along_dim(farthest[:, None, None], 1)[:, 0], is_worth[:, 0]
+    is_cheap = line_cost <= _SHORT_CUT * path_cost
+    farthest = torch.where(is_cheap & in_range, rank, 0).amax(dim=1)
+    waypoint = ahead.take_along_dim(farthest[:, None, None], 1)[:, 0]
+    return waypoint, is_cheap[:, 0]
 
 
 def _grid_cuts(
@@ -145,12 +151,16 @@ def _grid_cuts(
 
     Shape [B, J, 2·crossings + 2].
     """
-    lines = torch.arange(crossings, device=start_m.device) + 1
-    begin, along = start_m[..., None], offset_m[..., None]
+    count = torch.arange(crossings, device=start_m.device) + 1
+    begin = start_m[..., None]
+    along = offset_m[..., None]
     low = torch.minimum(begin, begin + along)
-    crossed = ((low / resolution_m).floor() + lines) * resolution_m
-    # A line along an axis never crosses that axis's grid lines: NaN or infinite.
-    fractions = ((crossed - begin) / along).nan_to_num(1.0, 1.0, 1.0)
+    crossed = ((low / resolution_m).floor() + count) * resolution_m
+    fractions = (crossed - begin) / along
+    # Along an axis no grid line of that axis is crossed: the fraction is NaN or infinite.
+    fractions = fractions.nan_to_num(1.0, 1.0, 1.0)
     fractions = fractions.clamp(0, 1).flatten(2)
-    ends = torch.zeros_like(fractions[..., :1]), torch.ones_like(fractions[..., :1])
-    return torch.cat((*ends, fractions), dim=-1).sort(dim=-1).values
+    first = torch.zeros_like(fractions[..., :1])
+    last = torch.ones_like(first)
+    cuts = torch.cat((first, last, fractions), dim=-1)
+    return cuts.sort(dim=-1).values

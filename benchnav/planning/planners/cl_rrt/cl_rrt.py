@@ -1,48 +1,48 @@
 """Closed-loop rapidly-exploring random trees (CL-RRT).
 
-A tree is not grown by steering states but by simulating the robot with its controller.
-A node is chosen for a sampled point, and a Dubins reference is drawn from the node to
-the point. The closed loop of pure pursuit and a PID on speed (`pursuit`) drives along
-it through F with predicted traversability. An edge is kept as far as it is free of
-collision. The robot then executes the same controller on the same references. The best
-path is that of minimum simulated time; J is not used. Source: Kuwata et al. (2009),
-"Real-time motion planning with applications to autonomous urban driving"; paper IV-A2.
+A tree grows by simulations of the robot with its controller. A node is chosen for a
+sampled point, and a Dubins reference is drawn from the node to the point. The closed
+loop of pure pursuit and a PID on speed (`pursuit`) follows the reference through F with
+predicted traversability. An edge is kept as far as it is free of collision. The robot
+then runs the same controller on the same references. The best path has the minimum
+simulated time; J is not used. Source: Kuwata et al. (2009), "Real-time motion planning
+with applications to autonomous urban driving"; paper IV-A2.
 
-See also `tree`, whose `search` is one plan, and `edges`, which simulates. This module
+See also `tree`, whose `search` makes one plan, and `edges`, which simulates. This module
 is the execution loop of the source, algorithm 2: when to plan, and from which state.
 
 - The source grows one tree all the time, simulates its best path again from the latest
-  state, and stops if no path is safe. Here a tree is grown only when a plan is due, at
-  the path's end or when the robot has strayed or stalled (paper IV-A2), and is not
-  kept. Nodes need not be safe to stop at.
+  state, and stops if no path is safe. Here a tree is grown only when a plan is due (at
+  the end of the path, or when the robot has strayed or stalled; paper IV-A2), and is
+  then discarded. A node need not be a state at which the robot can stop safely.
 - References are Dubins paths; the source draws straight lines and uses Dubins lengths
-  for its heuristics.
-- If λ̂ decreases along a path to the goal, so that the remaining path costs over a tenth
-  more than on the map on which it was chosen, a new tree is grown and the cheaper of
+  only in its heuristics.
+- λ̂ may decrease along a path to the goal. If the remaining path then costs over a tenth
+  more than on the map on which it was chosen, a new tree is grown, and the cheaper of
   both paths is driven. Both costs are times along the predicted positions under the new
   λ̂. Without a new path the next steps try again, up to `most_failures` times. A partial
-  path is left at once. Hence a constant map costs no tree, and one that changes slowly
+  path is left at once. Hence a constant map costs no tree, and a slowly changing map
   only a few.
 - Sampled points have no heading, so references are the shortest paths to a point with
-  free heading: the minimum over all end headings of the Dubins length. No random
+  free heading: the minimum of the Dubins length over all end headings. No random
   heading causes a detour.
-- A plan without a path to the goal follows the best partial path. The next steps plan
-  again, each time with references of half the radius, down to the robot's own tightest
-  turn or the spacing of their points: at full radius a robot that faces non-free cells
-  may have no path, and one that can slow down can turn tighter. After `most_failures`
-  such plans a partial path is driven to its end. It is left slightly before its end,
-  and there is no further plan from non-free cells: a robot that slid into a wall could
-  leave it on the other side.
+- After a plan without a path to the goal, the robot follows the best partial path. The
+  next steps plan again. Each plan halves the radius of the references, down to the
+  robot's tightest turn or the spacing of their points. At full radius a robot that faces
+  non-free cells may have no path, and a robot that can slow down can turn tighter. After
+  `most_failures` such plans a partial path is driven until slightly before its end.
+  There is no further plan from non-free cells, because a robot that slid into a wall
+  could leave it on the other side.
 - If `most_failures` consecutive plans found no partial path either, the next ones may
-  cross: their edges continue over non-free cells, at their penalty per metre, and the
-  cheapest path is driven as a partial one. Before that the tree stays in free cells, so
-  that a free path is used wherever one is found; once the robot is across, it looks for
-  one again. The planner never gives up.
-- Expansions are in rounds: all samples of a round, of all episodes, are simulated at
-  once. Samples are a pure function of the plan state's seed and step, the same for each
-  episode of a batch.
+  cross: their edges continue over non-free cells, with a penalty per metre, and the
+  cheapest path is driven as a partial one. Until then the tree stays in free cells, so
+  that a free path is used if one is found. After the crossing the robot searches for a
+  free path again. The planner never gives up.
+- Edges are added in rounds: all samples of a round, of all episodes, are simulated at
+  once. Samples are a pure function of the plan state's seed and step, and the same for
+  all episodes of a batch.
 - A path has at most one edge per round, so that a plan reaches as far as `rounds` edges
-  do (100 m by default); a goal farther away is approached along partial paths.
+  (100 m by default); a goal farther away is approached along partial paths.
 
 Letters in shapes: B episodes, M of which plan, D edges of a path, R edges of a round.
 """
@@ -68,19 +68,14 @@ from benchnav.planning.planners.cl_rrt.pursuit import (
     Tracking,
 )
 from benchnav.planning.planners.cl_rrt.tree import Route, no_route, search
-from benchnav.planning.planners.planner import (
-    Plan,
-    Planner,
-    PlanStatus,
-    check_steers,
-)
+from benchnav.planning.planners.planner import Plan, Planner, PlanStatus, check_steers
 from benchnav.planning.problem import Problem, Task, motion_traversability
 from benchnav.planning.robots import SPEED, TURN_RATE
 from benchnav.planning.sensing.sensor import Step
 
 _STALL_M = 0.25  # minimum progress within `stall_s`
-# Fraction by which the cost of the remaining path rises before it is compared with a
-# new one.
+# Minimum relative increase in the cost of the remaining path for a comparison with a new
+# path.
 _RISE = 0.1
 
 
@@ -90,18 +85,20 @@ class CLRRTState(Batch):
 
     Args:
         problem: the problem.
-        route: route that is followed.
+        route: route that the robots follow.
         edge: index of the current edge of the path, int64, shape [B].
         tracking: state of the controller.
         progress_m: arc length along the reference of that edge in metres, shape [B].
-        failures: consecutive plans without a path to the goal, int64, shape [B].
-        mark_m: progress along the path at the last mark, shape [B].
-        mark_step: step of that mark, int64, shape [B].
-        ground: `Problem.padded_ground` on which the path was chosen, shape [B, N].
-        doubted: mask of paths that have become more expensive, and are to be compared
-            with new ones, bool, shape [B].
+        failures: number of consecutive plans without a path to the goal, int64, shape
+            [B].
+        mark_m: progress along the path in metres when the robot last had progress of
+            `_STALL_M`, shape [B].
+        mark_step: step at that progress, int64, shape [B].
+        ground: `Problem.padded_ground` when the path was chosen, shape [B, N].
+        doubted: mask of paths that have become more expensive and must be compared with
+            new ones, bool, shape [B].
         follower: the controller.
-        seed: root of the samples.
+        seed: seed of the samples.
         step: number of steps planned so far.
     """
 
@@ -145,21 +142,20 @@ class CLRRT(Planner[CLRRTState]):
 
     def remarks(self, task: Task) -> tuple[str, ...]:
         """Return notes for tables; see `Planner`."""
-        config, robot = self.config.follower, task.robot
+        config = self.config.follower
+        robot = task.robot
         follower = PathFollower(config, robot)
         remarks = []
         if follower.wanted_mps < robot.top_speed_mps:
             remarks.append(
                 f"CL-RRT drives at {follower.wanted_mps:g} m/s at most; the robot's "
-                "top speed is "
-                f"{robot.top_speed_mps:g} m/s"
+                f"top speed is {robot.top_speed_mps:g} m/s"
             )
-        if follower.lookahead_m > max(
-            config.lookahead_m, config.lookahead_s * follower.wanted_mps
-        ):
+        timed_m = config.lookahead_s * follower.wanted_mps
+        if follower.lookahead_m > max(config.lookahead_m, timed_m):
             remarks.append(
-                f"CL-RRT looks {follower.lookahead_m:g} m ahead, the way of the robot "
-                "while its turn rate builds up"
+                f"CL-RRT looks {follower.lookahead_m:g} m ahead, the distance that the "
+                "robot drives while its turn rate builds up"
             )
         return tuple(remarks)
 
@@ -167,8 +163,8 @@ class CLRRT(Planner[CLRRTState]):
         """Return a plan state without a path, so that the first step plans.
 
         Raises:
-            ConfigError: If the robot cannot follow references, or not of the turning
-                radius.
+            ConfigError: If the robot cannot follow references, or cannot turn as tightly
+                as `turning_radius_m`.
         """
         config = self.config
         check_steers(self, problem.robot, "cl_rrt")
@@ -176,28 +172,25 @@ class CLRRT(Planner[CLRRTState]):
         expect(
             config.turning_radius_m >= follower.tightest_m,
             f"`turning_radius_m` ≥ {follower.tightest_m:g}, the radius of the robot's "
-            "tightest turn, for CL-RRT, got "
-            f"{config.turning_radius_m}.",
+            f"tightest turn, for CL-RRT, got {config.turning_radius_m}.",
         )
-        none = torch.zeros(len(problem), dtype=torch.int64, device=problem.start.device)
-        zero = torch.zeros_like(problem.start[:, 0])
+        zero_m = torch.zeros_like(problem.start[:, 0])
+        zero = torch.zeros_like(zero_m, dtype=torch.int64)
+        loop = self._closed_loop(problem, follower, zero)
+        seed = torch.randint(2**62, (), generator=generator)
         return CLRRTState(
             problem=problem,
-            route=no_route(
-                self._closed_loop(problem, follower, none),
-                config.rounds,
-                config.expansions,
-            ),
-            edge=none,
+            route=no_route(loop, config.rounds, config.expansions),
+            edge=zero,
             tracking=Tracking.standing(problem.start),
-            progress_m=zero,
-            failures=none,
-            mark_m=zero,
-            mark_step=none,
+            progress_m=zero_m,
+            failures=zero,
+            mark_m=zero_m,
+            mark_step=zero,
             ground=problem.padded_ground,
-            doubted=none.bool(),
+            doubted=zero.bool(),
             follower=follower,
-            seed=int(torch.randint(2**62, (), generator=generator)),
+            seed=int(seed),
             step=0,
         )
 
@@ -205,39 +198,38 @@ class CLRRT(Planner[CLRRTState]):
         self, step: Step, plan_state: CLRRTState
     ) -> tuple[Tensor, CLRRTState, Plan]:
         """Return actions along the path, after a new plan if one is due; see `Planner`."""
-        config, problem, state = self.config, plan_state.problem, step.state
+        problem = plan_state.problem
+        state = step.state
         now = self._follow(state, plan_state)
         ground = problem.ground_at(state)
+        on_map = ground != 0
         arrived = distance(state, problem.goal_m) < problem.goal_radius_m
         lost = self._off_route(state, now)
         partial = now.route.status == PlanStatus.PARTIAL
-        again = ((partial & (now.failures < config.most_failures)) | now.doubted) & (
-            ground > 0
-        )
-        # not off the map
-        due = ((lost | again) & ~arrived & (ground != 0)).nonzero()[:, 0]
+        retries = partial & (now.failures < self.config.most_failures)
+        again = (retries | now.doubted) & (ground > 0)
+        is_due = (lost | again) & ~arrived & on_map
+        due = is_due.nonzero()[:, 0]
         if len(due):
             now = self._replan(state, now, due, lost[due])
-        route, follower = now.route, now.follower
+        route = now.route
+        follower = now.follower
         reference = _reference(route, now.edge)
-        progress = now.progress_m  # moved already, but on references that begin now
-        progress = torch.where(
-            progress > 0, progress, follower.advance(reference, state, progress)
-        )
+        # Only the progress along references that begin in this step is still 0.
+        progress = now.progress_m
+        advanced = follower.advance(reference, state, progress)
+        progress = torch.where(progress > 0, progress, advanced)
         action, tracking = follower.act(reference, state, now.tracking, progress)
         driving = (route.depth > 0) & ~arrived
-        action = torch.where(driving[:, None], action, 0).clamp(*problem.action_bounds)
-        layers = (
-            {"path": route.path, "reference": route.line, "tree": route.tree}
-            if step.draw
-            else {}
-        )
+        action = torch.where(driving[:, None], action, 0)
+        action = action.clamp(*problem.action_bounds)
+        layers = {}
+        if step.draw:
+            layers = {"path": route.path, "reference": route.line, "tree": route.tree}
         plan = Plan.empty(len(state), state.device, status=route.status, **layers)
-        return (
-            action,
-            replace(now, tracking=tracking, progress_m=progress, step=now.step + 1),
-            plan,
-        )
+        next_step = now.step + 1
+        now = replace(now, tracking=tracking, progress_m=progress, step=next_step)
+        return action, now, plan
 
     def select(self, plan_state: CLRRTState, members: Tensor) -> CLRRTState:
         """Return the plan state of some episodes; see `Planner`."""
@@ -246,132 +238,143 @@ class CLRRT(Planner[CLRRTState]):
     def revise(self, plan_state: CLRRTState, problem: Problem) -> CLRRTState:
         """Return the plan state under another λ̂; see `Planner`.
 
-        Paths of unchanged cost are kept, more expensive ones are doubted, and those
-        that are no longer free are left.
+        Paths of unchanged cost are kept, more expensive paths to the goal are doubted,
+        and paths that are no longer free are left.
         """
-        route, before = plan_state.route, plan_state.problem
+        route = plan_state.route
         points, length_m = self._ahead(route, problem, problem.start)
-        was, now = (problem_of.ground_at(points) for problem_of in (before, problem))
-        closed = ((was > 0) & (now < 0) & (length_m > 0)).any(dim=1)
-        judged = problem.grid.lookup(plan_state.ground, points[..., 0], points[..., 1])
-        cost, judged_cost = (
-            self._cost(plan_state, ground, length_m) for ground in (now, judged)
-        )
-        dearer = cost > (1 + _RISE) * judged_cost
+        old_ground = plan_state.problem.ground_at(points)
+        new_ground = problem.ground_at(points)
+        is_blocked = (old_ground > 0) & (new_ground < 0) & (length_m > 0)
+        closed = is_blocked.any(dim=1)
+        x, y = points[..., 0], points[..., 1]
+        chosen_ground = problem.grid.lookup(plan_state.ground, x, y)
+        cost = self._cost(plan_state, new_ground, length_m)
+        chosen_cost = self._cost(plan_state, chosen_ground, length_m)
+        dearer = cost > (1 + _RISE) * chosen_cost
         leads = route.status == PlanStatus.OK
-        # At the end of its path a robot looks for another.
-        edge = torch.where(closed | (dearer & ~leads), route.depth, plan_state.edge)
-        return replace(
-            plan_state,
-            problem=problem,
-            edge=edge,
-            doubted=plan_state.doubted | (dearer & leads),
-        )
+        # A robot at the end of its path searches for another.
+        is_left = closed | (dearer & ~leads)
+        edge = torch.where(is_left, route.depth, plan_state.edge)
+        doubted = plan_state.doubted | (dearer & leads)
+        return replace(plan_state, problem=problem, edge=edge, doubted=doubted)
 
     def _ahead(
         self, route: Route, problem: Problem, state: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return pieces of paths as `Route.pieces`; those behind robots have length 0."""
-        points, length_m = route.pieces(0.5 * problem.grid.resolution_m)
-        away = distance(points, state[:, None, :2]).masked_fill(length_m == 0, math.inf)
-        ahead = (
-            torch.arange(away.shape[1], device=away.device)
-            >= away.argmin(dim=1)[:, None]
-        )
-        return points, torch.where(ahead, length_m, 0)
+        """Return the segments of paths ahead of robots; those behind have length 0.
+
+        Returns:
+            Midpoints and lengths of all segments, as returned by `Route.segments`.
+        """
+        points, length_m = route.segments(0.5 * problem.grid.resolution_m)
+        distance_m = distance(points, state[:, None, :2])
+        distance_m = distance_m.masked_fill(length_m == 0, math.inf)
+        nearest = distance_m.argmin(dim=1)[:, None]
+        index = torch.arange(distance_m.shape[1], device=distance_m.device)
+        return points, torch.where(index >= nearest, length_m, 0)
 
     def _cost(self, now: CLRRTState, ground: Tensor, length_m: Tensor) -> Tensor:
-        """Return costs of pieces in seconds, [B], as those of a tree's edges.
+        """Return costs of paths in seconds, by the rule for edges of a tree, shape [B].
 
-        Pieces are given by values of `padded_ground` and lengths, [B, K].
+        Args:
+            now: plan state with the robot and its follower.
+            ground: values of `padded_ground` at the segments, shape [B, K].
+            length_m: lengths of the segments in metres, shape [B, K].
         """
-        robot, rules = now.problem.robot, now.problem.task.rules
-        reach_mps = (
-            motion_traversability(ground, rules.min_traversability)
-            * robot.action_high[0]
-        )
-        pace = 1 / reach_mps.clamp(max=now.follower.wanted_mps) + PENALTY * (
-            ground <= 0
-        )
+        problem = now.problem
+        min_traversability = problem.task.rules.min_traversability
+        traversability = motion_traversability(ground, min_traversability)
+        reach_mps = traversability * problem.robot.action_high[0]
+        speed_mps = reach_mps.clamp(max=now.follower.wanted_mps)
+        pace = 1 / speed_mps + PENALTY * (ground <= 0)
         return torch.where(length_m > 0, pace * length_m, 0).sum(dim=1)
 
     def _cost_ahead(self, now: CLRRTState, route: Route, state: Tensor) -> Tensor:
-        """Cost of what is left of paths from states [B, S] on, shape [B]."""
+        """Return the cost of the remaining paths from states [B, S], shape [B]."""
         points, length_m = self._ahead(route, now.problem, state)
-        return self._cost(now, now.problem.ground_at(points), length_m)
+        ground = now.problem.ground_at(points)
+        return self._cost(now, ground, length_m)
 
     def _follow(self, state: Tensor, now: CLRRTState) -> CLRRTState:
-        """Moves the progress to where the robots are, on to the next edge where one is
-        done.
-        """
-        reference = _reference(now.route, now.edge)
+        """Advance the progress to the robots' states, and to the next edge at an end."""
+        route = now.route
+        reference = _reference(route, now.edge)
         progress = now.follower.advance(reference, state, now.progress_m)
-        last = now.route.end_m.shape[1] - 1
-        done = (
-            progress
-            >= now.route.end_m.gather(1, now.edge.clamp(max=last)[:, None])[:, 0]
-        )
-        edge = torch.minimum(now.edge + done, now.route.depth)
+        last = route.end_m.shape[1] - 1
+        current = now.edge.clamp(max=last)
+        end_m = route.end_m.gather(1, current[:, None])[:, 0]
+        done = progress >= end_m
+        edge = torch.minimum(now.edge + done, route.depth)
         progress = torch.where(done, 0, progress)
-        along = edge * self.config.step_m + progress
-        moved = along >= now.mark_m + _STALL_M
-        # A robot that drives over ground that is not free looks for a free way when it
-        # is across.
-        astray = (now.route.depth > 0) & ~now.problem.free_at(state)
+        along_m = edge * self.config.step_m + progress
+        passed = along_m >= now.mark_m + _STALL_M
+        # A robot that crosses non-free cells searches for a free path after it.
+        astray = (route.depth > 0) & ~now.problem.free_at(state)
         return replace(
             now,
             edge=edge,
             progress_m=progress,
             failures=torch.where(astray, 0, now.failures),
-            mark_m=torch.where(moved, along, now.mark_m),
-            mark_step=torch.where(moved, now.step, now.mark_step),
+            mark_m=torch.where(passed, along_m, now.mark_m),
+            mark_step=torch.where(passed, now.step, now.mark_step),
         )
 
     def _off_route(self, state: Tensor, now: CLRRTState) -> Tensor:
-        """Return a mask of robots that need a plan, bool, [B].
+        """Return a mask of robots that need a plan, bool, shape [B].
 
         They are at the end of the path, too far from it, or stalled.
         """
+        config = self.config
         offset = now.route.path - state[:, None, :2]
-        square = (offset * offset).sum(dim=-1).nan_to_num(nan=math.inf).amin(dim=1)
-        stalled = (now.step - now.mark_step) * now.problem.dt_s > self.config.stall_s
-        return (
-            (now.edge >= now.route.depth)
-            | (square > self.config.replan_distance_m**2)
-            | stalled
-        )
+        square = (offset * offset).sum(dim=-1)
+        min_square = square.nan_to_num(nan=math.inf).amin(dim=1)
+        is_far = min_square > config.replan_distance_m**2
+        idle_s = (now.step - now.mark_step) * now.problem.dt_s
+        stalled = idle_s > config.stall_s
+        at_end = now.edge >= now.route.depth
+        return at_end | is_far | stalled
 
     def _replan(
         self, state: Tensor, now: CLRRTState, due: Tensor, lost: Tensor
     ) -> CLRRTState:
-        """Plan for some episodes, indices [M].
+        """Plan for the episodes that are due, and return the next plan state.
 
-        Those not lost, bool [M], change only for a path to the goal, and from one in
-        doubt only for a cheaper one.
+        Robots off their route follow the new path. The others change to it only if it
+        leads to the goal and, if the path is doubted, only if it is also cheaper.
+
+        Args:
+            state: states of all robots, shape [B, S].
+            now: plan state.
+            due: indices of the episodes to plan for, int64, shape [M].
+            lost: mask of due episodes that are off their route, bool, shape [M].
         """
+        most_failures = self.config.most_failures
         used_up = lost & (now.route.depth[due] > 0)
         failures = torch.where(used_up, 0, now.failures[due])
         route = self._search(state[due], now, due, failures)
         reaches_goal = route.status == PlanStatus.OK
-        crosses = (failures >= self.config.most_failures) & (route.depth > 0)
+        crosses = (failures >= most_failures) & (route.depth > 0)
         failures = torch.where(reaches_goal | crosses, 0, failures + 1)
         compared = now.doubted[due] & ~lost
         better = ~compared
         if bool((compared & reaches_goal).any()):
-            costs = [
-                self._cost_ahead(now, candidate, state)[due]
-                for candidate in (now.route.put(due, route), now.route)
-            ]
-            better = better | (costs[0] < costs[1])
-        taken = (lost | (reaches_goal & better)).nonzero()[:, 0]
+            new_routes = now.route.put(due, route)
+            new_cost = self._cost_ahead(now, new_routes, state)[due]
+            old_cost = self._cost_ahead(now, now.route, state)[due]
+            better = better | (new_cost < old_cost)
+        changes = lost | (reaches_goal & better)
+        taken = changes.nonzero()[:, 0]
         members = due[taken]
-        # A path that nothing better is found for is kept as it is.
-        stays = compared & (failures >= self.config.most_failures)
+        # After the last attempt a doubted path is kept as it is.
+        stays = compared & (failures >= most_failures)
         failures = torch.where(stays, 0, failures)
+        ground = now.problem.padded_ground[due]
+        doubted = compared & ~reaches_goal & ~stays
         return replace(
             now,
-            ground=now.ground.index_copy(0, due, now.problem.padded_ground[due]),
-            doubted=now.doubted.index_copy(0, due, compared & ~reaches_goal & ~stays),
+            ground=now.ground.index_copy(0, due, ground),
+            doubted=now.doubted.index_copy(0, due, doubted),
             route=now.route.put(members, route.select(taken)),
             edge=now.edge.index_fill(0, members, 0),
             progress_m=now.progress_m.index_fill(0, members, 0),
@@ -384,41 +387,35 @@ class CLRRT(Planner[CLRRTState]):
         self, root: Tensor, now: CLRRTState, members: Tensor, failures: Tensor
     ) -> Route:
         """Return the best paths of trees grown from root states [M, S]."""
-        config, problem = self.config, now.problem
+        config = self.config
+        problem = now.problem
         if len(members) < len(problem):
             problem = problem.select(members)
         loop = self._closed_loop(problem, now.follower, failures)
         key = rng.stream_key(now.seed, "cl_rrt", now.step)
-        draws = rng.uniform(
-            key,
-            np.zeros(1, dtype=np.int64),
-            (config.rounds, config.expansions_per_round, 3),
-        )
-        chance = torch.from_numpy(draws[0]).to(root)
-        sample_m = chance[..., :2] * root.new_tensor(problem.grid.extent_m)
+        shape = config.rounds, config.expansions_per_round, 3
+        draws = rng.uniform(key, np.zeros(1, dtype=np.int64), shape)
+        uniform = torch.from_numpy(draws[0]).to(root)
+        extent_m = root.new_tensor(problem.grid.extent_m)
+        sample_m = uniform[..., :2] * extent_m
+        chance = uniform[..., 2]
+        tracking = now.tracking.select(members)
         goal_edges = math.ceil(config.goal_bias * config.expansions_per_round)
-        return search(
-            loop,
-            root,
-            now.tracking.select(members),
-            sample_m,
-            chance[..., 2],
-            goal_edges,
-        )
+        return search(loop, root, tracking, sample_m, chance, goal_edges)
 
     def _closed_loop(
         self, problem: Problem, follower: PathFollower, failures: Tensor
     ) -> ClosedLoop:
         """Return the closed loop of trees after a number of failed plans, int64 [B]."""
         config = self.config
-        least_m = max(follower.tightest_m, min(config.turning_radius_m, SPACING_M))
-        tries = failures % config.most_failures
+        full_m = config.turning_radius_m
+        min_m = max(follower.tightest_m, min(full_m, SPACING_M))
+        n_halvings = (failures % config.most_failures).to(problem.start)
+        radius_m = full_m * 0.5**n_halvings
         return ClosedLoop(
             problem=problem,
             follower=follower,
-            radius_m=(config.turning_radius_m * 0.5 ** tries.to(problem.start)).clamp(
-                min=least_m
-            ),
+            radius_m=radius_m.clamp(min=min_m),
             crossing=failures >= config.most_failures,
             step_m=config.step_m,
             edge_time_s=config.edge_time_s,
@@ -426,7 +423,8 @@ class CLRRT(Planner[CLRRTState]):
 
 
 def _reference(route: Route, edge: Tensor) -> Reference:
-    """Return the references of one edge [B] of each path."""
-    batch, depth, count, _ = route.rows.shape
-    path = torch.arange(batch, device=edge.device) * depth + edge.clamp(max=depth - 1)
-    return Reference(route.rows.reshape(-1, 4), path * count, count)
+    """Return the reference of an edge of each path, from indices [B]."""
+    n_paths, depth, count, _ = route.rows.shape
+    first = torch.arange(n_paths, device=edge.device) * depth
+    row = first + edge.clamp(max=depth - 1)
+    return Reference(route.rows.reshape(-1, 4), row * count, count)

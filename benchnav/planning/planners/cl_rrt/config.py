@@ -3,31 +3,28 @@
 from dataclasses import dataclass, field
 
 from benchnav.core.errors import expect
-from benchnav.planning.planners.cl_rrt.pursuit import (
-    FollowerConfig,
-)
-from benchnav.planning.planners.planner import (
-    check_finite,
-)
+from benchnav.planning.planners.cl_rrt.pursuit import FollowerConfig
+from benchnav.planning.planners.planner import check_finite
 
 
 @dataclass(frozen=True, kw_only=True)
 class CLRRTConfig:
-    """Settings of CL-RRT. The paper gives none of these numbers; the defaults are ours.
+    """Settings of CL-RRT. The defaults are ours, since the paper states no values.
 
     Args:
         expansions: number of edges tried in a plan.
-        expansions_per_round: edges simulated at once; divides `expansions`.
+        expansions_per_round: number of edges simulated at once; divides `expansions`.
         step_m: maximum length of an edge along its reference in metres.
         edge_time_s: maximum duration of an edge in seconds.
-        goal_bias: fraction of the expansions toward the goal.
-        turning_radius_m: radius of the references while they lead to the goal.
+        goal_bias: fraction of the edges that aim at the goal, 0–1.
+        turning_radius_m: turning radius of the references in metres, halved after each
+            plan without a path to the goal.
         replan_distance_m: distance from the nearest predicted position beyond which a
             robot plans again, in metres.
         stall_s: time without progress after which a robot plans again, in seconds.
-        most_failures: consecutive plans without a path to the goal after which a
-            partial path is driven to its end and, without one, edges may cross non-free
-            cells.
+        most_failures: maximum number of consecutive plans without a path to the goal.
+            Then the robot drives a partial path to its end or, without one, edges may
+            cross non-free cells.
         follower: settings of the controller, in simulation and in execution.
     """
 
@@ -44,16 +41,17 @@ class CLRRTConfig:
 
     def __post_init__(self) -> None:
         """Validate the settings."""
-        above = (
+        above_zero = (
             "expansions",
             "expansions_per_round",
             "step_m",
             "edge_time_s",
             "turning_radius_m",
+            "replan_distance_m",
+            "stall_s",
+            "most_failures",
         )
-        check_finite(
-            "CL-RRT", self, (*above, "replan_distance_m", "stall_s", "most_failures")
-        )
+        check_finite("CL-RRT", self, above_zero)
         expect(
             self.expansions % self.expansions_per_round == 0,
             "`expansions` as a multiple of `expansions_per_round` = "
@@ -67,5 +65,5 @@ class CLRRTConfig:
 
     @property
     def rounds(self) -> int:
-        """Rounds of a plan, also the maximum number of edges of a path: D."""
+        """Number of rounds of a plan, also the maximum number of edges of a path: D."""
         return self.expansions // self.expansions_per_round

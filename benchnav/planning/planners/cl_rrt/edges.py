@@ -1,23 +1,22 @@
-"""Edges of the tree: references are drawn, simulated in closed loop, and judged.
+"""Edges of the tree: references are drawn, simulated in closed loop and truncated.
 
-An edge is what becomes of the robot when its controller follows a reference from a
-node: it is driven through F with predicted traversability, step by step, and ends where
-its reference ends, at the goal, after its time, or where it collides.
+An edge is the simulated motion of a robot whose controller follows a reference from a
+node. The robot moves through F with predicted traversability, step by step. The edge
+ends at the end of its reference, at the goal, after its maximum duration, or where it
+collides.
 
-- An edge collides where it leaves the map, *enters* ground that is not free, or passes
-  in one time step between two such cells that touch at a corner (`gridgraph.squeezes`).
-  One that begins on ground that is not free, because the truth differs from the
-  prediction, may leave it, and goes on.
-- A loop that may cross does not collide with ground that is not free. How far an edge
-  drives on such ground, or between such cells, is counted, since a metre of it has a
-  penalty.
-- Of an edge that collides the nearer half of its free part stays, as the source keeps
-  feasible nodes along
-  the way: in tight places no edge of full length is free.
+- An edge collides if it leaves the map, *enters* a non-free cell, or passes in one time
+  step between two non-free cells that touch at a corner (`gridgraph.squeezes`). An edge
+  that begins in a non-free cell, because the truth differs from the prediction, may
+  leave it and continue.
+- A loop that may cross does not collide with non-free cells. The length of an edge in or
+  between such cells is measured, since each metre of it has a penalty.
+- If an edge collides, the first half of its free part is kept, as the source keeps
+  feasible nodes along the path: in narrow passages no edge of full length is free.
 
 Source: Kuwata et al. (2009), algorithm 1, lines 4–10. Letters in shapes: B episodes, R
-edges driven at once, T time steps, N points of a reference, P drawn points of an edge,
-S state dimensions.
+edges simulated at once, T time steps, N points of a reference, P drawn points of an
+edge, S state dimensions.
 """
 
 import math
@@ -26,6 +25,7 @@ from functools import partial
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from benchnav.core.batch import Batch
 from benchnav.core.gridgraph import squeezes
@@ -42,7 +42,7 @@ from benchnav.planning.problem import Problem, motion_traversability
 from benchnav.planning.robots import steps_in
 
 DRAWN_M = 0.5  # between the drawn points of an edge
-_CHECK_STEPS = 8  # between looks at whether all edges of a round have ended
+_CHECK_STEPS = 8  # between checks whether all edges of a round have ended
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,13 +91,13 @@ class Edges:
     """Simulated edges.
 
     Args:
-        at: closed-loop state at its end.
-        exists: mask of edges of which a part is left, bool, shape [B, R].
+        at: closed-loop state at the end.
+        exists: mask of edges of more than 0 steps, bool, shape [B, R].
         time_s: duration in seconds, shape [B, R].
         blocked_m: metres in non-free cells, shape [B, R].
         arrived: mask of edges that end at the goal, bool, shape [B, R].
-        end_m: arc length along its reference at its end in metres, shape [B, R].
-        drawn: positions along it, NaN past its end, shape [B, R, P, 2].
+        end_m: arc length along the reference at the end in metres, shape [B, R].
+        drawn: positions along the edge, NaN past its end, shape [B, R, P, 2].
     """
 
     at: LoopState
@@ -115,19 +115,19 @@ def draw_references(
     """Return the shortest paths to points with free heading.
 
     Args:
-        loop: gives radii and lengths.
-        pose: where they begin, shape [B, R, 3].
-        target_m: points to reach, shape [B, R, 2].
+        loop: closed loop with the turning radii and the maximum length of an edge.
+        pose: start poses (x, y, θ) of the paths, shape [B, R, 3].
+        target_m: points (x, y) to reach in metres, shape [B, R, 2].
 
     Returns:
-        The references, and the length of each path, shape [B, R]; references run
-        straight on past it.
+        The references, and the length of each path in metres, shape [B, R]. References
+        continue straight past the ends of the paths.
     """
-    curvature, lengths_m = dubins_segments_to_point(
-        pose, target_m, loop.radius_m[:, None]
-    )
-    # As far as the controller looks ahead from an edge's end.
-    count = 2 + math.ceil((loop.step_m + loop.follower.lookahead_m) / SPACING_M)
+    radius_m = loop.radius_m[:, None]
+    curvature, lengths_m = dubins_segments_to_point(pose, target_m, radius_m)
+    # The controller looks ahead past the end of an edge.
+    reach_m = loop.step_m + loop.follower.lookahead_m
+    count = 2 + math.ceil(reach_m / SPACING_M)
     poses = sample_segments(pose, curvature, lengths_m, SPACING_M, count)
     length_m = lengths_m.sum(dim=-1)
     return Reference.along(poses, length_m), length_m
@@ -136,38 +136,37 @@ def draw_references(
 def drive(
     loop: ClosedLoop, begin: LoopState, reference: Reference, length_m: Tensor
 ) -> Edges:
-    """Return edges driven along references, as far as they are free of collision.
+    """Return edges simulated along references, as far as they are free of collision.
 
     Args:
-        loop: robots, controller and ground.
-        begin: where the edges begin.
-        reference: what to follow, of shape [B, R].
-        length_m: length of each reference, shape [B, R].
-
-    Returns:
-        The edges.
+        loop: robots, controller and terrain.
+        begin: closed-loop states at the start of the edges, shape [B, R].
+        reference: references to follow, shape [B, R].
+        length_m: length of each reference in metres, shape [B, R].
     """
-    problem, end_m = loop.problem, length_m.clamp(max=loop.step_m)
-    path, progress, free, collided, integral, error = _simulate(
-        loop, begin, reference, end_m
-    )
+    problem = loop.problem
+    end_m = length_m.clamp(max=loop.step_m)
+    log = _simulate(loop, begin, reference, end_m)
+    path, progress, free, collided, integral, error = log
     squeezed = _squeezed(problem, path, free)
-    collided = collided | (squeezed & ~loop.crossing[:, None]).cummax(dim=0).values
+    barred_squeeze = squeezed & ~loop.crossing[:, None]
+    collided = collided | barred_squeeze.cummax(dim=0).values
     at_goal = distance(path, problem.goal_m[:, None]) < problem.goal_radius_m
     over = (progress >= end_m) | at_goal
-    over[-1] = True  # no edge goes on past the log
+    over[-1] = True  # no edge continues past the log
     last = _first(over)  # the step at which each edge ends
     half = (_first(collided) - 1).clamp(min=0) // 2
     last = torch.where(_at(collided, last), half, last)
     before = (last - 1).clamp(min=0)
-    tracking = Tracking(
-        _at(path, before)[..., :2], _at(integral, last), _at(error, last)
-    )
+    position_m = _at(path, before)[..., :2]
+    tracking = Tracking(position_m, _at(integral, last), _at(error, last))
+    end = LoopState(state=_at(path, last), tracking=tracking, free=_at(free, last))
+    blocked_m = _blocked_m(path, free, squeezed)
     return Edges(
         exists=last > 0,
-        at=LoopState(state=_at(path, last), tracking=tracking, free=_at(free, last)),
+        at=end,
         time_s=last.to(path) * problem.dt_s,
-        blocked_m=_at(_blocked_m(path, free, squeezed), last),
+        blocked_m=_at(blocked_m, last),
         arrived=_at(at_goal, last),
         end_m=_at(progress, last),
         drawn=_thin(path[..., :2], progress, last, loop.drawn_points),
@@ -180,91 +179,99 @@ def _simulate(
     """Simulate until all edges have ended or collided.
 
     Returns:
-        At each of T steps: states, shape [T, B, R, S]; progress; whether the robot is
-        on free ground; whether it has collided by then; integral and error of the
-        controller; each of shape [T, B, R].
+        States at each of T steps, shape [T, B, R, S]. Then, each of shape [T, B, R]:
+        progress in metres, masks of robots in free cells and of robots that have
+        collided by this step, and the integral and error of the controller.
     """
-    problem, follower, barred = loop.problem, loop.follower, ~loop.crossing[:, None]
-    state, tracking, progress = begin.state, begin.tracking, torch.zeros_like(end_m)
-    was_free, collided = begin.free, torch.zeros_like(begin.free)
+    problem = loop.problem
+    follower = loop.follower
+    barred = ~loop.crossing[:, None]
+    min_traversability = problem.task.rules.min_traversability
+    state = begin.state
+    tracking = begin.tracking
+    progress = torch.zeros_like(end_m)
+    was_free = begin.free
+    collided = torch.zeros_like(was_free)
     log: list[tuple[Tensor, ...]] = []
     for step in range(steps_in(loop.edge_time_s, problem.dt_s) + 1):
         progress = follower.advance(reference, state, progress)
         ground = problem.ground_at(state)
         free = ground > 0
-        collided = collided | (was_free & barred & ~free) | (ground == 0)
+        entered = was_free & barred & ~free
+        collided = collided | entered | (ground == 0)
         was_free = was_free | free
-        log.append(
-            (state, progress, free, collided, tracking.integral, tracking.error_mps)
-        )
-        if step % _CHECK_STEPS == 0 and bool(((progress >= end_m) | collided).all()):
-            break
+        integral, error = tracking.integral, tracking.error_mps
+        log.append((state, progress, free, collided, integral, error))
+        if step % _CHECK_STEPS == 0:
+            has_ended = (progress >= end_m) | collided
+            if bool(has_ended.all()):
+                break
         action, tracking = follower.act(reference, state, tracking, progress)
-        state = problem.robot(
-            state,
-            action,
-            motion_traversability(ground, problem.task.rules.min_traversability),
-        )
+        traversability = motion_traversability(ground, min_traversability)
+        state = problem.robot(state, action, traversability)
     return [torch.stack(values) for values in zip(*log, strict=True)]
 
 
 def _squeezed(problem: Problem, path: Tensor, free: Tensor) -> Tensor:
-    """Return at which steps a robot has just passed between two non-free cells.
-
-    Bool, shape [T, B, R].
+    """Return a mask of steps on which a robot has passed between two non-free cells.
 
     Args:
         problem: B problems.
         path: states, shape [T, B, R, S].
-        free: which are on free ground, bool, shape [T, B, R].
+        free: mask of robots in free cells, bool, shape [T, B, R].
+
+    Returns:
+        Bool, shape [T, B, R].
     """
     cells = cell_at(problem.grid, path).movedim(0, -1)
-    source, target = (part.flatten(1) for part in (cells[..., :-1], cells[..., 1:]))
-    free_cells = problem.free.flatten(1)
-    passed = squeezes(
-        partial(torch.gather, free_cells, 1), source, target, problem.grid.width
-    )
-    # A robot off the map is read in the nearest cell.
-    passed = (
-        passed.unflatten(1, (path.shape[2], -1)).movedim(-1, 0) & free[:-1] & free[1:]
-    )
-    return torch.nn.functional.pad(passed, (0, 0, 0, 0, 1, 0))
+    source = cells[..., :-1].flatten(1)
+    target = cells[..., 1:].flatten(1)
+    is_free = partial(torch.gather, problem.free.flatten(1), 1)
+    passed = squeezes(is_free, source, target, problem.grid.width)
+    passed = passed.unflatten(1, (path.shape[2], -1)).movedim(-1, 0)
+    # `cell_at` returns the nearest cell for a robot off the map.
+    passed = passed & free[:-1] & free[1:]
+    return pad(passed, (0, 0, 0, 0, 1, 0))
 
 
 def _blocked_m(path: Tensor, free: Tensor, squeezed: Tensor) -> Tensor:
     """Return metres in or between non-free cells up to each step, shape [T, B, R]."""
-    moved = torch.where(free[:-1] & ~squeezed[1:], 0, distance(path[1:], path[:-1]))
-    return torch.nn.functional.pad(moved.cumsum(dim=0), (0, 0, 0, 0, 1, 0))
+    is_free_step = free[:-1] & ~squeezed[1:]
+    step_m = distance(path[1:], path[:-1])
+    blocked_m = torch.where(is_free_step, 0, step_m)
+    return pad(blocked_m.cumsum(dim=0), (0, 0, 0, 0, 1, 0))
 
 
 def _first(condition: Tensor) -> Tensor:
-    """Return the first step of a condition [T, B, R], int64, [B, R]; 0 without one."""
+    """Return the first step at which a mask [T, B, R] is true, or 0; int64, [B, R]."""
     return condition.to(torch.uint8).argmax(dim=0)
 
 
 def _at(log: Tensor, step: Tensor) -> Tensor:
     """Return a log [T, B, R, *F] at steps [B, R] of its first dimension, [B, R, *F]."""
-    return log.take_along_dim(step.reshape(1, *step.shape, *[1] * (log.dim() - 3)), 0)[
-        0
-    ]
+    feature_dims = [1] * (log.dim() - 3)
+    index = step.reshape(1, *step.shape, *feature_dims)
+    return log.take_along_dim(index, 0)[0]
 
 
 def _thin(path: Tensor, progress: Tensor, last: Tensor, count: int) -> Tensor:
     """Return simulated positions at equal progress, the last position included.
 
     Args:
-        path: positions, shape [T, B, R, 2].
-        progress: shape [T, B, R].
+        path: positions (x, y) in metres, shape [T, B, R, 2].
+        progress: arc lengths along the references in metres, shape [T, B, R].
         last: step at which each edge ends, shape [B, R].
-        count: points P.
+        count: number of points P.
 
     Returns:
         Positions, NaN past the end, shape [B, R, P, 2].
     """
     level = torch.arange(count, dtype=progress.dtype, device=progress.device) * DRAWN_M
+    levels = level.expand(*last.shape, -1).contiguous()
     along = progress.movedim(0, -1).contiguous()
-    step = torch.searchsorted(along, level.expand(*last.shape, -1).contiguous())
+    step = torch.searchsorted(along, levels)
     step = torch.minimum(step, last[..., None])
     thinned = path.movedim(0, 2).take_along_dim(step[..., None], 2)
-    used = torch.nn.functional.pad(step[..., :-1] < last[..., None], (1, 0), value=True)
-    return torch.where(used[..., None], thinned, math.nan)
+    is_used = step[..., :-1] < last[..., None]
+    is_used = pad(is_used, (1, 0), value=True)
+    return torch.where(is_used[..., None], thinned, math.nan)

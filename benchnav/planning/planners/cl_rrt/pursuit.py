@@ -1,18 +1,17 @@
-"""Path following: pure pursuit steers, a PID holds the speed.
+"""Path following: pure pursuit steers, and a PID controls the speed.
 
-Pure pursuit drives the arc that is tangent to the robot and meets the path one
-look-ahead distance on. The PID compares the speed over ground with the wanted one, so
-it makes up for ground that slows the robot, as far as the bounds allow; where an arc
-asks for a turn rate out of bounds, the speed gives way and the arc is kept.
-Traversability that scales both velocities alike thus bears on when the robot is
-somewhere, hardly on where. The robot is driven by (v, ω), as a unicycle is. One whose
-turn rate changes within a limit would weave about a path that it looks too short a way
-ahead on: the look-ahead distance is at least what it drives while its turn rate builds
-up.
+Pure pursuit drives the arc that is tangent to the robot's heading and meets the path one
+look-ahead distance ahead. The PID compares the achieved speed with the target speed.
+Within the bounds it thus compensates for terrain that slows the robot. If an arc needs a
+turn rate out of bounds, the speed is reduced and the arc is kept. Traversability that
+scales both velocities alike thus affects when the robot is at a point of the path, and
+hardly its route. The robot is driven by (v, ω), as a unicycle. If its turn rate changes
+only within a limit, a short look-ahead would make it oscillate about the path. Hence
+the look-ahead distance is at least the distance that it drives while its turn rate
+builds up.
 
-Where the robot is along the path is itself a state, its progress: an arc length that
-each step moves forward to the robot's projection on the path's tangent. It never goes
-back, so paths may cross
+The robot's progress is a state: an arc length along the path, which each step advances
+to the robot's projection on the path's tangent. It never decreases, so paths may cross
 themselves. Sources: Coulter (1992), "Implementation of the pure pursuit path tracking
 algorithm"; paper IV-A2. Letters in shapes: N points, S state and A action dimensions.
 """
@@ -38,13 +37,12 @@ class FollowerConfig:
     """Settings of a path follower.
 
     Args:
-        lookahead_m: distance along the path from the robot to the point that it steers
-            for, at least.
-        lookahead_s: the same as the time in seconds to drive it at the wanted
-            speed, where that is more.
-        speed_mps: speed over ground that is wanted; without it the robot's top speed
-            forward.
-        speed_kp: proportional gain of the speed, on top of the wanted speed itself.
+        lookahead_m: minimum look-ahead distance along the path in metres.
+        lookahead_s: minimum look-ahead distance as the time in seconds to drive it at
+            the target speed. The longer of both distances is used.
+        speed_mps: target speed in m/s; if None, the robot's top speed forward.
+        speed_kp: proportional gain of the PID, whose output is added to the target
+            speed.
         speed_ki: integral gain in 1/s.
         speed_kd: derivative gain in s.
     """
@@ -58,10 +56,9 @@ class FollowerConfig:
 
     def __post_init__(self) -> None:
         """Validate the settings."""
+        above_zero = "lookahead_m", "speed_mps"
         at_least_zero = "lookahead_s", "speed_kp", "speed_ki", "speed_kd"
-        check_finite(
-            "a path follower", self, ("lookahead_m", "speed_mps"), at_least_zero
-        )
+        check_finite("a path follower", self, above_zero, at_least_zero)
 
 
 @dataclass(frozen=True)
@@ -83,31 +80,34 @@ class Reference:
         """Return references that continue straight past the ends of their paths.
 
         Args:
-            poses: (x, y, θ) each `SPACING_M` on, past the end the end pose, shape [*B,
-                N, 3].
-            length_m: length of each path, shape [*B].
+            poses: poses (x, y, θ), `SPACING_M` apart, that repeat the end pose past the
+                end, shape [*B, N, 3].
+            length_m: length of each path in metres, shape [*B].
         """
         *batch, count, _ = poses.shape
         arc = torch.arange(count, dtype=poses.dtype, device=poses.device) * SPACING_M
         beyond = (arc - length_m[..., None]).clamp(min=0)
-        cos, sin = poses[..., 2].cos(), poses[..., 2].sin()
-        rows = torch.stack(
-            (poses[..., 0] + beyond * cos, poses[..., 1] + beyond * sin, cos, sin),
-            dim=-1,
-        )
-        first = (
-            torch.arange(math.prod(batch), device=poses.device).reshape(batch) * count
-        )
+        cos = poses[..., 2].cos()
+        sin = poses[..., 2].sin()
+        x = poses[..., 0] + beyond * cos
+        y = poses[..., 1] + beyond * sin
+        rows = torch.stack((x, y, cos, sin), dim=-1)
+        path = torch.arange(math.prod(batch), device=poses.device)
+        first = path.reshape(batch) * count
         return cls(rows.reshape(-1, 4), first, count)
 
     def at(self, arc_m: Tensor) -> Tensor:
         """Return the last point at or before an arc length, which must be on the path.
 
+        Args:
+            arc_m: arc lengths in metres, shape [*B].
+
         Returns:
-            (x, y, cos θ, sin θ), shape [*B, 4].
+            Points (x, y, cos θ, sin θ), shape [*B, 4].
         """
         row = self.first + (arc_m * (1 / SPACING_M)).long()
-        return self.rows.index_select(0, row.flatten()).reshape(*row.shape, 4)
+        points = self.rows.index_select(0, row.flatten())
+        return points.reshape(*row.shape, 4)
 
 
 @dataclass(frozen=True)
@@ -115,9 +115,9 @@ class Tracking(Batch):
     """State of a follower from step to step, except its progress.
 
     Args:
-        position_m: where the robot was a step ago, shape [*B, 2].
-        integral: the integral term of the speed, m/s, shape [*B].
-        error_mps: the speed's error a step ago, shape [*B].
+        position_m: position of the robot one step ago, shape [*B, 2].
+        integral: integral term of the speed in m/s, shape [*B].
+        error_mps: error of the speed one step ago, shape [*B].
     """
 
     position_m: Tensor
@@ -136,42 +136,39 @@ class PathFollower:
 
     Args:
         config: settings.
-        robot: gives the time step and the bounds of (v, ω), and of their changes where
-            it has some.
+        robot: robot with the time step, the bounds of (v, ω) and any limits of their
+            rates of change.
 
     Raises:
-        ConfigError: If the robot has other actions, cannot drive forward, or only turns
-            one way.
+        ConfigError: If the robot has other actions, cannot drive forward, or turns only
+            to one side.
     """
 
     def __init__(self, config: FollowerConfig, robot: Robot) -> None:
         """Store the robot's bounds."""
-        names, low, high = (
-            tuple(robot.action_names),
-            robot.action_low,
-            robot.action_high,
-        )
+        names = tuple(robot.action_names)
+        low = robot.action_low
+        high = robot.action_high
+        has_actions = names == (SPEED, TURN_RATE)
         expect(
-            names == (SPEED, TURN_RATE) and high[0] > 0 and low[1] < 0 < high[1],
+            has_actions and high[0] > 0 and low[1] < 0 < high[1],
             f"a robot with actions ({SPEED}, {TURN_RATE}), the first up to more than "
             "0 and the second to both sides, "
-            f"got ({', '.join(names)}) from {tuple(low)} to {tuple(high)}. Take a "
-            "planner that samples actions, such "
-            "as mppi.",
+            f"got ({', '.join(names)}) from {tuple(low)} to {tuple(high)}. "
+            "Use a planner that samples actions, such as mppi.",
         )
         self.config = config
         self.dt_s = robot.dt_s
         self.speed_mps = low[0], high[0]
-        self.wanted_mps = (
-            high[0] if config.speed_mps is None else min(config.speed_mps, high[0])
-        )
+        self.wanted_mps = high[0]
+        if config.speed_mps is not None:
+            self.wanted_mps = min(config.speed_mps, high[0])
         self.turn_rate_radps = min(-low[1], high[1])
         self.tightest_m = low[0] / self.turn_rate_radps  # radius of the tightest turn
         rates = robot.action_rates
         build_up_s = self.turn_rate_radps / rates[1] if rates else 0.0
-        self.lookahead_m = max(
-            config.lookahead_m, max(config.lookahead_s, build_up_s) * self.wanted_mps
-        )
+        lookahead_s = max(config.lookahead_s, build_up_s)
+        self.lookahead_m = max(config.lookahead_m, lookahead_s * self.wanted_mps)
 
     def advance(
         self, reference: Reference, state: Tensor, progress_m: Tensor
@@ -179,19 +176,21 @@ class PathFollower:
         """Return the progress after the robot's motion.
 
         Args:
-            reference: paths, of shape [*B].
-            state: shape [*B, S].
-            progress_m: shape [*B].
+            reference: paths, shape [*B].
+            state: states of the robots, shape [*B, S].
+            progress_m: progress before the motion in metres, shape [*B].
 
         Returns:
-            The new progress, no further than leaves the look-ahead point on the
-            reference.
+            The new progress in metres, shape [*B]. It is limited so that the look-ahead
+            point is on the reference.
         """
         near_x, near_y, cos, sin = reference.at(progress_m).unbind(-1)
-        at = (progress_m * (1 / SPACING_M)).floor() * SPACING_M
-        projected = at + (state[..., 0] - near_x) * cos + (state[..., 1] - near_y) * sin
-        last = (reference.count - 1) * SPACING_M - self.lookahead_m
-        return torch.maximum(progress_m, projected).clamp(max=last)
+        near_m = (progress_m * (1 / SPACING_M)).floor() * SPACING_M
+        dx = state[..., 0] - near_x
+        dy = state[..., 1] - near_y
+        projected_m = near_m + dx * cos + dy * sin
+        last_m = (reference.count - 1) * SPACING_M - self.lookahead_m
+        return torch.maximum(progress_m, projected_m).clamp(max=last_m)
 
     def act(
         self,
@@ -203,41 +202,41 @@ class PathFollower:
         """Return an action and the next tracking.
 
         Args:
-            reference: paths, of shape [*B].
-            state: shape [*B, S].
-            tracking: from the step before.
-            progress_m: from `advance`, shape [*B].
+            reference: paths, shape [*B].
+            state: states of the robots, shape [*B, S].
+            tracking: tracking from the last step.
+            progress_m: progress from `advance` in metres, shape [*B].
 
         Returns:
             Actions (v, ω) within the bounds, shape [*B, 2], and the next tracking.
         """
         config = self.config
         # Pure pursuit: the arc through the look-ahead point.
-        x, y, heading = state[..., 0], state[..., 1], state[..., 2]
         aim = reference.at(progress_m + self.lookahead_m)
-        aim_x, aim_y = aim[..., 0] - x, aim[..., 1] - y
+        aim_x = aim[..., 0] - state[..., 0]
+        aim_y = aim[..., 1] - state[..., 1]
+        heading = state[..., 2]
         sideways = aim_y * heading.cos() - aim_x * heading.sin()
-        curvature = 2 * sideways / (aim_x * aim_x + aim_y * aim_y + _MIN_SQUARE_M2)
+        square = aim_x * aim_x + aim_y * aim_y + _MIN_SQUARE_M2
+        curvature = 2 * sideways / square
 
-        # PID: the wanted speed, corrected by the error of the speed over ground.
-        moved = state[..., :2] - tracking.position_m
-        error = self.wanted_mps - torch.hypot(moved[..., 0], moved[..., 1]) * (
-            1 / self.dt_s
-        )
+        # PID: the target speed, corrected by the error of the achieved speed.
+        motion = state[..., :2] - tracking.position_m
+        step_m = torch.hypot(motion[..., 0], motion[..., 1])
+        error = self.wanted_mps - step_m * (1 / self.dt_s)
         low, high = self.speed_mps
-        reach = high - low
-        integral = (tracking.integral + error * (config.speed_ki * self.dt_s)).clamp(
-            -reach, reach
-        )
+        span = high - low
+        integral = tracking.integral + error * (config.speed_ki * self.dt_s)
+        integral = integral.clamp(-span, span)
         speed = self.wanted_mps + config.speed_kp * error + integral
         if config.speed_kd:
-            speed = speed + (error - tracking.error_mps) * (config.speed_kd / self.dt_s)
-        speed = torch.minimum(
-            speed, self.turn_rate_radps / curvature.abs().clamp(min=_MIN_CURVATURE)
-        )
+            change = error - tracking.error_mps
+            speed = speed + change * (config.speed_kd / self.dt_s)
+        max_turn_rate = self.turn_rate_radps
+        bend = curvature.abs().clamp(min=_MIN_CURVATURE)
+        speed = torch.minimum(speed, max_turn_rate / bend)
         speed = speed.clamp(low, high)
-        turn_rate = (speed * curvature).clamp(
-            -self.turn_rate_radps, self.turn_rate_radps
-        )
+        turn_rate = speed * curvature
+        turn_rate = turn_rate.clamp(-max_turn_rate, max_turn_rate)
         action = torch.stack((speed, turn_rate), dim=-1)
         return action, Tracking(state[..., :2], integral, error)

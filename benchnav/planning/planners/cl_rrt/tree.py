@@ -1,23 +1,22 @@
 """The tree of CL-RRT and the search that grows it.
 
-`search` is the whole of a plan and reads top-down: plant a root; in each round choose
-nodes and where to go from them, draw references, drive along them (`edges`), and add
-their ends as nodes; at last take the best
-route. A tree is a value: a table of nodes, of which every round makes a longer one.
+`search` makes a whole plan. It plants a root, then grows the tree in rounds: it chooses
+nodes and a target for each, draws references, simulates the robot along them (`edges`)
+and adds the ends of the edges as nodes. Finally it selects the best route. A tree is a
+value: a table of nodes, and each round returns a longer table.
 
-- Nodes are chosen by Kuwata's mix of two heuristics: the nearest in Dubins length
-  (explore), or the one through which the point is reached soonest (optimise). Before a
-  way to the goal is known 70 % of the choices explore, afterwards 30 %, and nodes that
-  cannot improve on the best way are left out.
-- The goal's share of the edges goes to nodes that have not tried it yet, the most
-  promising first: an attempt is deterministic, so a second one from the same node would
-  be a copy. The source tries the goal from every new node.
-- A way costs its simulated time, and `PENALTY` for each metre of it on ground that is
-  not free.
+- Nodes are chosen by Kuwata's mix of two heuristics: the nearest node in Dubins length
+  (explore), or the node through which the point is reached soonest (optimise). 70 % of
+  the choices explore before a path to the goal is known, and 30 % afterwards. Nodes that
+  cannot improve on the best path are excluded.
+- Edges to the goal start from nodes that have not tried it yet, the most promising
+  first. An attempt is deterministic, so a second one from the same node would be a copy.
+  The source tries the goal from each new node.
+- A path costs its simulated time, plus `PENALTY` for each metre in non-free cells.
 
 Source: Kuwata et al. (2009), section IV and algorithm 1. Letters in shapes: B episodes,
 R edges of a round, V nodes, E edges of a finished tree, D edges of a path, N points of
-a reference, of which Q are drawn, P drawn points of an edge.
+a reference, Q drawn points of a reference, P drawn points of an edge.
 """
 
 import math
@@ -45,8 +44,7 @@ from benchnav.planning.planners.planner import PlanStatus
 # Fraction of choices that explore, before and after a path to the goal is known.
 _EXPLORE = (0.7, 0.3)
 _PARTIAL_GAIN_M = 0.5  # minimum gain toward the goal of a partial path
-# Distance before its end at which a partial path is left, since the end may be close to
-# non-free cells.
+# A partial path is left this far before its end, which may be close to non-free cells.
 _MARGIN_M = 0.3
 _FAR_M = 1e4  # longer than any path on a map
 
@@ -68,15 +66,15 @@ class Choice:
 
 @dataclass(frozen=True, kw_only=True)
 class Tree(Choice, Edges):
-    """Trees of B episodes. Node 0 is the root; every other is the end of the edge that
-    leads to it.
+    """Trees of B episodes, as tables of nodes.
 
-    Edges are as they were chosen and driven, V in place of R, but that their times, inf
-    where nothing is left of one, and metres that are not free count from the root.
+    Node 0 is the root, and each other node is the end of the edge that leads to it. The
+    inherited fields describe these edges, with V instead of R in their shapes. Times
+    and metres in non-free cells count from the root; the time of a rejected edge is inf.
 
     Args:
-        to_goal_m: Dubins length on to the goal, inf where nothing is left of the edge,
-            shape [B, V].
+        to_goal_m: Dubins length from each node to the goal in metres, inf for rejected
+            edges, shape [B, V].
     """
 
     to_goal_m: Tensor
@@ -89,7 +87,8 @@ class Tree(Choice, Edges):
     @property
     def best(self) -> tuple[Tensor, Tensor]:
         """Cost of the best path to the goal, inf without one, and its node, each [B]."""
-        return torch.where(self.arrived, self.cost, math.inf).min(dim=1)
+        cost_to_goal = torch.where(self.arrived, self.cost, math.inf)
+        return cost_to_goal.min(dim=1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,13 +96,15 @@ class Route(Batch):
     """Plan of each episode.
 
     Args:
-        status: `PlanStatus`: OK where the path leads to the goal and enters free ground
-            alone, else PARTIAL.
-        depth: edges of the path, 0 without a path, int64, shape [B].
-        rows: references of the edges, as `Reference` keeps them, shape [B, D, N, 4].
-        end_m: arc length at which each reference is left for the next, shape [B, D].
-        path: predicted positions, NaN where unused, shape [B, D·P, 2].
-        tree: predicted positions along all edges, NaN where unused, shape [B, E, P, 2].
+        status: `PlanStatus`: OK if the path leads to the goal and enters only free
+            cells, else PARTIAL.
+        depth: number of edges of the path, 0 without a path, int64, shape [B].
+        rows: references of the edges, as rows of `Reference`, shape [B, D, N, 4].
+        end_m: arc length in metres at which each reference is left for the next, shape
+            [B, D].
+        path: predicted positions (x, y), unused ones NaN, shape [B, D·P, 2].
+        tree: predicted positions (x, y) along all edges, unused ones NaN, shape
+            [B, E, P, 2].
     """
 
     status: Tensor
@@ -113,43 +114,41 @@ class Route(Batch):
     path: Tensor
     tree: Tensor
 
-    def pieces(self, most_m: float) -> tuple[Tensor, Tensor]:
-        """Split paths into short straight pieces.
+    def segments(self, max_m: float) -> tuple[Tensor, Tensor]:
+        """Split paths into short straight segments.
 
         Args:
-            most_m: maximum length of a piece, where the drawn points are `DRAWN_M`
-                apart.
+            max_m: maximum length of a segment in metres between points that are
+                `DRAWN_M` apart.
 
         Returns:
-            Midpoints (x, y), shape [B, K, 2], and lengths, shape [B, K]; 0 m at (0, 0)
-            past the end of a path.
+            Midpoints (x, y), shape [B, K, 2], and lengths, shape [B, K], in metres.
+            Segments past the end of a path have length 0 at (0, 0).
         """
-        count = math.ceil(DRAWN_M / most_m)
+        count = math.ceil(DRAWN_M / max_m)
         offset = self.path.diff(dim=1)[:, :, None]
-        at = (torch.arange(count, device=offset.device) + 0.5) / count
-        points = (
-            (self.path[:, :-1, None] + at[:, None] * offset)
-            .flatten(1, 2)
-            .nan_to_num(nan=0.0)
-        )
-        length_m = (
-            torch.linalg.vector_norm(offset, dim=-1).expand(-1, -1, count) / count
-        )
+        fraction = (torch.arange(count, device=offset.device) + 0.5) / count
+        points = self.path[:, :-1, None] + fraction[:, None] * offset
+        points = points.flatten(1, 2).nan_to_num(nan=0.0)
+        distance_m = torch.linalg.vector_norm(offset, dim=-1)
+        length_m = distance_m.expand(-1, -1, count) / count
         return points, length_m.flatten(1, 2).nan_to_num(nan=0.0)
 
     @property
     def line(self) -> Tensor:
-        """Points of the references as far as they are driven, shape [B, D·Q, 2].
+        """Points of the references up to their ends, shape [B, D·Q, 2].
 
         Unused points are NaN.
         """
-        points = self.rows[:, :, :: round(DRAWN_M / SPACING_M), :2]
-        arc_m = torch.arange(points.shape[2], device=points.device) * DRAWN_M
-        used = (
-            torch.arange(self.rows.shape[1], device=points.device) < self.depth[:, None]
-        )
-        driven = used[..., None] & (arc_m <= self.end_m[..., None])
-        return _pack(torch.where(driven[..., None], points, math.nan).flatten(1, 2))
+        stride = round(DRAWN_M / SPACING_M)
+        points = self.rows[:, :, ::stride, :2]
+        device = points.device
+        arc_m = torch.arange(points.shape[2], device=device) * DRAWN_M
+        edge = torch.arange(points.shape[1], device=device)
+        is_used = edge < self.depth[:, None]
+        is_driven = is_used[..., None] & (arc_m <= self.end_m[..., None])
+        driven_points = torch.where(is_driven[..., None], points, math.nan)
+        return _pack(driven_points.flatten(1, 2))
 
 
 def search(
@@ -163,31 +162,33 @@ def search(
     """Return the best route of a tree grown for each episode.
 
     Args:
-        loop: robots, controller and ground.
+        loop: robots, controller and terrain.
         root: states to plan from, shape [B, S].
-        tracking: of the controllers there, shape [B].
-        sample_m: points to reach, D rounds of them, shape [D, R, 2].
-        chance: uniform in [0, 1), decides by which heuristic each node is chosen, shape
+        tracking: state of the controllers at the root, shape [B].
+        sample_m: points (x, y) to reach in D rounds, in metres, shape [D, R, 2].
+        chance: uniform draws in [0, 1) that select the heuristic of each choice, shape
             [D, R].
-        goal_edges: edges of a round that aim at the goal.
+        goal_edges: number of edges of a round that aim at the goal.
     """
     tree = plant(loop, root, tracking)
     for points_m, chances in zip(sample_m, chance, strict=True):
         choice = choose(loop, tree, points_m, chances, goal_edges)
         begin = stand(tree, choice.parent)
-        reference, length_m = draw_references(
-            loop, begin.state[..., :3], choice.target_m
-        )
-        tree = add(loop, tree, choice, drive(loop, begin, reference, length_m))
+        pose = begin.state[..., :3]
+        reference, length_m = draw_references(loop, pose, choice.target_m)
+        edges = drive(loop, begin, reference, length_m)
+        tree = add(loop, tree, choice, edges)
     return best_route(loop, tree, len(sample_m))
 
 
 def plant(loop: ClosedLoop, root: Tensor, tracking: Tracking) -> Tree:
     """Return a tree of only the root; arguments as for `search`."""
-    begin = LoopState(state=root, tracking=tracking, free=loop.problem.free_at(root))
+    free = loop.problem.free_at(root)
+    begin = LoopState(state=root, tracking=tracking, free=free)
     at = map_tensors(begin, lambda values: values[:, None])
     zero = torch.zeros_like(root[:, :1])
     false = zero.bool()
+    drawn_shape = len(root), 1, loop.drawn_points, 2
     return Tree(
         parent=zero.long(),
         target_m=at.state[..., :2],
@@ -198,7 +199,7 @@ def plant(loop: ClosedLoop, root: Tensor, tracking: Tracking) -> Tree:
         blocked_m=zero,
         arrived=false,
         end_m=zero,
-        drawn=zero.new_full((len(root), 1, loop.drawn_points, 2), math.nan),
+        drawn=zero.new_full(drawn_shape, math.nan),
         to_goal_m=_to_goal_m(loop, at.state),
     )
 
@@ -209,76 +210,79 @@ def choose(
     """Choose nodes, and targets of edges from them.
 
     Args:
-        loop: robots, controller and ground.
-        tree: so far.
-        sample_m: points to reach, shape [R, 2].
-        chance: uniform in [0, 1), shape [R].
-        goal_edges: how many of the R edges go to the goal instead, while there are
-            nodes that have not.
+        loop: robots, controller and terrain.
+        tree: tree of the rounds so far.
+        sample_m: points (x, y) to reach in metres, shape [R, 2].
+        chance: uniform draws in [0, 1), shape [R].
+        goal_edges: number of the R edges that lead to the goal instead of a point,
+            fewer if fewer nodes have not tried the goal.
     """
-    best = tree.best[0][:, None]
-    is_reached = best < math.inf
-    straight_m = (
-        distance(tree.at.state, loop.problem.goal_m[:, None])
-        - loop.problem.goal_radius_m
-    ).clamp(min=0)
-    # cannot improve on the best way
-    closed = tree.cost + straight_m / loop.follower.speed_mps[1] >= best
+    problem = loop.problem
+    goal_m = problem.goal_m[:, None]
+    best_cost, _ = tree.best
+    best_cost = best_cost[:, None]
+    is_reached = best_cost < math.inf
+    center_m = distance(tree.at.state, goal_m)
+    straight_m = (center_m - problem.goal_radius_m).clamp(min=0)
+    _, top_mps = loop.follower.speed_mps
+    # These nodes cannot improve on the best path.
+    closed = tree.cost + straight_m / top_mps >= best_cost
     closed_m = torch.where(closed, math.inf, 0.0)
-    # The time of the way to each node, as the length driven in it at the wanted speed.
-    spent_m = torch.where(closed, 0, loop.follower.wanted_mps * tree.time_s)
+    # Time from the root, as the length driven in it at the target speed.
+    spent_m = loop.follower.wanted_mps * tree.time_s
+    spent_m = torch.where(closed, 0, spent_m)
 
-    # Line 2 of algorithm 1: the first node by length alone (explore), or by the whole
-    # way (optimise).
-    explore = chance < torch.where(is_reached, _EXPLORE[1], _EXPLORE[0])  # [B, R]
-    length_m = dubins_length_to_point(
-        tree.at.state[:, None, :, :3], sample_m[:, None], loop.radius_m[:, None, None]
-    )
-    before_m = torch.where(explore[..., None], 0, spent_m[:, None]) + closed_m[:, None]
+    # Line 2 of algorithm 1: the first node by the Dubins length (explore), or by the
+    # length of the path from the root (optimise).
+    explore_fraction = torch.where(is_reached, _EXPLORE[1], _EXPLORE[0])
+    explore = chance < explore_fraction  # [B, R]
+    pose = tree.at.state[:, None, :, :3]
+    radius_m = loop.radius_m[:, None, None]
+    length_m = dubins_length_to_point(pose, sample_m[:, None], radius_m)
+    before_m = torch.where(explore[..., None], 0, spent_m[:, None])
+    before_m = before_m + closed_m[:, None]
     node = (length_m + before_m).argmin(dim=-1)
     target_m = sample_m.expand(len(node), -1, -1)
 
     # Lines 13–20: the goal.
-    lanes = min(goal_edges, tree.parent.shape[1])
-    tried = (
-        torch.zeros_like(tree.time_s).scatter_add(
-            1, tree.parent, tree.aimed.to(tree.time_s)
-        )
-        > 0
-    )
+    n_aimed = min(goal_edges, tree.parent.shape[1])
+    no_attempts = torch.zeros_like(tree.time_s)
+    aimed = tree.aimed.to(tree.time_s)
+    tried = no_attempts.scatter_add(1, tree.parent, aimed) > 0
     promise_m = tree.to_goal_m + closed_m + torch.where(is_reached, spent_m, 0)
-    promise_m, promising = torch.where(tried, math.inf, promise_m).topk(
-        lanes, dim=1, largest=False
-    )
-    others = (0, node.shape[1] - lanes)
-    aimed, promising = pad(promise_m < math.inf, others), pad(promising, others)
+    promise_m = torch.where(tried, math.inf, promise_m)
+    promise_m, promising = promise_m.topk(n_aimed, dim=1, largest=False)
+    others = (0, node.shape[1] - n_aimed)
+    aimed = pad(promise_m < math.inf, others)
+    promising = pad(promising, others)
     return Choice(
         parent=torch.where(aimed, promising, node),
-        target_m=torch.where(aimed[..., None], loop.problem.goal_m[:, None], target_m),
+        target_m=torch.where(aimed[..., None], goal_m, target_m),
         aimed=aimed,
     )
 
 
 def stand(tree: Tree, node: Tensor) -> LoopState:
-    """Return the closed-loop state at nodes, int64 [B, R]."""
+    """Return the closed-loop states at nodes, int64, shape [B, R]."""
     return map_tensors(tree.at, lambda values: _take(values, node))
 
 
 def add(loop: ClosedLoop, tree: Tree, choice: Choice, edges: Edges) -> Tree:
     """Return the tree with the ends of edges as its next nodes.
 
-    Rejected edges are added too, so that the size of tables is constant.
+    Rejected edges are added too, so that all episodes have tables of one size.
     """
-    exists, parent = edges.exists, choice.parent
+    exists = edges.exists
+    time_s = tree.time_s.gather(1, choice.parent) + edges.time_s
+    blocked_m = tree.blocked_m.gather(1, choice.parent) + edges.blocked_m
     edges = replace(
         edges,
-        time_s=torch.where(
-            exists, tree.time_s.gather(1, parent) + edges.time_s, math.inf
-        ),
-        blocked_m=tree.blocked_m.gather(1, parent) + edges.blocked_m,
+        time_s=torch.where(exists, time_s, math.inf),
+        blocked_m=blocked_m,
         arrived=edges.arrived & exists,
     )
-    to_goal_m = torch.where(exists, _to_goal_m(loop, edges.at.state), math.inf)
+    to_goal_m = _to_goal_m(loop, edges.at.state)
+    to_goal_m = torch.where(exists, to_goal_m, math.inf)
     new = Tree(**vars(choice), **vars(edges), to_goal_m=to_goal_m)
     return map_tensors(tree, lambda old, added: torch.cat((old, added), dim=1), new)
 
@@ -287,60 +291,72 @@ def best_route(loop: ClosedLoop, tree: Tree, rounds: int) -> Route:
     """Return the cheapest path to the goal or, without one, the best partial path.
 
     Args:
-        loop: robots, controller and ground.
-        tree: grown.
-        rounds: in which it was grown, so that no path has more edges: D.
+        loop: robots, controller and terrain.
+        tree: finished tree.
+        rounds: number of rounds of the tree, also the maximum number of edges of a
+            path: D.
     """
     cost, cheapest = tree.best
     is_reached = cost < math.inf
-    chain = [torch.where(is_reached, cheapest, _best_partial(tree))[:, None]]
+    last_node = torch.where(is_reached, cheapest, _best_partial(tree))[:, None]
+    chain = [last_node]
     for _ in range(rounds):
-        chain.append(tree.parent.gather(1, chain[-1]))
+        parent = tree.parent.gather(1, chain[-1])
+        chain.append(parent)
     backward = torch.cat(chain, dim=1)  # ends in zeros
     depth = (backward > 0).sum(dim=1)
     order = depth[:, None] - 1 - torch.arange(rounds, device=depth.device)
-    nodes = torch.where(order >= 0, backward.gather(1, order.clamp(min=0)), 0)
+    forward = backward.gather(1, order.clamp(min=0))
+    nodes = torch.where(order >= 0, forward, 0)
     end_m = tree.end_m.gather(1, nodes)
-    early = (order == 0) & ~is_reached[:, None]
-    crossed = loop.crossing & (tree.blocked_m.gather(1, chain[0])[:, 0] > 0)
+    is_last_partial = (order == 0) & ~is_reached[:, None]
+    blocked_m = tree.blocked_m.gather(1, last_node)[:, 0]
+    is_crossed = loop.crossing & (blocked_m > 0)
+    is_ok = is_reached & ~is_crossed
 
-    pose = stand(tree, tree.parent.gather(1, nodes)).state[..., :3]
-    reference, _ = draw_references(loop, pose, _take(tree.target_m, nodes))
-    drawn = _take(tree.drawn.flatten(2), nodes).unflatten(-1, (-1, 2))
+    parents = tree.parent.gather(1, nodes)
+    pose = stand(tree, parents).state[..., :3]
+    target_m = _take(tree.target_m, nodes)
+    reference, _ = draw_references(loop, pose, target_m)
+    path = _take(tree.drawn.flatten(2), nodes).unflatten(-1, (-1, 2))
+    is_edge = (nodes > 0)[..., None, None]
+    path = torch.where(is_edge, path, math.nan)
+    exists = tree.exists[:, 1:, None, None]
     return Route(
-        status=torch.where(is_reached & ~crossed, PlanStatus.OK, PlanStatus.PARTIAL),
+        status=torch.where(is_ok, PlanStatus.OK, PlanStatus.PARTIAL),
         depth=depth,
         rows=reference.rows.reshape(*nodes.shape, -1, 4),
-        end_m=torch.where(early, end_m - _MARGIN_M, end_m),
-        path=_pack(
-            torch.where((nodes > 0)[..., None, None], drawn, math.nan).flatten(1, 2)
-        ),
-        tree=torch.where(tree.exists[:, 1:, None, None], tree.drawn[:, 1:], math.nan),
+        end_m=torch.where(is_last_partial, end_m - _MARGIN_M, end_m),
+        path=_pack(path.flatten(1, 2)),
+        tree=torch.where(exists, tree.drawn[:, 1:], math.nan),
     )
 
 
 def no_route(loop: ClosedLoop, rounds: int, edges: int) -> Route:
-    """Return routes without a path, of the shapes of searched ones."""
-    root = plant(loop, loop.problem.start, Tracking.standing(loop.problem.start))
+    """Return routes without a path, of the same shapes as those of `search`."""
+    start = loop.problem.start
+    tracking = Tracking.standing(start)
+    root = plant(loop, start, tracking)
     tree = map_tensors(root, lambda values: values.repeat_interleave(1 + edges, dim=1))
     return best_route(loop, tree, rounds)
 
 
 def _best_partial(tree: Tree) -> Tensor:
-    """Return nodes nearest to the goal, those in free cells first.
+    """Return the nodes nearest to the goal, those in free cells first.
 
-    It is the root unless the gain is sufficient.
+    The root is returned if the gain is less than `_PARTIAL_GAIN_M`.
     """
-    remaining_m = tree.to_goal_m + torch.where(tree.at.free, 0.0, _FAR_M)
-    least_m, node = remaining_m.min(dim=1)
-    return torch.where(remaining_m[:, 0] - least_m > _PARTIAL_GAIN_M, node, 0)
+    penalty_m = torch.where(tree.at.free, 0.0, _FAR_M)
+    remaining_m = tree.to_goal_m + penalty_m
+    min_m, node = remaining_m.min(dim=1)
+    gain_m = remaining_m[:, 0] - min_m
+    return torch.where(gain_m > _PARTIAL_GAIN_M, node, 0)
 
 
 def _to_goal_m(loop: ClosedLoop, state: Tensor) -> Tensor:
     """Return Dubins lengths from states [B, V, S] to the goals, shape [B, V]."""
-    return dubins_length_to_point(
-        state[..., :3], loop.problem.goal_m[:, None], loop.radius_m[:, None]
-    )
+    goal_m = loop.problem.goal_m[:, None]
+    return dubins_length_to_point(state[..., :3], goal_m, loop.radius_m[:, None])
 
 
 def _take(values: Tensor, index: Tensor) -> Tensor:
@@ -349,6 +365,7 @@ def _take(values: Tensor, index: Tensor) -> Tensor:
 
 
 def _pack(points: Tensor) -> Tensor:
-    """Return points [B, N, 2] with those that are not NaN first, in their order."""
-    order = points[..., 0].isnan().to(torch.uint8).argsort(dim=1, stable=True)
+    """Return points [B, N, 2] with NaN points moved to the end, in stable order."""
+    is_nan = points[..., 0].isnan().to(torch.uint8)
+    order = is_nan.argsort(dim=1, stable=True)
     return _take(points, order)

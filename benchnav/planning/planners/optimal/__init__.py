@@ -1,1 +1,1 @@
-"""The optimal planner: value iteration over where a unicycle stands and looks."""
+"""The optimal planner: value iteration over the poses of a unicycle."""

@@ -1,7 +1,7 @@
 """Closed-loop simulation of planners on a known λ field, as in the world.
 
-λ is read where a robot stands at the start of a step, and so is whether that
-immobilises it. Nothing is drawn, so a robot that repeats the actions in the same world
+λ of a step is that at the robot's position when the step starts, also for
+immobilisation. Nothing is drawn, so a robot that repeats the actions in the same world
 repeats the drive.
 Letters in shapes: B episodes, T steps, S state and A action dimensions.
 """
@@ -26,9 +26,10 @@ class Drive(Batch):
     """Drives from the start of each episode.
 
     Args:
-        states: from the first to the last, NaN from then on, shape [B, T + 1, S].
-        actions: those taken, NaN from then on, shape [B, T, A].
-        steps: steps until the goal is reached, infinite where it is not, shape [B].
+        states: states from the start, NaN after the end, shape [B, T + 1, S].
+        actions: actions from the start, NaN after the end, shape [B, T, A].
+        steps: number of steps until the goal is reached, infinite if it is not, shape
+            [B].
     """
 
     states: Tensor
@@ -44,70 +45,68 @@ def simulate(
     field: Tensor,
     rival: Drive | None = None,
 ) -> Drive:
-    """Drive a planner to the end of every episode.
+    """Simulate a planner to the end of every episode.
 
     Args:
         plan: `plan` of a `Planner`.
         select: `select` of a `Planner`.
-        plan_state: from `init`.
+        plan_state: plan state from `init` of the planner.
         problem: B problems.
         field: λ, shape [B, H, W].
-        rival: the simulation ends where this drive has reached the goal by then; None
-            for no such drive.
+        rival: drive whose time at the goal ends the simulation of each episode; None
+            without such a drive.
     """
-    grid, robot, immobile = problem.grid, problem.robot, problem.immobile
+    grid = problem.grid
+    immobile = problem.immobile
+    start = problem.start
+    dt_s = problem.dt_s
     low, high = problem.action_bounds
-    ground = grid.pad(field.to(problem.start), outside=0.0)
-    limit = (problem.time_budget_s / problem.dt_s).round()
-    longest = int(limit.max())
+    ground = grid.pad(field.to(start), outside=0.0)
+    limit = (problem.time_budget_s / dt_s).round()
+    max_steps = int(limit.max())
     if rival is not None:
         limit = torch.minimum(limit, rival.steps)
-    states = problem.start.new_full(
-        (len(problem), longest + 1, problem.start.shape[1]), torch.nan
-    )
-    actions = problem.start.new_full((len(problem), longest, len(low)), torch.nan)
+    n_episodes, n_dims = start.shape
+    states = start.new_full((n_episodes, max_steps + 1, n_dims), torch.nan)
+    actions = start.new_full((n_episodes, max_steps, len(low)), torch.nan)
     arrival = torch.full_like(problem.time_budget_s, torch.inf)
-    states[:, 0] = problem.start
-    running = torch.arange(len(problem), device=ground.device)
-    state, dwell = problem.start, torch.zeros_like(running)
+    states[:, 0] = start
+    running = torch.arange(n_episodes, device=ground.device)
+    state = start
+    dwell = torch.zeros_like(running)
     observed = torch.full_like(state[:, 0], torch.nan)
-    for count in range(longest):
-        step = Step(state=state, traversability=observed, time_s=count * problem.dt_s)
+    for count in range(max_steps):
+        step = Step(state=state, traversability=observed, time_s=count * dt_s)
         action, plan_state, _ = plan(step, plan_state)
         observed = grid.lookup(ground[running], state[:, 0], state[:, 1])
-        state = robot(state.clone(), action.clamp(low, high), observed)
-        states[running, count + 1], actions[running, count] = state, action
+        state = problem.robot(state.clone(), action.clamp(low, high), observed)
+        states[running, count + 1] = state
+        actions[running, count] = action
         arrived = distance(state, problem.goal_m[running]) < problem.goal_radius_m
         arrival[running[arrived]] = count + 1.0
-        ended = (
-            arrived
-            | ~grid.contains(state[:, 0], state[:, 1])
-            | (count + 1 >= limit[running])
-        )
+        off_map = ~grid.contains(state[:, 0], state[:, 1])
+        timed_out = count + 1 >= limit[running]
+        ended = arrived | off_map | timed_out
         if immobile is not None:
             dwell = torch.where(observed < immobile.below, dwell + 1, 0)
-            ended = ended | (dwell >= steps_in(immobile.for_s, problem.dt_s))
+            ended = ended | (dwell >= steps_in(immobile.for_s, dt_s))
         if bool(ended.any()):
-            running_on = (~ended).nonzero()[:, 0]
-            if len(running_on) == 0:
+            remaining = (~ended).nonzero()[:, 0]
+            if len(remaining) == 0:
                 break
-            plan_state = select(plan_state, running_on)
-            running, state, dwell, observed = (
-                running[running_on],
-                state[running_on],
-                dwell[running_on],
-                observed[running_on],
-            )
+            plan_state = select(plan_state, remaining)
+            running = running[remaining]
+            state = state[remaining]
+            dwell = dwell[remaining]
+            observed = observed[remaining]
     return Drive(states=states, actions=actions, steps=arrival)
 
 
 def earlier(first: Drive, second: Drive) -> Drive:
-    """Return of each episode the drive that reaches the goal earlier; the first where
-    both are as early.
-    """
-    takes = (second.steps < first.steps)[:, None, None]
+    """Return each episode's drive that reaches the goal earlier; the first at a tie."""
+    is_earlier = (second.steps < first.steps)[:, None, None]
     return Drive(
-        states=torch.where(takes, second.states, first.states),
-        actions=torch.where(takes, second.actions, first.actions),
+        states=torch.where(is_earlier, second.states, first.states),
+        actions=torch.where(is_earlier, second.actions, first.actions),
         steps=torch.minimum(first.steps, second.steps),
     )

@@ -1,12 +1,12 @@
-"""The optimal planner: follows the minimum cost to go of every pose on a map, computed
-once by value iteration.
+"""The optimal planner: value iteration over the poses of a map.
 
-`Optimal` takes λ̂ for λ: its time is the minimum under that map, "certainty-equivalent",
-and no bound for the true terrain. `NearOptimal` receives λ itself, by the model
-`clairvoyant`, and uses the dwell time after which the world immobilises a robot. Its
-drives are feasible, so the minimum time is at most its time: it is the near-optimal
-reference, and no bound. Both plan only for the paper's unicycle, which drives forward,
-and plan once: maps that change are rejected.
+Value iteration computes the minimum cost to go of every pose once, and the robot
+follows it. `Optimal` takes λ̂ for λ ("certainty-equivalent"). Its time is the minimum
+under the predicted map, and no bound for the true terrain. `NearOptimal` receives λ
+itself, from the model `clairvoyant`, and uses the dwell time after which the world
+immobilises a robot. Its drives are feasible, so the minimum time is at most its time.
+Hence it is the near-optimal reference, and no lower bound. Both plan only for the
+paper's unicycle, which drives forward, and reject maps that change.
 Letters in shapes: B episodes, H×W cells, Q headings, K primitives, N points, L levels
 of dwell time.
 """
@@ -24,21 +24,25 @@ from benchnav.core.mixture import TraversabilityMixture
 from benchnav.planning.free_space import PENALTY
 from benchnav.planning.planners.astar.astar_dwa import AStarDWA
 from benchnav.planning.planners.optimal.drive import Drive, earlier, simulate
+from benchnav.planning.planners.optimal.primitives import (
+    OptimalState,
+    path_of,
+    primitives_from,
+)
 from benchnav.planning.planners.optimal.value import (
     UNREACHED,
     Costs,
     Moves,
     value_iteration,
 )
-from benchnav.planning.planners.optimal.ways import OptimalState, path_of, ways_from
 from benchnav.planning.planners.planner import Plan, Planner, PlanStatus, check_steers
 from benchnav.planning.planners.straight import Straight, steer_toward
 from benchnav.planning.problem import Problem, Task
-from benchnav.planning.robots import SPEED, TURN_RATE, Unicycle
+from benchnav.planning.robots import SPEED, TURN_RATE, Robot, Unicycle
 from benchnav.planning.sensing.sensor import Step
 
-_MIN_TRAVERSABILITY = 1e-3  # minimum λ that is planned for
-_ON_DRIVE = 1e-4  # m and rad: maximum distance of a robot on a simulated drive
+_MIN_TRAVERSABILITY = 1e-3  # smaller λ counts as this
+_ON_DRIVE = 1e-4  # maximum distance from a simulated drive, in m and rad
 _MAX_LEVELS = 5
 
 
@@ -49,9 +53,9 @@ class OptimalConfig:
     Args:
         headings: number Q of headings.
         refine: cells of value iteration along each side of a cell of the map.
-        hazard: whether it plans for the expected time under each cell's own
-            distribution, in which an immobilised robot costs the whole time limit,
-            instead of the time under λ̂.
+        hazard: whether to minimise the expected time under each cell's distribution,
+            with the time limit as the cost of an immobilised robot, instead of the time
+            under λ̂.
     """
 
     headings: int = 32
@@ -70,8 +74,8 @@ class NearOptimalConfig:
     Args:
         headings: number Q of headings.
         refine: cells of value iteration along each side of a cell of the map.
-        levels: number L of levels of dwell time between which costs to go are
-            distinguished; with 0 immobilising terrain is impassable.
+        levels: number L of levels of dwell time with a cost to go each; 0 makes
+            immobilising terrain impassable.
     """
 
     headings: int = 32
@@ -89,9 +93,8 @@ class NearOptimalConfig:
 
 
 def _check_grid(name: str, headings: int, refine: int) -> None:
-    expect(
-        8 <= headings <= 256, f"`headings` from 8 to 256 for {name}, got {headings}."
-    )
+    is_valid = 8 <= headings <= 256
+    expect(is_valid, f"`headings` from 8 to 256 for {name}, got {headings}.")
     expect(1 <= refine <= 4, f"`refine` from 1 to 4 for {name}, got {refine}.")
 
 
@@ -112,7 +115,7 @@ class Optimal(Planner[OptimalState]):
         self.config: Any = config or OptimalConfig()
 
     def uses(self, task: Task) -> frozenset[str]:
-        """Return the distribution with `hazard`, else λ̂ and free space."""
+        """Return the distribution with `hazard`, else λ̂ and the input of free space."""
         if self.config.hazard:
             return frozenset({"distribution"})
         return frozenset({"risk_map", task.rules.free_space.source})
@@ -127,35 +130,24 @@ class Optimal(Planner[OptimalState]):
         """Return the plan state with the cost to go; draws nothing. See `Planner`.
 
         Raises:
-            ConfigError: If the robot is another, or a required input is missing.
+            ConfigError: If the robot is not a `Unicycle` that only drives forward and
+                turns equally fast to both sides, or a required input is missing.
         """
-        robot, times = problem.robot, self.config.refine
-        check_steers(self, robot, self.name)
-        low, high = robot.action_low[1], robot.action_high[1]
-        expect(
-            low == -high,
-            f"`turn_rate_radps` alike to both sides for planner {self.name!r}, got "
-            f"{low:g} to {high:g}.",
-        )
-        min_speed = robot.action_low[0]
-        expect(
-            min_speed == 0,
-            f"`speed_mps` from 0 on for planner {self.name!r}, got from "
-            f"{min_speed:g} on.",
-        )
+        robot = problem.robot
+        headings = self.config.headings
+        self._check_robot(robot)
         assert isinstance(robot, Unicycle)
-        grid = problem.grid
-        grid = Grid(grid.height * times, grid.width * times, grid.resolution_m / times)
-        min_radius, radius = grid.resolution_m / math.sqrt(2), problem.goal_radius_m
+        grid = _refined(problem.grid, self.config.refine)
+        min_radius = grid.resolution_m / math.sqrt(2)
+        radius = problem.goal_radius_m
         expect(
             radius >= min_radius,
             f"`goal_radius_m` of at least {min_radius:.2f}, half of a cell's diagonal, for "
-            f"planner {self.name!r}, got "
-            f"{radius:g}.",
+            f"planner {self.name!r}, got {radius:g}.",
         )
         costs = self.costs_of(problem, grid)
-        moves = Moves.of(robot, grid.resolution_m, self.config.headings)
-        to_go = value_iteration(costs, moves, grid, self.config.headings)
+        moves = Moves.of(robot, grid.resolution_m, headings)
+        to_go = value_iteration(costs, moves, grid, headings)
         no_dwell = problem.start.new_zeros(len(problem))
         return OptimalState(
             problem=problem,
@@ -163,7 +155,22 @@ class Optimal(Planner[OptimalState]):
             costs=costs,
             to_go=to_go,
             dwell_s=no_dwell,
-            taken=torch.zeros_like(no_dwell).long(),
+            n_steps=torch.zeros_like(no_dwell).long(),
+        )
+
+    def _check_robot(self, robot: Robot) -> None:
+        check_steers(self, robot, self.name)
+        min_speed, low = robot.action_low
+        _, high = robot.action_high
+        expect(
+            low == -high,
+            f"equal `turn_rate_radps` to both sides for planner {self.name!r}, got "
+            f"{low:g} to {high:g}.",
+        )
+        expect(
+            min_speed == 0,
+            f"`speed_mps` from 0 on for planner {self.name!r}, got from "
+            f"{min_speed:g} on.",
         )
 
     def plan(
@@ -171,38 +178,37 @@ class Optimal(Planner[OptimalState]):
     ) -> tuple[Tensor, OptimalState, Plan]:
         """Return actions of the motion primitive of minimum cost; see `Planner`."""
         plan_state = self.observe(step, plan_state)
-        problem, dwell_s = plan_state.problem, plan_state.dwell_s
-        pose, member = (
-            step.state[:, :3],
-            torch.arange(len(dwell_s), device=dwell_s.device),
-        )
-        ways = ways_from(pose, dwell_s, plan_state)
-        cost, best = ways.cost.min(1)
+        problem = plan_state.problem
+        dwell_s = plan_state.dwell_s
+        pose = step.state[:, :3]
+        member = torch.arange(len(dwell_s), device=dwell_s.device)
+        primitives = primitives_from(pose, dwell_s, plan_state)
+        cost, best = primitives.cost.min(1)
         # The turn rate that completes the turn in this step.
         turning = self.turning_at(pose, plan_state).clamp(min=_MIN_TRAVERSABILITY)
-        rate = ways.turn[member, best] / (turning * problem.dt_s)
+        rate = primitives.turn[member, best] / (turning * problem.dt_s)
         low, high = problem.action_bounds
-        drives = ways.rolls[member, best] | (rate.abs() <= high[1])
-        action = torch.stack(
-            (torch.where(drives, high[0], 0.0), rate.clamp(low[1], high[1])), 1
-        )
+        drives = primitives.rolls[member, best] | (rate.abs() <= high[1])
+        speed = torch.where(drives, high[0], 0.0)
+        action = torch.stack((speed, rate.clamp(low[1], high[1])), 1)
         # Without a path the robot drives straight, as other planners do, and the world
         # decides how that ends.
-        is_stranded = cost >= self.no_way(plan_state.costs)
+        is_stranded = cost >= self.no_path_cost(plan_state.costs)
         straight = steer_toward(step.state, problem.goal_m, problem.robot)
         action = torch.where(is_stranded[:, None], straight, action)
         status = PlanStatus.PARTIAL * is_stranded.long()
         drawn = {"path": path_of(plan_state, pose, dwell_s)} if step.draw else {}
-        plan = replace(Plan.empty(len(dwell_s), dwell_s.device, **drawn), status=status)
-        return action, plan_state, plan
+        plan = Plan.empty(len(dwell_s), dwell_s.device, **drawn)
+        return action, plan_state, replace(plan, status=status)
 
     def observe(self, step: Step, plan_state: OptimalState) -> OptimalState:
         """Return the plan state after a step, with dwell times from the observed λ."""
-        immobile, dwell_s = plan_state.problem.immobile, plan_state.dwell_s
-        if immobile is not None:
-            immobilises = step.traversability < immobile.below
-            dwell_s = torch.where(immobilises, dwell_s + plan_state.problem.dt_s, 0.0)
-        return replace(plan_state, dwell_s=dwell_s, taken=plan_state.taken + 1)
+        problem = plan_state.problem
+        dwell_s = plan_state.dwell_s
+        if problem.immobile is not None:
+            immobilises = step.traversability < problem.immobile.below
+            dwell_s = torch.where(immobilises, dwell_s + problem.dt_s, 0.0)
+        return replace(plan_state, dwell_s=dwell_s, n_steps=plan_state.n_steps + 1)
 
     def select(self, plan_state: OptimalState, members: Tensor) -> OptimalState:
         """Return the plan state of some episodes; see `Planner`."""
@@ -216,20 +222,21 @@ class Optimal(Planner[OptimalState]):
         """
         raise ConfigError(
             f"Expected a fixed map for planner {self.name!r}, which plans once, got "
-            "one that changes. "
-            "Take belief 'static' and sensor 'full'."
+            "one that changes. Use belief 'static' and sensor 'full'."
         )
 
-    def no_way(self, costs: Costs) -> Tensor:
-        """Return the cost from which on there is no path, shape [B]."""
+    def no_path_cost(self, costs: Costs) -> Tensor:
+        """Return the minimum cost that means that there is no path, shape [B]."""
         return torch.full_like(costs.loss, UNREACHED / 2)
 
     def turning_at(self, pose: Tensor, plan_state: OptimalState) -> Tensor:
         """Return λ that scales turns at the robots' poses [B, 3], shape [B]."""
-        if plan_state.costs.hazard is None:
+        grid = plan_state.grid
+        costs = plan_state.costs
+        if costs.hazard is None:
             return plan_state.problem.traversability_at(pose)
-        padded = plan_state.grid.pad(plan_state.costs.rate, UNREACHED)
-        return 1 / plan_state.grid.lookup(padded, pose[:, 0], pose[:, 1])
+        rate = grid.pad(costs.rate, UNREACHED)
+        return 1 / grid.lookup(rate, pose[:, 0], pose[:, 1])
 
     def costs_of(self, problem: Problem, grid: Grid) -> Costs:
         """Return the costs of driving, on the cells of value iteration."""
@@ -241,27 +248,29 @@ class Optimal(Planner[OptimalState]):
         if immobile is None:
             raise ConfigError(
                 "Expected a world that immobilises robots for `hazard` of "
-                f"{self.name!r}, got none."
+                f"{self.name!r}, got one that does not."
             )
-        lost = problem.distribution.cdf_limits(immobile.below)[0].clamp(max=1 - 1e-6)
+        below = immobile.below
+        distribution = problem.distribution
+        lost, _ = distribution.cdf_limits(below)
+        lost = lost.clamp(max=1 - 1e-6)
         # The expected rate, conditional on terrain that does not immobilise.
-        total_time = problem.distribution.expected_time(immobile.below)
-        rate = ((total_time - lost / immobile.below) / (1 - lost)).clamp(min=1)
+        total_time = distribution.expected_time(below)
+        rate = (total_time - lost / below) / (1 - lost)
+        rate = rate.clamp(min=1)
         hazard = -torch.log1p(-lost) / problem.grid.resolution_m
         all_open = torch.ones_like(problem.free)
         return _on_grid(problem, grid, rate, all_open, hazard=hazard)
 
 
 class NearOptimal(Optimal):
-    """The near-optimal reference: a fast drive on λ itself, in a world that immobilises
-    robots.
+    """The near-optimal reference: a fast drive on λ itself.
 
-    Three drives are simulated to their end as in the world: by value iteration, by
-    A*+DWA with its default settings, and by `straight`. The robot follows the first
-    that reaches the goal. Hence it succeeds wherever A*+DWA or `straight` does on the
-    same problem, and not later. Planners that draw samples are not included: whether
-    they are faster, or the only ones to succeed, is a matter of
-    measurement. A robot that has left the drive is steered by value iteration.
+    Three drives are simulated to their ends, with the immobilisation of the world: by
+    value iteration, by A*+DWA with its default settings, and by `straight`. The robot
+    follows the drive that reaches the goal first. Hence it succeeds whenever A*+DWA or
+    `straight` succeeds on the same problem, and at least as early. Planners that draw
+    samples may be faster. Value iteration steers a robot that has left the drive.
 
     Args:
         config: settings.
@@ -275,7 +284,7 @@ class NearOptimal(Optimal):
         self.config = config or NearOptimalConfig()
 
     def uses(self, task: Task) -> frozenset[str]:
-        """Return the distribution and λ̂, which both are λ itself; see `Planner`."""
+        """Return the distribution and λ̂, since both are λ itself; see `Planner`."""
         return frozenset({"risk_map", "distribution"})
 
     def follows(self, task: Task) -> str:
@@ -286,97 +295,105 @@ class NearOptimal(Optimal):
         """Return the plan state with simulated drives; draws nothing. See `Planner`.
 
         Raises:
-            ConfigError: If the robot is another, or the prediction is not λ itself.
+            ConfigError: If the robot is not supported, or the prediction is not λ
+                itself.
         """
         plan_state = super().init(problem, generator)
         field = problem.distribution.mean()
         drive = simulate(super().plan, OptimalState.select, plan_state, problem, field)
         planners: tuple[Planner[Any], ...] = (AStarDWA(), Straight())
         for planner in planners:
-            planner_state = planner.init(problem, generator)
-            drive = earlier(
-                drive,
-                simulate(
-                    planner.plan, planner.select, planner_state, problem, field, drive
-                ),
+            first_state = planner.init(problem, generator)
+            rival = simulate(
+                planner.plan, planner.select, first_state, problem, field, drive
             )
+            drive = earlier(drive, rival)
         return replace(plan_state, drive=drive)
 
     def plan(
         self, step: Step, plan_state: OptimalState
     ) -> tuple[Tensor, OptimalState, Plan]:
         """Return actions on the drive, or by value iteration off it; see `Planner`."""
-        drive, taken = plan_state.drive, plan_state.taken
+        drive = plan_state.drive
+        n_steps = plan_state.n_steps
         assert drive is not None
-        action, follows = _follow(drive, taken, step.state)
+        action, follows = _follow(drive, n_steps, step.state)
         index = torch.arange(drive.states.shape[1], device=action.device)
-        is_ahead = (index >= taken[:, None]) & follows[:, None]
+        is_ahead = (index >= n_steps[:, None]) & follows[:, None]
         path = torch.where(is_ahead[..., None], drive.states[..., :2], torch.nan)
         status = PlanStatus.PARTIAL * drive.steps.isinf().long()
         if bool(follows.all()):
             drawn = {"path": path} if step.draw else {}
-            plan = replace(
-                Plan.empty(len(action), action.device, **drawn), status=status
-            )
+            plan = Plan.empty(len(action), action.device, **drawn)
+            plan = replace(plan, status=status)
             return action, self.observe(step, plan_state), plan
         steered, following, plan = super().plan(step, plan_state)
         plan = replace(plan, status=torch.where(follows, status, plan.status))
         if step.draw:
             steered_path = torch.where(follows[:, None, None], torch.nan, plan.path)
-            plan = replace(plan, path=torch.cat((path, steered_path), 1))
+            path = torch.cat((path, steered_path), 1)
+            plan = replace(plan, path=path)
         return torch.where(follows[:, None], action, steered), following, plan
 
-    def no_way(self, costs: Costs) -> Tensor:
-        """Return twice T, since unreached values are interpolated into cells near them.
+    def no_path_cost(self, costs: Costs) -> Tensor:
+        """Return twice the time limit T, as the cost of a missing path.
 
-        Not T itself: the grid makes times slightly too long, and a path of little more
-        than T may succeed. See `Optimal`.
+        Costs without a path are interpolated into neighbouring cells and are then below
+        `UNREACHED`. T would be too low: the grid makes times slightly too long, so a
+        path with a cost just above T may succeed. See `Optimal`.
         """
         return 2 * costs.loss
 
     def costs_of(self, problem: Problem, grid: Grid) -> Costs:
         """Return the costs of driving; see `Optimal`."""
-        distribution, immobile = problem.distribution, problem.immobile
-        if not (
-            isinstance(distribution, TraversabilityMixture)
-            and bool((distribution.stds == 0).all())
-        ):
+        distribution = problem.distribution
+        immobile = problem.immobile
+        is_certain = False
+        if isinstance(distribution, TraversabilityMixture):
+            is_certain = bool((distribution.stds == 0).all())
+        if not is_certain:
             raise ConfigError(
                 f"Expected model 'clairvoyant' for planner {self.name!r}, which is "
                 "given λ itself, got a prediction that is not certain."
             )
         field = distribution.mean()
         rate = 1 / field.clamp(min=_MIN_TRAVERSABILITY)
-        immobilises = (
-            torch.zeros_like(problem.free)
-            if immobile is None
-            else field < immobile.below
-        )
-        if immobile is None or self.config.levels == 0:
-            return _on_grid(
-                problem, grid, torch.where(immobilises, UNREACHED, rate), ~immobilises
-            )
-        costs = _on_grid(
-            problem,
-            grid,
-            rate,
-            ~immobilises,
-            immobile_s=torch.where(immobilises, rate, 0.0),
-        )
+        if immobile is None:
+            return _on_grid(problem, grid, rate, torch.ones_like(problem.free))
+        immobilises = field < immobile.below
+        if self.config.levels == 0:
+            rate = torch.where(immobilises, UNREACHED, rate)
+            return _on_grid(problem, grid, rate, ~immobilises)
+        immobile_s = torch.where(immobilises, rate, 0.0)
+        costs = _on_grid(problem, grid, rate, ~immobilises, immobile_s=immobile_s)
         return replace(costs, lost_after_s=immobile.for_s, levels=self.config.levels)
 
 
-def _follow(drive: Drive, taken: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the next action of drives, shape [B, A], and which robots are on them,
-    bool, shape [B].
+def _follow(drive: Drive, n_steps: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the next actions of drives, and a mask of robots that are on them.
+
+    Args:
+        drive: simulated drives.
+        n_steps: number of steps taken, int64, shape [B].
+        state: states of the robots, shape [B, S].
+
+    Returns:
+        Actions, 0 for robots off their drive, shape [B, A]; and the mask, bool, shape
+        [B].
     """
-    member = torch.arange(len(taken), device=taken.device)
-    index = taken.clamp(max=drive.actions.shape[1] - 1)
+    member = torch.arange(len(n_steps), device=n_steps.device)
+    index = n_steps.clamp(max=drive.actions.shape[1] - 1)
     action = drive.actions[member, index]
-    off = (state - drive.states[member, index]).abs().amax(1)
-    # Of an ended drive both are NaN, which is no nearer.
-    follows = (taken == index) & (off < _ON_DRIVE) & ~action.isnan().any(1)
+    deviation = (state - drive.states[member, index]).abs().amax(1)
+    # After the end of a drive both are NaN, and the comparison is false.
+    is_on = (n_steps == index) & (deviation < _ON_DRIVE)
+    follows = is_on & ~action.isnan().any(1)
     return torch.where(follows[:, None], action, 0.0), follows
+
+
+def _refined(grid: Grid, times: int) -> Grid:
+    """Return a grid with each cell divided into several along each side."""
+    return Grid(grid.height * times, grid.width * times, grid.resolution_m / times)
 
 
 def _on_grid(
@@ -387,35 +404,47 @@ def _on_grid(
     hazard: Tensor | None = None,
     immobile_s: Tensor | None = None,
 ) -> Costs:
-    """Costs on a grid that divides the map's cells, from maps of `Costs`, each of shape
-    [B, H, W].
+    """Return costs on a grid that divides the map's cells.
+
+    Args:
+        problem: B problems.
+        grid: grid of value iteration.
+        rate: see `Costs`; this and the next maps are on the map's cells, shape
+            [B, H, W].
+        open_: see `Costs`.
+        hazard: see `Costs`.
+        immobile_s: see `Costs`.
     """
     times = grid.height // problem.grid.height
+    dtype = problem.start.dtype
 
     def fine(values: Tensor) -> Tensor:
         return values.repeat_interleave(times, 1).repeat_interleave(times, 2)
 
-    dtype = problem.start.dtype
+    def outside_goal(values: Tensor | None) -> Tensor | None:
+        """Return values on the fine grid, 0 within the goal's disc."""
+        if values is None:
+            return None
+        return fine(values).to(dtype).masked_fill(ends, 0)
+
     rate = fine(rate).to(dtype)
-    row, column = (torch.arange(size, device=rate.device) for size in grid.shape)
+    row = torch.arange(grid.height, device=rate.device)
+    column = torch.arange(grid.width, device=rate.device)
     x, y = grid.centre_of(row[:, None], column)
     goal_x, goal_y = problem.goal_m.T[:, :, None, None]
     distance_m = torch.hypot(x - goal_x, y - goal_y)
-    # One rate in all of them: what a way costs within the disc is taken off again;
-    # nothing immobilises a robot there.
+    # Cells within the goal's disc have one rate, so that `final` can subtract the cost of
+    # a path within the disc. Nothing immobilises a robot there.
     ends = distance_m <= problem.goal_radius_m
     goal_rate = torch.where(ends, rate, UNREACHED).amin((1, 2), keepdim=True)
     rate = torch.where(ends, goal_rate, rate)
-    remaining_s = (
-        (distance_m - problem.goal_radius_m) / problem.robot.top_speed_mps * rate
-    )
+    outside_m = distance_m - problem.goal_radius_m
+    remaining_s = outside_m / problem.robot.top_speed_mps * rate
     return Costs(
         rate=rate,
         open=fine(open_) | ends,
         final=torch.where(ends, remaining_s, torch.nan).to(dtype),
         loss=problem.time_budget_s.to(dtype),
-        hazard=None if hazard is None else fine(hazard).to(dtype).masked_fill(ends, 0),
-        immobile_s=None
-        if immobile_s is None
-        else fine(immobile_s).to(dtype).masked_fill(ends, 0),
+        hazard=outside_goal(hazard),
+        immobile_s=outside_goal(immobile_s),
     )

@@ -3,16 +3,16 @@
 A state is a cell centre and one of Q headings. An action lasts for about a cell: full
 speed along one of five arcs, or a turn in place by one heading. λ scales speed and turn
 rate by the same factor. Hence an arc is the same curve on all terrain, and takes 1/λ
-times as long; its end and its cells are the same for all cells of all maps. A sweep
-over all states is therefore a convolution of the values for each arc. Between cells
-values are interpolated, bilinearly, over those that are open.
+times as long. Relative to its start it passes the same cells everywhere. A sweep over
+all states is therefore a convolution of the values for each arc. Between cell centres,
+values are interpolated bilinearly over the open cells.
 Source: Falcone and Ferretti (2013), "Semi-Lagrangian approximation schemes for linear
 and Hamilton-Jacobi equations".
 
 If terrain immobilises a robot after some dwell time, a state has several costs to go:
-the minimum over all drives, and those over drives that are still possible after more
-and more dwell time. Each is stored with the dwell time up to which it is possible,
-without rounding, so that moves add up exactly.
+at each level, the minimum over drives that are still possible after that dwell time.
+Each is stored with the dwell time up to which its drive is possible. The dwell time is
+not rounded, so that the dwell times of successive moves add up exactly.
 Letters in shapes: B maps, H×W cells, Q headings, A actions, N points along an arc, R
 reach of an arc in cells, L levels of dwell time.
 """
@@ -28,17 +28,17 @@ from benchnav.core.batch import Batch
 from benchnav.core.grid import Grid
 from benchnav.planning.robots import Unicycle
 
-_POINTS = 8  # N
+_POINTS = 8  # number N of points along an arc
 UNREACHED = 1e6
 """Cost to go before a path is found, or without one."""
-# Cost to go that is mostly interpolated from unreached states.
+# A larger cost to go is mostly interpolated from unreached states.
 _MIXED = UNREACHED / 100
-_BARRED = 1e-9  # weight of a non-free cell next to a free one
-_TOLERANCE = 1e-3  # change of a cost at which iteration has converged
-_CHECK_EVERY = 10  # sweeps
-_MAX_SWEEPS = 40  # per cell of the longer side
-_MIN_DWELL_S = 1e-6  # a drive that leaves no more dwell time is impossible
-_CHUNK_MAPS = 8  # so that intermediate results fit the CPU cache
+_BARRED = 1e-9  # interpolation weight of a non-free cell
+_TOLERANCE = 1e-3  # maximum change of a cost at convergence
+_CHECK_EVERY = 10  # sweeps between checks for convergence
+_MAX_SWEEPS = 40  # maximum number of sweeps per cell of the longer side
+_MIN_DWELL_S = 1e-6  # minimum remaining dwell time of a possible drive
+_CHUNK_MAPS = 8  # maximum number of maps whose intermediate results fit the CPU cache
 
 
 @dataclass(frozen=True)
@@ -46,9 +46,9 @@ class Moves:
     """Actions of a robot for about a cell at λ = 1.
 
     Args:
-        actions: (v, ω), shape [A, 2].
+        actions: actions (v, ω), shape [A, 2].
         seconds: duration of each action, shape [A].
-        turns: number of headings by which each turns, A of them.
+        turns: number of headings by which each action turns, A numbers.
     """
 
     actions: Tensor
@@ -59,24 +59,25 @@ class Moves:
     def of(cls, robot: Unicycle, cell_m: float, headings: int) -> "Moves":
         """Return the actions of a unicycle.
 
-        Turns last for a whole number of headings, at least one and otherwise at most
-        for a cell; straight driving lasts for a cell.
+        Straight driving lasts for a cell. An arc turns by a whole number of headings,
+        as many as fit in a cell and at least one. A turn in place turns by one heading.
         """
         top, max_rate = robot.action_high
         bin_rad = 2 * math.pi / headings
-        moves = [((top, 0.0), cell_m / top, 0)]
+        actions = [(top, 0.0)]
+        durations = [cell_m / top]
+        turns = [0]
         for speed, rate in ((top, max_rate / 2), (top, max_rate), (0.0, max_rate)):
             bins = 1
             if speed:
-                bins = max(1, math.floor(cell_m * rate / speed / bin_rad + 1e-9))
-            duration = bins * bin_rad / rate
-            moves += [((speed, side * rate), duration, side * bins) for side in (1, -1)]
-        actions, seconds, turns = zip(*moves, strict=True)
-        return cls(
-            torch.tensor(actions, dtype=torch.float64),
-            torch.tensor(seconds, dtype=torch.float64),
-            turns,
-        )
+                cell_rad = cell_m * rate / speed
+                bins = max(1, math.floor(cell_rad / bin_rad + 1e-9))
+            for side in (1, -1):
+                actions.append((speed, side * rate))
+                durations.append(bins * bin_rad / rate)
+                turns.append(side * bins)
+        seconds = torch.tensor(durations, dtype=torch.float64)
+        return cls(torch.tensor(actions, dtype=torch.float64), seconds, tuple(turns))
 
     def offsets(self, heading: Tensor, fraction: Tensor) -> Tensor:
         """Return displacements after fractions of each action.
@@ -91,10 +92,11 @@ class Moves:
         speed, rate = self.actions.T.to(heading)[..., None]
         time = self.seconds.to(heading)[:, None] * fraction
         angle = heading[..., None, None]
-        # sin(ωt/2) / (ωt/2) of the chord, along the mean heading.
+        # The chord of an arc has the length v·t·sin(ωt/2) / (ωt/2) and the direction of
+        # the mean heading.
         chord = speed * time * torch.sinc(rate * time / (2 * math.pi))
-        along = angle + rate * time / 2
-        return torch.stack((chord * along.cos(), chord * along.sin()), -1)
+        mean = angle + rate * time / 2
+        return torch.stack((chord * mean.cos(), chord * mean.sin()), -1)
 
 
 def headings_of(count: int) -> Tensor:
@@ -107,14 +109,15 @@ class Costs(Batch):
     """Costs of driving on maps.
 
     Args:
-        rate: cost of a second of driving with λ = 1, shape [B, H, W].
-        open: mask of cells between which values are interpolated, bool, [B, H, W].
-        final: cost to go where paths end, negative within the goal's disc; NaN
-            elsewhere, shape [B, H, W].
+        rate: cost of a motion that takes a second at λ = 1, shape [B, H, W].
+        open: mask of cells between which values are interpolated, bool, shape
+            [B, H, W].
+        final: cost to go in cells where paths end, negative within the goal's disc; NaN
+            in other cells, shape [B, H, W].
         hazard: hazard of immobilisation per metre, −ln of the survival probability,
-            shape [B, H, W]; None for none.
+            shape [B, H, W]; None without a hazard.
         loss: cost of an immobilised robot, shape [B].
-        immobile_s: dwell time for each second of driving with λ = 1, 0 on other
+        immobile_s: dwell time of a motion that takes a second at λ = 1, 0 on other
             terrain, shape [B, H, W]; None if nothing immobilises a robot.
         lost_after_s: dwell time in seconds after which a robot is immobilised.
         levels: number L of levels of dwell time.
@@ -153,16 +156,19 @@ def value_iteration(costs: Costs, moves: Moves, grid: Grid, headings: int) -> Co
         costs: costs on B maps.
         moves: actions of the robot.
         grid: grid of the maps.
-        headings: Q.
+        headings: number of headings Q.
     """
     arcs = _arcs(moves, grid, headings, costs.rate)
-    maps = torch.arange(len(costs.rate), device=costs.rate.device).split(_CHUNK_MAPS)
-    solved = [_solve(costs.select(chunk), arcs, grid) for chunk in maps]
-    dwell = [part.max_dwell_s for part in solved if part.max_dwell_s is not None]
-    return CostToGo(
-        value=torch.cat([part.value for part in solved]),
-        max_dwell_s=torch.cat(dwell) if dwell else None,
-    )
+    maps = torch.arange(len(costs.rate), device=costs.rate.device)
+    values = []
+    dwells = []
+    for chunk in maps.split(_CHUNK_MAPS):
+        solved = _solve(costs.select(chunk), arcs, grid)
+        values.append(solved.value)
+        if solved.max_dwell_s is not None:
+            dwells.append(solved.max_dwell_s)
+    max_dwell_s = torch.cat(dwells) if dwells else None
+    return CostToGo(value=torch.cat(values), max_dwell_s=max_dwell_s)
 
 
 @dataclass(frozen=True)
@@ -170,13 +176,13 @@ class _Arc:
     """An action at all headings.
 
     Args:
-        seconds: duration.
-        metres: length.
-        turn: number of headings by which it turns.
-        passed: fraction of it in each cell around the first, shape
+        seconds: duration in seconds at λ = 1.
+        metres: length in metres.
+        turn: number of headings by which the robot turns.
+        passed: fraction of the arc in each cell around the first, shape
             [Q, 1, 2R + 1, 2R + 1].
-        ends: interpolation weights of the cells around its end, of the same shape.
-        points: cells of the points along it, rows and columns, N each of shape [Q].
+        ends: interpolation weights of the cells around the end, of the same shape.
+        points: rows and columns of the N points along the arc, Q of each.
     """
 
     seconds: float
@@ -196,51 +202,61 @@ def _arcs(moves: Moves, grid: Grid, headings: int, like: Tensor) -> list[_Arc]:
     # Fractions of an arc at which costs are read, and its end.
     fractions = (torch.arange(_POINTS) + 0.5) / _POINTS
     fractions = torch.cat((fractions, torch.ones(1))).double()
-    # Shape [Q, A, N + 1, 2].
-    offsets = moves.offsets(headings_of(headings), fractions) / grid.resolution_m
+    offsets_m = moves.offsets(headings_of(headings), fractions)
+    offsets = offsets_m / grid.resolution_m  # [Q, A, N + 1, 2]
     reach = max(1, math.ceil(float(offsets.abs().max()) - 1e-9))
+    speeds = moves.actions[:, 0].abs().tolist()
     arcs = []
-    for index, (seconds, turn) in enumerate(
-        zip(moves.seconds.tolist(), moves.turns, strict=True)
-    ):
-        passed, ends = (
-            torch.zeros(headings, 2 * reach + 1, 2 * reach + 1) for _ in range(2)
-        )
+    for index, seconds in enumerate(moves.seconds.tolist()):
         cells_at = offsets[:, index].flip(-1) + reach  # rows and columns
         cells = (cells_at[:, :-1] + 0.5).floor().long()
-        for heading in range(headings):
-            for row, column in cells[heading].tolist():
-                passed[heading, row, column] += 1 / _POINTS
-            end = cells_at[heading, -1].tolist()
-            row, column = (min(math.floor(part + 1e-9), 2 * reach - 1) for part in end)
-            for down, across in ((0, 0), (0, 1), (1, 0), (1, 1)):
-                down_weight = abs(1 - down - (end[0] - row))
-                across_weight = abs(1 - across - (end[1] - column))
-                weight = down_weight * across_weight
-                ends[heading, row + down, column + across] += weight
-        metres = float(moves.actions[index, 0].abs()) * seconds
-        points = tuple(
-            (cells[:, number, 0].tolist(), cells[:, number, 1].tolist())
-            for number in range(_POINTS)
+        points = []
+        for point_cells in cells.unbind(1):
+            rows, columns = point_cells.T.tolist()
+            points.append((rows, columns))
+        arc = _Arc(
+            seconds=seconds,
+            metres=speeds[index] * seconds,
+            turn=moves.turns[index],
+            passed=_fractions_in(cells, reach)[:, None].to(like),
+            ends=_end_weights(cells_at[:, -1], reach)[:, None].to(like),
+            points=tuple(points),
         )
-        arcs.append(
-            _Arc(
-                seconds=seconds,
-                metres=metres,
-                turn=turn,
-                passed=passed[:, None].to(like),
-                ends=ends[:, None].to(like),
-                points=points,
-            )
-        )
+        arcs.append(arc)
     return arcs
+
+
+def _fractions_in(cells: Tensor, reach: int) -> Tensor:
+    """Return the fraction of an arc in each cell, from cells [Q, N, 2] of its points."""
+    width = 2 * reach + 1
+    fractions = torch.zeros(len(cells), width, width)
+    for heading, points in enumerate(cells.tolist()):
+        for row, column in points:
+            fractions[heading, row, column] += 1 / _POINTS
+    return fractions
+
+
+def _end_weights(ends: Tensor, reach: int) -> Tensor:
+    """Return bilinear weights of cells around ends (row, column), shape [Q, 2]."""
+    width = 2 * reach + 1
+    weights = torch.zeros(len(ends), width, width)
+    for heading, (end_row, end_column) in enumerate(ends.tolist()):
+        row = min(math.floor(end_row + 1e-9), width - 2)
+        column = min(math.floor(end_column + 1e-9), width - 2)
+        for down, across in ((0, 0), (0, 1), (1, 0), (1, 1)):
+            down_weight = abs(1 - down - (end_row - row))
+            across_weight = abs(1 - across - (end_column - column))
+            weights[heading, row + down, column + across] += down_weight * across_weight
+    return weights
 
 
 def _solve(costs: Costs, arcs: list[_Arc], grid: Grid) -> CostToGo:
     headings = len(arcs[0].ends)
     frame = (arcs[0].reach,) * 4
     weights = torch.where(costs.open, 1.0, _BARRED)[:, None]
-    step_costs, scales, dwells = [], [], []
+    step_costs = []
+    scales = []
+    dwells = []
     survivals: list[Tensor | None] = []
     # Off the map a second costs as much as a missing path, and weights are those of the
     # border.
@@ -251,61 +267,67 @@ def _solve(costs: Costs, arcs: list[_Arc], grid: Grid) -> CostToGo:
         scales.append(1 / conv2d(framed, arc.ends))
         survival = None
         if costs.hazard is not None:
-            hazard = conv2d(pad(costs.hazard[:, None], frame), arc.passed)
-            survival = torch.exp(-arc.metres * hazard)
+            hazard = pad(costs.hazard[:, None], frame)
+            survival = torch.exp(-arc.metres * conv2d(hazard, arc.passed))
             cost = cost + (1 - survival) * costs.loss[:, None, None, None]
+        dwell_along = None
+        if costs.immobile_s is not None:
+            dwell_along = _dwell_along(costs.immobile_s, costs.lost_after_s, arc)
         step_costs.append(cost)
         survivals.append(survival)
-        dwells.append(None if costs.immobile_s is None else _dwell_along(costs, arc))
+        dwells.append(dwell_along)
 
     def at_end(arc: _Arc, scale: Tensor, values: Tensor) -> Tensor:
         """Interpolate values at the end of an arc."""
         turned = values.roll(-arc.turn, 2)
         if not arc.metres:
             return turned
-        inside = pad((turned * weights[:, None]).flatten(0, 1), frame, mode="replicate")
-        summed = conv2d(inside, arc.ends, groups=headings).view_as(values)
-        return summed * scale[:, None]
+        weighted = (turned * weights[:, None]).flatten(0, 1)
+        padded = pad(weighted, frame, mode="replicate")
+        weighted_sum = conv2d(padded, arc.ends, groups=headings).view_as(values)
+        return weighted_sum * scale[:, None]
 
     final = costs.final[:, None, None]
-    start = torch.where(final.isnan(), UNREACHED, final)
+    is_inner = final.isnan()
+    start = torch.where(is_inner, UNREACHED, final)
     value = start.expand(-1, costs.levels, headings, -1, -1).clone()
     dwell = None
     if costs.immobile_s is not None:
         dwell = torch.full_like(value, costs.lost_after_s)
-    converged = torch.zeros_like(final, dtype=torch.bool)[..., :1, :1]
+    converged = torch.zeros_like(is_inner)[..., :1, :1]
     for sweep in range(1, _MAX_SWEEPS * max(grid.shape)):
-        before, dwell_before = value, dwell
+        value_before = value
+        dwell_before = dwell
         for index, arc in enumerate(arcs):
-            ended = at_end(arc, scales[index], value)
-            along = dwells[index]
-            ended_dwell = None
-            if along is not None:
+            to_go = at_end(arc, scales[index], value)
+            dwell_along = dwells[index]
+            new_dwell = None
+            if dwell_along is not None:
                 assert dwell is not None
                 end_dwell = at_end(arc, scales[index], dwell)
-                ended, ended_dwell = along.before(ended, end_dwell, costs.lost_after_s)
+                to_go, new_dwell = dwell_along.before(to_go, end_dwell)
             survival = survivals[index]
             if survival is not None:
-                ended = ended * survival[:, None]
-            candidate = ended + step_costs[index][:, None]
-            better = final.isnan() & (candidate < value)
+                to_go = to_go * survival[:, None]
+            candidate = to_go + step_costs[index][:, None]
+            better = is_inner & (candidate < value)
             value = torch.where(better, candidate, value)
-            if ended_dwell is not None:
+            if new_dwell is not None:
                 assert dwell is not None
-                dwell = torch.where(better, ended_dwell, dwell)
-        # A converged map does not change, so that none depends on the others of a
-        # chunk.
-        value = torch.where(converged, before, value)
+                dwell = torch.where(better, new_dwell, dwell)
+        # A converged map no longer changes, so that its result does not depend on the
+        # other maps of the chunk.
+        value = torch.where(converged, value_before, value)
         if dwell is not None and dwell_before is not None:
             dwell = torch.where(converged, dwell_before, dwell)
         if sweep % _CHECK_EVERY == 0:
-            change = before - value
+            change = value_before - value
             if dwell is not None:
-                # Between reached and unreached states, values decrease for long, but
-                # do not matter.
+                # Values between those of reached and unreached states decrease for many
+                # sweeps, but do not affect any path.
                 change = torch.where(value < _MIXED, change, 0.0)
-            largest = change.flatten(1).amax(1)[:, None, None, None, None]
-            converged = largest < _TOLERANCE
+            max_change = change.flatten(1).amax(1)[:, None, None, None, None]
+            converged = max_change < _TOLERANCE
             if bool(converged.all()):
                 break
     return CostToGo(value=value, max_dwell_s=dwell)
@@ -316,62 +338,69 @@ class _Dwell:
     """Dwell time along an arc, from every state.
 
     Args:
-        first_s: until the arc first leaves immobilising terrain, or its whole duration,
-            shape [B, Q, H, W].
-        last_s: after it last entered such terrain, 0 if it ends elsewhere or never
-            leaves it, of the same shape.
+        first_s: dwell time until the arc first leaves immobilising terrain, or its
+            whole duration, in seconds, shape [B, Q, H, W].
+        last_s: dwell time after the arc last entered such terrain, in seconds; 0 if it
+            ends on other terrain or never leaves; of the same shape.
         leaves: mask of arcs with a point on other terrain, bool, of the same shape.
-        is_lost: mask of arcs that immobilise between both, bool, of the same shape.
+        is_lost: mask of arcs that immobilise a robot between both, bool, of the same
+            shape.
+        lost_after_s: dwell time in seconds after which a robot is immobilised.
     """
 
     first_s: Tensor
     last_s: Tensor
     leaves: Tensor
     is_lost: Tensor
+    lost_after_s: float
 
-    def before(
-        self, value: Tensor, max_dwell_s: Tensor, lost_after_s: float
-    ) -> tuple[Tensor, Tensor]:
-        """Return costs to go and dwell times at an arc's beginning, from those at its
-        end, [B, L, Q, H, W].
+    def before(self, value: Tensor, max_dwell_s: Tensor) -> tuple[Tensor, Tensor]:
+        """Return costs to go and maximum dwell times at the start of an arc.
+
+        Args:
+            value: costs to go at its end, shape [B, L, Q, H, W].
+            max_dwell_s: maximum dwell times at its end, of the same shape.
         """
         levels = value.shape[1]
-        at_end_s = torch.where(self.leaves[:, None], lost_after_s, max_dwell_s)
-        dwell = at_end_s - self.first_s[:, None]
+        limit_s = self.lost_after_s
+        max_end_s = torch.where(self.leaves[:, None], limit_s, max_dwell_s)
+        dwell = max_end_s - self.first_s[:, None]
         is_lost = self.is_lost[:, None] | (max_dwell_s <= self.last_s[:, None])
         dwell = torch.where(is_lost, 0.0, dwell)
-        # The more dwell time a drive leaves, the more it costs: the first that leaves
-        # enough is the cheapest.
-        min_dwell_s = [
-            max(level * lost_after_s / levels, _MIN_DWELL_S) for level in range(levels)
-        ]
-        index = torch.stack([(dwell < min_s).sum(1) for min_s in min_dwell_s], 1)
+        # Over levels, both the remaining dwell time and the cost increase, so the first
+        # drive that leaves enough dwell time is the cheapest.
+        first_levels = []
+        for level in range(levels):
+            min_dwell_s = max(level * limit_s / levels, _MIN_DWELL_S)
+            first_levels.append((dwell < min_dwell_s).sum(1))
+        index = torch.stack(first_levels, 1)
         unreached = torch.full_like(value[:, :1], UNREACHED)
-        unlimited = torch.full_like(unreached, lost_after_s)
+        unlimited = torch.full_like(unreached, limit_s)
         values = torch.cat((value, unreached), 1).gather(1, index)
-        return values, torch.cat((dwell, unlimited), 1).gather(1, index)
+        dwells = torch.cat((dwell, unlimited), 1).gather(1, index)
+        return values, dwells
 
 
-def _dwell_along(costs: Costs, arc: _Arc) -> _Dwell:
-    assert costs.immobile_s is not None
-    (_, height, width), reach = costs.immobile_s.shape, arc.reach
-    around = pad(costs.immobile_s[:, None], (reach,) * 4)[:, 0]
-    first = now = torch.zeros(1).to(around)
-    leaves = is_lost = torch.zeros(1).to(around).bool()
+def _dwell_along(immobile_s: Tensor, lost_after_s: float, arc: _Arc) -> _Dwell:
+    _, height, width = immobile_s.shape
+    padded = pad(immobile_s[:, None], (arc.reach,) * 4)[:, 0]
+    first = torch.zeros(1).to(padded)
+    current = first
+    leaves = first.bool()
+    is_lost = leaves
     for rows, columns in arc.points:
-        cells = zip(rows, columns, strict=True)
-        passed = [
-            around[:, row : row + height, column : column + width]
-            for row, column in cells
-        ]
+        passed = []
+        for row, column in zip(rows, columns, strict=True):
+            passed.append(padded[:, row : row + height, column : column + width])
         seconds = arc.seconds / _POINTS * torch.stack(passed, 1)
         leaves = leaves | (seconds == 0)
         first = first + torch.where(leaves, 0.0, seconds)
-        now = torch.where(seconds > 0, now + seconds, 0.0)
-        is_lost = is_lost | (leaves & (now >= costs.lost_after_s))
+        current = torch.where(seconds > 0, current + seconds, 0.0)
+        is_lost = is_lost | (leaves & (current >= lost_after_s))
     return _Dwell(
         first_s=first,
-        last_s=torch.where(leaves, now, 0.0),
+        last_s=torch.where(leaves, current, 0.0),
         leaves=leaves,
         is_lost=is_lost,
+        lost_after_s=lost_after_s,
     )

@@ -152,7 +152,7 @@ def test_a_path_cost_that_is_none_for_each_piece_is_refused(cost: object) -> Non
         ) -> torch.Tensor:
             return cost  # type: ignore[return-value]
 
-    with pytest.raises(ConfigError, match=r"path_cost.*Same.*a cost for each piece"):
+    with pytest.raises(ConfigError, match=r"path_cost.*Same.*a cost for each segment"):
         astar.search(
             factories.problem(
                 torch.full((1, 8, 8), 0.8), goal=(2.75, 2.75), objective=Same()

@@ -187,7 +187,7 @@ def test_it_tells_where_no_risk_setting_moves_its_path(by: str) -> None:
         else:
             (remark,) = remarks
             assert "travel_time" in remark
-            assert "moves DWA alone" in remark
+            assert "affects only DWA" in remark
 
 
 def test_it_tells_that_it_takes_the_shortest_path_of_an_objective_without_its_own_cost() -> (
