@@ -104,7 +104,7 @@ def list_datasets(folder: str = "") -> None:
     from benchnav.datagen.files.describe import widest
     from benchnav.datagen.files.find import dataset_folders
     from benchnav.datagen.files.manifest import FOLDER_MANIFEST
-    from benchnav.datagen.recipe.recipe import shipped_sizes
+    from benchnav.datagen.recipe.load import shipped_sizes
 
     is_valid = not folder or Path(folder).is_dir()
     expect(is_valid, f"`folder` as a folder that exists, got {folder!r}.")

@@ -23,7 +23,8 @@ from benchnav.core.grid import is_azimuth
 from benchnav.core.ground import GroundStatistics
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.classes import look_alike_classes
-from benchnav.datagen.recipe.recipe import Recipe, load_recipe
+from benchnav.datagen.recipe.load import load_recipe
+from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.datagen.recipe.scenario import RECIPES
 from benchnav.datagen.schema import Maps
 

@@ -19,7 +19,8 @@ from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Terrain
 from benchnav.datagen.files.stored_terrain import terrain_of
-from benchnav.datagen.recipe.recipe import Split, load_recipe
+from benchnav.datagen.recipe.load import load_recipe
+from benchnav.datagen.recipe.recipe import Split
 from benchnav.datagen.synth.generate import generate
 from benchnav.models.base import TraversabilityModel, predict
 from benchnav.models.nets.trainable import TrainableModel

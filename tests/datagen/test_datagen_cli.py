@@ -16,7 +16,8 @@ from benchnav.datagen.files import create
 from benchnav.datagen.files.hdf5 import ShardFile
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.classes import SoftSpots
-from benchnav.datagen.recipe.recipe import Recipe, load_recipe, shipped_recipes
+from benchnav.datagen.recipe.load import load_recipe, shipped_recipes
+from benchnav.datagen.recipe.recipe import Recipe
 from tests.commands import call
 from tests.factories import tiny_dataset
 

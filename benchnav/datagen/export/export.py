@@ -29,11 +29,7 @@ from benchnav.datagen.export.parquet import (
 )
 from benchnav.datagen.files.hdf5 import exclusive_output
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.datagen.recipe.recipe import (
-    load_recipe,
-    recipe_from_dict,
-    shipped_recipes,
-)
+from benchnav.datagen.recipe.load import load_recipe, recipe_from_dict, shipped_recipes
 
 METADATA = "croissant.json"
 CARD = "README.md"
