@@ -438,7 +438,7 @@ def test_faults_of_consecutive_maps_are_one_line(datagen: Call, capsys) -> None:
         ("{preset: hs, relief", "{preset: hs, severity: .nan, relief", "severity"),
         ("height: 32", "height: many", "height"),
         ("id: mine", "id: my maps", "my maps"),
-        ("environments: 5", "environments: 4", "`id` of its own"),
+        ("environments: 5", "environments: 4", "unused `id`"),
         ("scenario: std", "scenario: dusk", "dusk"),
         ("splits:", "splits: []\nmore:", "splits"),
         (RECIPE, "[1, 2]", "mapping"),
@@ -448,7 +448,7 @@ def test_faults_of_consecutive_maps_are_one_line(datagen: Call, capsys) -> None:
 def test_a_bad_recipe_is_one_clear_line_and_status_2(
     datagen: Call, capsys, old: str, new: str, said: str
 ) -> None:  # type: ignore[no-untyped-def]
-    own = RECIPE if "of its own" in said else RECIPE.replace("id: tiny-v1", "id: mine")
+    own = RECIPE if "unused" in said else RECIPE.replace("id: tiny-v1", "id: mine")
     text = new if old == RECIPE else own.replace(old, new, 1)
     assert text != RECIPE
     Path("r.yaml").write_text(text)
