@@ -150,7 +150,7 @@ def table(dataset: TerrainDataset) -> Table:
         straight_free = f"{straight.sum()}/{len(straight)}"
         rows.append((split, *percent, median, time_range, straight_free))
     return Table(
-        title=f"how hard the maps are (λ_stuck {stuck:g})",
+        title=f"difficulty of the maps (λ_stuck {stuck:g})",
         headings=_HEADINGS,
         numbers=True,
         rows=tuple(rows),

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from benchnav.datagen.dem.recipe_fit import GroundError
 
 _MAX_BACKWARD = 0.1  # of the rows (choice)
-_FEW_REVERSES = 0.01  # of the rows; noise alone may cause them (choice)
+_FEW_REVERSES = 0.01  # of the rows; noise may cause this fraction (choice)
 _COARSE_M = 0.2  # of positions; too coarse for speeds over 2 s (choice)
 
 

@@ -16,7 +16,7 @@ from benchnav.env.environment import OffRoadEnv, OffRoadVectorEnv
 
 
 class EgocentricEnv(OffRoadEnv):
-    """Partially observed task: drive to the goal, learning about λ on the way.
+    """Partially observed task: drive to the goal, learning about λ during the episode.
 
     ## Arguments
     `gymnasium.make("benchnav/OffRoad-v1", …)` takes the arguments of

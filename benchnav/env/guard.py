@@ -45,8 +45,8 @@ def check_render_mode(render_mode: str | None, modes: Collection[str]) -> None:
     """Check that an environment has a render mode.
 
     Args:
-        render_mode: as passed by the user.
-        modes: modes of the environment; empty for version 0.
+        render_mode: mode that the user passed.
+        modes: render modes of the environment; empty for version 0.
 
     Raises:
         ConfigError: If the mode is not in `modes`.
@@ -74,7 +74,7 @@ def read_options(options: Any, names: Collection[str], maps: int) -> dict[str, A
     """Return the checked options of a reset.
 
     Args:
-        options: as passed by the user.
+        options: options that the user passed.
         names: names of the environment's options.
         maps: number of the environment's maps.
 

@@ -111,7 +111,7 @@ class _BeliefCheck:
         first = self.begin(self.prior)
         if first is NOTHING or not self.is_sound(first):
             return
-        breach = "Expected what is believed at first to be the prediction, got another."
+        breach = "Expected the initial belief to equal the prediction, got another."
         self.expect_of(first, self.prior, breach)
         state = first
         for sensed in looks:
@@ -122,7 +122,7 @@ class _BeliefCheck:
             again = self.belief.update(before, sensed)
             self.expect(
                 self.alike(again, state, 0),
-                "Expected the same from `update` when asked again, got another.",
+                "Expected the same result from `update` when called again, got another.",
             )
             self.try_changed(before, state)
         shown = _cdf(self.belief.distribution(state))
@@ -130,7 +130,7 @@ class _BeliefCheck:
         again = _cdf(self.belief.distribution(state))
         self.expect(
             same(again, shown),
-            "Expected the same after other maps were begun, got another.",
+            "Expected the same belief after `init` on other maps, got another.",
         )
         distribution = self.belief.distribution(state)
         check_functions(distribution, self.tolerance, self.breaches)
@@ -199,7 +199,7 @@ class _BeliefCheck:
         in_range = (probabilities >= 0) & (probabilities <= 1)
         return self.expect(
             bool(in_range.all()),
-            "Expected probabilities in [0, 1] of what is believed, got others.",
+            "Expected probabilities of the belief in [0, 1], got others.",
         )
 
     def alike(
@@ -263,7 +263,7 @@ class _BeliefCheck:
             is_same = after is NOTHING or self.alike(after, state, self.tolerance)
             self.expect(
                 is_same,
-                "Expected that nothing changes where nothing is sensed, got a change.",
+                "Expected an update without measurements to change nothing, got a change.",
             )
         breach = (
             "Expected the prediction of an episode in which nothing was sensed, "
@@ -386,13 +386,13 @@ class _BeliefCheck:
                 return
             self.expect(
                 self.alike(separate, last, self.tolerance, members),
-                "Expected for episodes alone and in another order what they got in "
-                "the batch, got another.",
+                "Expected the same results for single episodes and in another order as "
+                "in the batch, got others.",
             )
             self.expect(
                 self.alike(selected, last, self.tolerance, members),
-                "Expected of episodes that `select` keeps what they got in the batch, "
-                "got another.",
+                "Expected the same beliefs for episodes that `select` keeps as in the "
+                "batch, got others.",
             )
 
     def try_put(self, state: Any) -> None:

@@ -55,7 +55,7 @@ def check_fields(
     others = draw(state, 2, _OTHER_KEYS)
     expect(
         same(draw(state, 2, KEYS), fewer),
-        "Expected the same fields when asked again, got others.",
+        "Expected the same fields when called again, got others.",
     )
     differ = others is NOTHING or not any(map(same, fewer, others))
     expect(
@@ -79,6 +79,5 @@ def check_fields(
         is_close = deviation <= _MAX_ERRORS * error + 0.03
         expect(
             bool(is_close.all()),
-            "Expected fields whose cells have the distribution that is believed, "
-            "got others.",
+            "Expected fields whose cells have the belief's distribution, got others.",
         )

@@ -104,15 +104,15 @@ class Breaches:
         again = act(**arguments)
         self.expect(
             same(again, answer),
-            f"Expected the same from `{what}` when asked again, got another.",
+            f"Expected the same result from `{what}` when called again, got another.",
         )
         last_only = {name: _last(value) for name, value in arguments.items()}
         single = self.watch(what, lambda: act(**last_only))
         expected = _last(answer)
         self.expect(
             same(single, expected, tolerance),
-            f"Expected the same from `{what}` for one alone and in a batch, got "
-            "another.",
+            f"Expected the same result from `{what}` for a single element as in a batch, "
+            "got another.",
         )
         return answer
 
@@ -144,14 +144,14 @@ class Breaches:
         listed = ", ".join(changed[:3])
         self.expect(
             not changed,
-            f"Expected `{what}` to leave its arguments as they were, got another "
+            f"Expected `{what}` to leave its arguments unchanged, got another "
             f"{listed}.",
         )
         for whose, state in _generators().items():
             previous = states.get(whose, state)
             self.expect(
                 previous == state,
-                f"Expected {whose} global generator to be unchanged, got it changed. "
+                f"Expected {whose} global generator to be unchanged, got a change. "
                 "Draw from a generator of your own, or from the one that is passed.",
             )
         return answer
@@ -174,7 +174,7 @@ class Breaches:
             if where:
                 listed += f" [{where}]"
         raise ConfigError(
-            f"Expected a {self._kind} that keeps the contract of "
+            f"Expected a {self._kind} that fulfils the contract of "
             f"`benchnav.testing.check_{self._kind}`, got "
             f"{self._name}, which breaks it:{listed}"
         )

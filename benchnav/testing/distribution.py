@@ -43,7 +43,7 @@ def check_functions(
         answer = breaches.watch(name, lambda: method(*arguments))
         if answer is NOTHING:
             return NOTHING
-        what = f"what `{name}` of the distribution gives"
+        what = f"results of `{name}` of the distribution"
         is_map = breaches.is_tensor(what, like, distribution.shape)
         return answer if is_map(answer) else NOTHING
 

@@ -104,7 +104,7 @@ def _try_robot(
         action = draws.uniform(robot.action_low, robot.action_high)
         traversability = draws.uniform([0], [1])[..., 0]
         arguments = {"state": state, "action": action, "traversability": traversability}
-        is_state = breaches.is_tensor("what `F` gives", draws.like, state.shape)
+        is_state = breaches.is_tensor("results of `F`", draws.like, state.shape)
         next_state = breaches.try_function("F", robot, arguments, is_state)
         if next_state is NOTHING:
             return
@@ -187,7 +187,7 @@ def check_objective(
             "path_cost": {"traversability": of_motion, "grade": grade},
         }
         for method, arguments in calls.items():
-            what = f"what `{method}` gives"
+            what = f"results of `{method}`"
             is_cost = breaches.is_tensor(what, draws.like, draws.leading)
             function = getattr(new_objective, method)
             cost = breaches.try_function(method, function, arguments, is_cost)

@@ -126,7 +126,8 @@ def check_planner(
             problem = create(replace(task, rules=free_space_rules), height, width)
             _PlannerCheck(new_planner, problem, tolerance, breaches).check_uses()
     breaches.expect(
-        n_robots > 0, "Expected a robot among those tried that it steers, got none."
+        n_robots > 0,
+        "Expected the planner to steer one of the tried robots, got no such robot.",
     )
     breaches.raise_any()
 
@@ -181,7 +182,7 @@ class _PlannerCheck:
         second_state = self.expect_action(breach, answered[0], repeated_state, problem)
         plan_state = self.begin(problem.select(last))
         breach = (
-            "Expected for an episode alone the action that it got in a batch, got "
+            "Expected the same action for a single episode as in the batch, got "
             "another."
         )
         for pair in answered[:_STEPS]:
@@ -192,8 +193,8 @@ class _PlannerCheck:
             selected = self.breaches.watch("select", select, plan_state=second_state)
         if selected is not NotImplemented:
             breach = (
-                "Expected of episodes that `select` keeps the actions that they "
-                "got among all, got others."
+                "Expected the same actions for episodes that `select` keeps as in "
+                "the batch, got others."
             )
             self.expect_action(breach, answered[1], selected, problem, last_two)
         different = invert_prediction(problem.select(last_two))
@@ -201,7 +202,7 @@ class _PlannerCheck:
         breach = (
             "Expected the first step's action to be the same after other steps and "
             "problems, got another. "
-            "Keep what evolves in the plan state, not on the planner."
+            "Keep changing values in the plan state, not on the planner."
         )
         self.expect_action(breach, answered[0], first_state, problem)
 
@@ -220,12 +221,12 @@ class _PlannerCheck:
         is_consistent = not self.planner.blind or not used
         expect(
             is_consistent,
-            "Expected `uses` of a `blind` planner to give no input, got some.",
+            "Expected `uses` of a `blind` planner to be empty, got some inputs.",
         )
         for name in sorted(INPUTS - used):
             changed = change_input(problem, name)
             breach = (
-                f"Expected the same action whatever `{name}` holds, which "
+                f"Expected the same action for any value of `{name}`, which "
                 "is not in `uses`, got another."
             )
             step = first_step(problem)
@@ -311,7 +312,7 @@ class _PlannerCheck:
         is_repeatable = self.breaches.expect(
             answer is not NOTHING and same(answer[0], expected),
             "Expected the same action for the same step and plan state, got "
-            "another when asked again.",
+            "another when called again.",
         )
         if is_repeatable:
             self.breaches.expect(
@@ -329,11 +330,11 @@ class _PlannerCheck:
         is_line = follows is NOTHING or _are_lines((follows,))
         expect(
             is_line,
-            "Expected `follows` to give a single line, got something else.",
+            "Expected `follows` to return a single line, got something else.",
         )
         expect(
             remarks is NOTHING or _are_lines(remarks),
-            "Expected `remarks` to give a tuple of single lines, got something else.",
+            "Expected `remarks` to return a tuple of single lines, got something else.",
         )
 
     def check_answer(self, action: Tensor, plan: Plan) -> None:

@@ -120,13 +120,13 @@ class _SensorCheck:
         has_seen = appearance is not None and bool(appearance.seen.any())
         self.breaches.expect(
             has_sensed or has_seen,
-            "Expected a robot in the middle of a map to sense or see some cell, got "
-            "none.",
+            "Expected a robot in the middle of a map to measure or see a cell, got no "
+            "such cell.",
         )
         reported = _reported(sensed)
         is_same = self.breaches.expect(
             self.is_alike(self.ask(self.truth), reported, 0),
-            "Expected the same when asked again, got another.",
+            "Expected the same measurement when called again, got another.",
         )
         for indices in ([3], [2, 0]):
             members = torch.tensor(indices, device=self.truth.field.device)
@@ -135,16 +135,16 @@ class _SensorCheck:
             expected = tuple(values[members] for values in reported)
             self.breaches.expect(
                 self.is_alike(of_members, expected, self.tolerance),
-                "Expected for episodes alone and in another order what they got in "
-                "the batch, got another. Draw noise by `NoiseKey.normal`.",
+                "Expected the same results for single episodes and in another order as "
+                "in the batch, got others. Draw noise by `NoiseKey.normal`.",
             )
         if not is_same:
             return  # the following comparisons would all fail
         for what, changed in _replaced(self.truth, sensed, self.sinks):
             self.breaches.expect(
                 self.is_alike(self.ask(changed), reported, self.tolerance),
-                f"Expected the same whatever {what}, got another. Look at no cell "
-                "that is not reported.",
+                f"Expected the same measurement whatever {what}, got another. Read only "
+                "cells that are reported.",
             )
         self.try_noise(sensed)
 

@@ -77,12 +77,12 @@ def try_training(
         target = maps[model.target]
         partial = torch.where(maps["slope_deg"] > 5, torch.nan, target)
         missing = torch.full_like(target, torch.nan)
-        for what, values in (("in part", partial), ("anywhere", missing)):
+        for what, values in (("some", partial), ("all", missing)):
             changed = maps | {model.target: values}
             loss, _ = model.train().assess(changed)
             breaches.expect(
                 bool(loss.isfinite()),
-                f"Expected a finite loss where λ is not observed {what}, got "
+                f"Expected a finite loss if λ of {what} cells is unobserved, got "
                 f"{loss.item()}.",
             )
         before = {name: value.clone() for name, value in model.named_parameters()}
@@ -94,7 +94,7 @@ def try_training(
             is_changed |= not torch.equal(before[name], value)
         breaches.expect(
             is_changed,
-            "Expected weights that a step of training changes, got them as they were.",
+            "Expected a training step to change the weights, got the same weights.",
         )
         model.eval().zero_grad()
         settings = model.settings()
@@ -104,8 +104,8 @@ def try_training(
         restored_mean = restored.to(device).predict_raw(layers).mean()
         breaches.expect(
             same(restored_mean, mean, 1e-5),
-            "Expected the same prediction from settings and tensors, as a checkpoint "
-            "keeps them, got another.",
+            "Expected the same prediction from the settings and tensors of a "
+            "checkpoint, got another.",
         )
     except Exception as error:
         text = str(error) if isinstance(error, BenchnavError) else one_line(error)

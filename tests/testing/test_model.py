@@ -198,8 +198,8 @@ BAD = {
     "PyTorch's seed": (meddling(lambda _: torch.manual_seed(54321)), "PyTorch's global generator"),
     "NumPy's generator": (meddling(lambda _: np.random.rand()), "NumPy's global generator"),  # noqa: NPY002
     "Python's generator": (meddling(lambda _: random.random()), "Python's global generator"),
-    "another answer": (Forgetful(), "Expected the same from `predict` when asked again"),
-    "an answer of the batch": (changed(of_batch), "Expected the same from `predict` for one alone"),
+    "another answer": (Forgetful(), "Expected the same result from `predict` when called again"),
+    "an answer of the batch": (changed(of_batch), "Expected the same result from `predict` for a single element"),
     "too many names": (Misnamed(), "each of 2 components, got 3"),
     "members without names": (Nameless(), "`class_names` with"),
     "members of another shape": (with_members(lambda weights: weights), "shape [M, 3, 2, 32, 32], got [3, 2, 32, 32]"),
@@ -377,7 +377,7 @@ BAD_DISTRIBUTIONS = {
     "under 0": (lambda d: replace(d, values=d.values - 0.3), "`quantile` to ascend within [0, 1]"),
     "with a hole": (
         lambda d: replace(d, values=d.values.where(d.values < d.values.max(), torch.nan)),
-        "finite what `quantile` of the distribution gives",
+        "finite results of `quantile` of the distribution",
     ),
     "elsewhere": (lambda d: d.to("meta"), "observation's device cpu, got meta"),
     "a row short": (lambda d: replace(d, values=d.values[..., 1:, :]), "got QuantileDistribution of shape [3, 31, 32]"),

@@ -212,7 +212,7 @@ BAD: dict[str, tuple[Any, str]] = {
         "got another step.traversability.",
     ),
     "writes into the map": (acting(lambda _, s: s.problem.risk_map.mul_(0.5)), "got another problem.risk_map."),
-    "writes into the goal": (preparing(lambda p, _: p.goal_m.add_(1)), "`init` to leave its arguments as they were"),
+    "writes into the goal": (preparing(lambda p, _: p.goal_m.add_(1)), "`init` to leave its arguments unchanged"),
     "writes into the prediction": (preparing(lambda p, _: p.distribution.means.zero_()), "problem.distribution.means"),
     "writes into the image": (preparing(lambda p, _: p.observation.rgb.add_(1)), "problem.observation.rgb"),
     "writes into the plan state": (acting(lambda _, s: s.last.add_(0.1)), "got another plan_state.last."),
@@ -234,14 +234,14 @@ BAD: dict[str, tuple[Any, str]] = {
     "PyTorch's seed in init": (preparing(lambda *_: torch.manual_seed(20_261)), "PyTorch's global generator"),
     "NumPy's generator": (acting(lambda *_: np.random.rand()), "NumPy's global generator"),  # noqa: NPY002
     "Python's generator": (acting(lambda *_: random.random()), "Python's global generator"),
-    "evolves on self": (OnSelf(), "got another when asked again"),
+    "evolves on self": (OnSelf(), "got another when called again"),
     "keeps the problem on self": (ProblemOnSelf(), "same after other steps and problems"),
     "keeps what it saw on self": (LastSeen(), "same after other steps and problems"),
     "no seed": (Unseeded(), "from a generator of the same seed, got another"),
     "drives otherwise when drawn": (action_of(lambda a, step: 0.9 * a if step.draw else a), "whether it is drawn"),
-    "an action of the batch": (action_of(lambda a, _: a - 0.1 * a.mean(0)), "Expected for an episode alone"),
-    "noise of the batch": (NoiseOfBatch(), "Expected for an episode alone"),
-    "blind that is not": (having(blind=True), "the same action whatever `risk_map` holds, which is not in `uses`"),
+    "an action of the batch": (action_of(lambda a, _: a - 0.1 * a.mean(0)), "same action for a single episode"),
+    "noise of the batch": (NoiseOfBatch(), "same action for a single episode"),
+    "blind that is not": (having(blind=True), "the same action for any value of `risk_map`, which is not in `uses`"),
     "uses λ̂ later on and does not say so": (
         using({"distribution"}, lambda step, p: p.traversability_at(step.state) * (step.time_s > 0)),
         "whatever `risk_map` holds",
@@ -261,11 +261,11 @@ BAD: dict[str, tuple[Any, str]] = {
     "blind that uses something": (
         type("Bad", (Straight,), {"uses": lambda self, task: INPUTS})(), "`uses` of a `blind` planner",
     ),
-    "follows no text": (having(follows=lambda self, task: 3), "Expected `follows` to give a single line"),
+    "follows no text": (having(follows=lambda self, task: 3), "Expected `follows` to return a single line"),
     "follows that is text": (having(follows="time"), "from `follows`, got TypeError"),
     "steers by one name": (having(steers=("speed_mps", "turn_rate_radps")), "`steers` as tuples of action names"),
-    "steers nothing": (having(steers=()), "Expected a robot among those tried that it steers, got none"),
-    "remarks that are no tuple": (having(remarks=lambda self, task: "slow"), "to give a tuple of single lines"),
+    "steers nothing": (having(steers=()), "Expected the planner to steer one of the tried robots, got no such robot"),
+    "remarks that are no tuple": (having(remarks=lambda self, task: "slow"), "to return a tuple of single lines"),
     "remarks that raise": (having(remarks=lambda self, task: task.wheels), "from `remarks`, got AttributeError"),
 }  # fmt: skip
 
@@ -484,5 +484,5 @@ def test_what_select_keeps_has_to_be_those_that_were_asked_for(order: str) -> No
     if order == "kept":
         check_planner(Leaving(), robots=[Unicycle()])
         return
-    with pytest.raises(ConfigError, match="of episodes that `select` keeps"):
+    with pytest.raises(ConfigError, match="for episodes that `select` keeps"):
         check_planner(Leaving(), robots=[Unicycle()])

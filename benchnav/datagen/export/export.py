@@ -259,7 +259,7 @@ def metadata(
 
     Args:
         dataset: exported dataset.
-        names: by each split's name in the dataset, its name in names of files.
+        names: names of splits as files contain them, by their names in the dataset.
         fields: names of the exported fields.
         publication: licence, creator, address and date.
         folder: folder of the files.
@@ -390,7 +390,7 @@ def card(
 
     Args:
         dataset: exported dataset.
-        names: by each split's name in the dataset, its name in names of files.
+        names: names of splits as files contain them, by their names in the dataset.
         publication: licence, creator, address and date.
     """
     ours = is_ours(dataset, names)

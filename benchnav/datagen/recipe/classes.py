@@ -1,7 +1,7 @@
 """Terrain classes: colours, and parameters of latent traversability (LT) functions.
 
 Beyond the paper, a class may have soft spots, a second mode of λ that neither colour
-nor slope shows, and classes may share a colour.
+nor slope shows, and several classes may have one colour.
 """
 
 from dataclasses import dataclass

@@ -4,8 +4,8 @@ f_c(ψ) = clip(1 − (a_c·10⁻³·ψ^b_c + o_c), 0, 1), ψ in degrees; observe
 + ε_c, 0, 1) with ε_c zero-mean Gaussian of standard deviation σ_c. Source: paper III-A.
 
 Beyond the paper, a class may have soft spots, a second mode of λ that neither colour
-nor slope shows, and classes may share a colour. Letters in shapes: B maps, H×W cells, K
-components.
+nor slope shows, and several classes may have one colour. Letters in shapes: B maps,
+H×W cells, K components.
 """
 
 from collections.abc import Mapping, Sequence

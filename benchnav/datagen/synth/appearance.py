@@ -72,7 +72,7 @@ def paint(colours: ndarray, brightness: ndarray) -> ndarray:
 
     Args:
         colours: RGB in full light, 0–255, shape [B, 3, H, W].
-        brightness: in [0, 1], shape [B, H, W].
+        brightness: brightness of each cell, in [0, 1], shape [B, H, W].
 
     Returns:
         Image, uint8, shape [B, 3, H, W].

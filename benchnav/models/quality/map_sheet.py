@@ -149,7 +149,7 @@ def map_sheet_figure(
 
     Args:
         sheet: the maps.
-        scales: from `shared_scales`.
+        scales: keywords of `imshow` by layer, from `shared_scales`.
         classes: classes of the dataset.
         title: names of model and dataset, followed by the split.
     """

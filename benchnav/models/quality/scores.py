@@ -68,7 +68,7 @@ def coverage(transformed: Tensor) -> float:
     """Return the fraction of observations in the central 90 % interval.
 
     Args:
-        transformed: from `pit`, any shape.
+        transformed: PIT of the observations from `pit`, any shape.
     """
     is_inside = (transformed - 0.5).abs() <= LEVEL / 2
     return float(is_inside.double().mean())
@@ -80,7 +80,7 @@ def tail_rate(transformed: Tensor, level: float = LEVEL) -> float:
     If the VaR lies on an atom at 0 or 1, the draw within the atom decides.
 
     Args:
-        transformed: from `pit`, any shape.
+        transformed: PIT of the observations from `pit`, any shape.
         level: α.
     """
     is_below = transformed < 1 - level
@@ -147,7 +147,7 @@ def pit_counts(transformed: Tensor) -> Tensor:
     """Count observations in 20 equal bins of the PIT.
 
     Args:
-        transformed: from `pit`, any shape.
+        transformed: PIT of the observations from `pit`, any shape.
 
     Returns:
         int64 on the CPU, shape [20].

@@ -182,7 +182,7 @@ class _Sparsification(Figure):
                 removed, by_width, label=model, markevery=2 * _MARKED_EVERY, **look
             )
             panel.plot(removed, by_error, color=look["color"], lw=0.8, ls=":")
-        panel.set_ylim(bottom=0)  # all panels share it
+        panel.set_ylim(bottom=0)  # of all panels, whose axes are linked
         figure.supxlabel(
             "fraction of cells removed, those with the widest intervals first"
         )
