@@ -85,7 +85,7 @@ class Picture:
     def draw(self, scene: Scene) -> np.ndarray:
         """Return the image of a scene, uint8, shape [480, 640, 3]."""
         self._figure.clear()
-        layout = [["map", "risk"], ["map", "spread"]]
+        layout: list[Any] = [["map", "risk"], ["map", "spread"]]
         panels = self._figure.subplot_mosaic(layout, gridspec_kw=_PANELS)
         for panel in panels.values():
             panel.set(xticks=[], yticks=[])

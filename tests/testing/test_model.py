@@ -384,9 +384,9 @@ BAD_DISTRIBUTIONS = {
     "of another inverse": (
         overriding(quantile=lambda d, u: 0.9 * QuantileDistribution.quantile(d, u)), "inverse of `cdf`",
     ),
-    "of another mean": (overriding(mean=lambda d: QuantileDistribution.mean(d) + 0.01), "`mean` to follow"),
-    "of another tail": (overriding(cvar=lambda d, level: d.var(level)), "`cvar` to follow"),
-    "of another time": (overriding(expected_time=lambda d, floor: 1 / d.mean()), "`expected_time` to follow"),
+    "of another mean": (overriding(mean=lambda d: QuantileDistribution.mean(d) + 0.01), "`mean` to follow from"),
+    "of another tail": (overriding(cvar=lambda d, level: d.var(level)), "`cvar` to follow from"),
+    "of another time": (overriding(expected_time=lambda d, floor: 1 / d.mean()), "`expected_time` to follow from"),
     "of other limits": (overriding(cdf_limits=lambda d, x: (0 * d.cdf(x), d.cdf(x)), cdf=lambda d, x: (
         QuantileDistribution.cdf_limits(d, x)[1])), "`cdf_limits` to be P(λ < value)"),
     "of another dtype": (

@@ -53,7 +53,7 @@ BAD: dict[str, tuple[Any, str]] = {
             ("knows [B] alone", lambda cost, *_: cost.flatten(), "[*B = [6, 5], torch.float32"),
             ("single precision", lambda cost, *_: cost.float(), "[*B = [6], torch.float64"),
             ("no number", lambda cost, *_: cost * torch.nan, "Expected finite results of `{}`"),
-            ("a cost of the batch", lambda cost, *_: cost + cost.mean(), "the same from `{}` for a single element"),
+            ("a cost of the batch", lambda cost, *_: cost + cost.mean(), "same result from `{}` for a single"),
             ("PyTorch's generator", lambda cost, *_: cost + 0 * torch.rand(1).to(cost), "PyTorch's global generator"),
             ("writes into λ̂", lambda cost, *g: [v.mul_(0.5) for v in g] and cost, "got another"),
         )

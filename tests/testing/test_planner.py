@@ -244,16 +244,16 @@ BAD: dict[str, tuple[Any, str]] = {
     "blind that is not": (having(blind=True), "the same action for any value of `risk_map`, which is not in `uses`"),
     "uses λ̂ later on and does not say so": (
         using({"distribution"}, lambda step, p: p.traversability_at(step.state) * (step.time_s > 0)),
-        "whatever `risk_map` holds",
+        "for any value of `risk_map`",
     ),
     "uses free space by risk and says the mean": (
-        using({"distribution"}, lambda step, p: p.free_at(step.state)), "whatever `risk_map` holds",
+        using({"distribution"}, lambda step, p: p.free_at(step.state)), "for any value of `risk_map`",
     ),
     "uses free space by the mean and says λ̂": (
-        using({"risk_map"}, lambda step, p: p.free_at(step.state)), "whatever `distribution` holds",
+        using({"risk_map"}, lambda step, p: p.free_at(step.state)), "for any value of `distribution`",
     ),
     "uses fields and does not say so": (
-        using({"risk_map"}, lambda step, p: p.sample_fields(1, 7)[:, 0, 8, 8]), "whatever `fields` holds",
+        using({"risk_map"}, lambda step, p: p.sample_fields(1, 7)[:, 0, 8, 8]), "for any value of `fields`",
     ),
     "uses what is no input": (
         using({"free"}, lambda step, p: p.goal_m[:, 0]), "frozenset of distribution, fields, risk_map, got frozenset",
@@ -367,7 +367,7 @@ def test_a_robot_that_it_does_not_steer_is_left_out() -> None:
 
     check_planner(Names(), shapes=((12, 12),))
     assert set(named) == {("speed_mps", "turn_rate_radps")}
-    with pytest.raises(ConfigError, match="that it steers"):
+    with pytest.raises(ConfigError, match="to steer one of the tried robots"):
         check_planner(Names(), robots=["bicycle"])
 
 
@@ -392,7 +392,7 @@ def test_parts_are_taken_by_name_mapping_or_as_objects() -> None:
 def test_the_tolerance_is_of_an_episode_alone() -> None:
     nearly = action_of(lambda action, _: action - 1e-2 * action.mean(0))
     check_planner(nearly, tolerance=0.02)
-    with pytest.raises(ConfigError, match="episode alone"):
+    with pytest.raises(ConfigError, match="a single episode"):
         check_planner(nearly)
 
 

@@ -41,8 +41,8 @@ BAD: dict[str, tuple[Any, str]] = {
     "below 0": (changed(lambda mean, _: -mean - 0.1), "λ̂ in [0, 1]"),
     "no number": (changed(lambda mean, _: mean * torch.nan), "λ̂ in [0, 1]"),
     "slip": (changed(lambda mean, m: (m.stds[:, 0] > 0) / mean.new_zeros(())), "λ̂ in [0, 1]"),
-    "λ̂ of the batch": (changed(lambda mean, _: mean / (1 + mean.mean())), "the same from `risk` for a single element"),
-    "λ̂ of the neighbours": (changed(lambda mean, _: (mean + mean.roll(1, -1)) / 2), "for some cells alone"),
+    "λ̂ of the batch": (changed(lambda mean, _: mean / (1 + mean.mean())), "same result from `risk` for a single"),
+    "λ̂ of the neighbours": (changed(lambda mean, _: (mean + mean.roll(1, -1)) / 2), "of selected cells as on the map"),
     "cannot take some cells": (
         changed(lambda mean, _: mean if mean.shape[-2] > 1 else mean[99]),
         "Expected an answer from `risk`, got IndexError",

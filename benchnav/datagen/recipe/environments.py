@@ -55,8 +55,8 @@ def deal_units(
     # Positions of the units in the pack, for each stride.
     positions = []
     for stride in dict.fromkeys(strides(count)):
-        order = stride * np.arange(count) % count
-        positions.append(np.argsort(order))
+        pack = stride * np.arange(count) % count
+        positions.append(np.argsort(pack))
 
     def rank(unit: int) -> tuple[int, int]:
         times = times_dealt[unit]

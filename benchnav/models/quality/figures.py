@@ -28,7 +28,7 @@ from benchnav.viz.style import legend_outside, page_width
 _MARGIN = 0.01  # of an axis around the ideal, so that small differences look small
 
 # Title and field of ClassQuality or TraversabilityQuality.
-_SEVERITY = (
+_SEVERITY: tuple[tuple[str, str], ...] = (
     ("Accuracy", "accuracy"),
     ("Calibration error (ECE)", "ece"),
     ("Mean entropy [nats]", "entropy"),
