@@ -107,7 +107,7 @@ BAD: dict[str, tuple[Any, str]] = {
     "NumPy's generator": (meddling(lambda *_: np.random.rand()), "NumPy's global generator"),  # noqa: NPY002
     "Python's generator": (meddling(lambda *_: random.random()), "Python's global generator"),
     "another step": (Forgetful(), "Expected the same result from `F` when called again"),
-    "a step of the batch": (moving(lambda moved, *_: moved + 0.01 * moved.mean(0)), "for a single element as in a batch"),
+    "a step of the batch": (moving(lambda moved, *_: moved + 0.01 * moved.mean(0)), "for a single element"),
     "faster than it says": (moving(lambda m, state, *_: state + 1.2 * (m - state)), "than `top_speed_mps` allows"),
     "faster than it says after a while": (Gathering(), "than `top_speed_mps` allows"),
     "drives on ground of 0": (
