@@ -66,7 +66,7 @@ class PolicyPlanner(Planner[PolicyState]):
         self.view = View(cells=crop_cells, behind=crop_behind)
 
     def follows(self, task: Task) -> str:
-        """Return that it follows no objective; see `Planner`."""
+        """Return a description instead of an objective; see `Planner`."""
         return "none (a policy, which does what it was trained for)"
 
     def init(self, problem: Problem, generator: torch.Generator) -> PolicyState:

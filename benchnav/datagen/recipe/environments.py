@@ -43,7 +43,7 @@ def deal_units(
     does not fit in the remaining room is skipped.
 
     Args:
-        units: classes that are shown together, without the units of `never_shown`.
+        units: classes that are shown together; must exclude those of `never_shown`.
         shown: M, number of classes of an environment.
         environments: E, number of environments; a larger E does not change the first.
 
