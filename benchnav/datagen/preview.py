@@ -91,7 +91,9 @@ def preview_figure(
         SheetColumn("class_id", "Class", class_id, class_scale(colours)),
         SheetColumn("elevation_m", "Elevation [m]", elevation_m, relief, contours),
         SheetColumn("slope_deg", "Slope [°]", slope_deg, slopes, "", "max"),
-        SheetColumn("traversability", "Traversability λ", traversability, FRACTIONS, ""),
+        SheetColumn(
+            "traversability", "Traversability λ", traversability, FRACTIONS, ""
+        ),
     ]
     for name in layers:
         unit = dataset.fields[name].unit
