@@ -9,7 +9,8 @@ from benchnav.core.grid import Grid
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Observation, Terrain
 from benchnav.datagen.files.create import create
-from benchnav.datagen.recipe.recipe import Recipe, load_recipe
+from benchnav.datagen.recipe.load import load_recipe
+from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.planning.free_space import Rules
 from benchnav.planning.objective import GoalDistance, Objective
 from benchnav.planning.problem import Prediction, Problem, Task, pose_problem

@@ -10,7 +10,7 @@ import torch
 from benchnav.core import gridgraph, registry, rng
 from benchnav.datagen.files.hdf5 import pack
 from benchnav.datagen.recipe import latent
-from benchnav.datagen.recipe.recipe import load_recipe
+from benchnav.datagen.recipe.load import load_recipe
 from benchnav.datagen.schema import FIELDS, entry_digests
 from benchnav.datagen.synth import appearance, elevation
 from benchnav.datagen.synth.generate import generate

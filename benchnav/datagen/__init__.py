@@ -1,4 +1,4 @@
-"""Terrain: recipes, synthesis, datasets and how they are read."""
+"""Terrain: recipes, synthesis, and datasets with their readers."""
 
 from benchnav.core.public_names import face
 
@@ -11,12 +11,12 @@ __getattr__, __dir__, __all__ = face(
         "benchnav.datagen.files.reader": ("TerrainDataset",),
         "benchnav.datagen.layers.layer": ("DrawnMaps", "Layer", "Streams"),
         "benchnav.datagen.recipe.classes": ("TerrainClass",),
-        "benchnav.datagen.recipe.recipe": (
-            "Recipe",
+        "benchnav.datagen.recipe.load": (
             "load_recipe",
             "recipe_from_dict",
             "shipped_recipes",
         ),
+        "benchnav.datagen.recipe.recipe": ("Recipe",),
         "benchnav.datagen.synth.generate": ("generate",),
     },
 )

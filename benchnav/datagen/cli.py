@@ -1,7 +1,7 @@
 """Command `benchnav-datagen`: create, inspect, merge, import and export datasets.
 
-Slow modules are imported where they are used, directly or through `datagen`. The
-command's help is fast therefore.
+Slow modules are imported where they are used, directly or through `datagen`, so that
+the command's help is fast.
 """
 
 import sys
@@ -43,13 +43,13 @@ def create(
             scenarios.hs.severity=0.5.
         out: File .h5, or a folder for many files. If empty, datasets/ID.h5, or
             datasets/ID for many maps.
-        jobs: Worker processes on this machine; a cluster has its own. The result does
-            not depend on their number.
+        jobs: Number of worker processes on this machine; a cluster has its own. The
+            result does not depend on it.
         seed: Root seed instead of the recipe's, for other maps of the same classes;
             their id is ID-seedN.
         splits: Only these splits, for example [test/std,test/hg]; their maps are the
             same as in the complete dataset.
-        first: Only this number of maps of each split, from the first; 0 for all.
+        first: Only the first N maps of each split; 0 for all.
         shard: Only this shard of the maps, such as 2/5; other machines may make the
             others.
         backend: Worker processes on this machine, or those of a Dask cluster.
@@ -69,12 +69,16 @@ def create(
     sizes = {}
     for name in choose("splits", splits, loaded.splits):
         spec = loaded.splits[name]
-        sizes[name] = replace(spec, maps=min(first or spec.maps, spec.maps))
+        n_maps = spec.maps
+        if first:
+            n_maps = min(first, n_maps)
+        sizes[name] = replace(spec, maps=n_maps)
     loaded = replace(loaded, splits=sizes)
     n_maps = sum(spec.maps for spec in sizes.values())
     n_cells = n_maps * loaded.height * loaded.width
     is_folder = requested is not None or n_cells > _MAX_CELLS_PER_FILE
-    path = Path(out or f"datasets/{loaded.id}{'' if is_folder else '.h5'}")
+    suffix = "" if is_folder else ".h5"
+    path = Path(out or f"datasets/{loaded.id}{suffix}")
     steps = datagen.create_dataset(loaded, path, jobs, scheduler, requested, overwrite)
     done, total = next(steps)
     if done:
@@ -100,22 +104,22 @@ def list_datasets(folder: str = "") -> None:
     from benchnav.datagen.files.describe import widest
     from benchnav.datagen.files.find import dataset_folders
     from benchnav.datagen.files.manifest import FOLDER_MANIFEST
-    from benchnav.datagen.recipe.recipe import shipped_sizes
+    from benchnav.datagen.recipe.load import shipped_sizes
 
-    expect(
-        not folder or Path(folder).is_dir(),
-        f"`folder` as a folder that exists, got {folder!r}.",
-    )
+    is_valid = not folder or Path(folder).is_dir()
+    expect(is_valid, f"`folder` as a folder that exists, got {folder!r}.")
     print("recipes:")
     recipes = datagen.shipped_recipes()
     width = widest(recipes)
     for name in recipes:
         sizes = [f"{split} {maps}" for split, maps in shipped_sizes(name).items()]
         print(f"  {name:{width}} {', '.join(sizes)}")
-    for parent in [Path(folder)] if folder else dataset_folders():
+    parents = [Path(folder)] if folder else dataset_folders()
+    for parent in parents:
         folders = [manifest.parent for manifest in parent.glob(f"*/{FOLDER_MANIFEST}")]
         files = sorted([*parent.glob("*.h5"), *folders])
-        print(f"files in {parent}:" if files else f"no files in {parent}")
+        heading = f"files in {parent}:" if files else f"no files in {parent}"
+        print(heading)
         width = widest(path.name for path in files)
         for path in files:
             try:
@@ -175,19 +179,18 @@ def validate(file: str) -> int:
         return 0
     print(f"{path}: {len(faults)} fault(s)")
     files = sorted({fault.file for fault in faults if fault.file})
-    parts = [part for entry in entries for part in entry["parts"]]
-    if not all("recipe" in part for part in parts):
-        print("To repair it, import its maps again.")
+    is_generated = all("recipe" in part for entry in entries for part in entry["parts"])
+    if not is_generated:
+        remedy = "import its maps again."
     elif files:
-        print(
-            f"To repair it, remove {' '.join(files)} in {path} and run the command "
-            "that made it again."
-        )
+        names = " ".join(files)
+        remedy = f"remove {names} in {path} and repeat the command that made it."
     else:
-        print(
-            "To repair it, make the file again with --overwrite. The same recipe and "
-            "version give the same digests."
+        remedy = (
+            "make the file again with --overwrite. The same recipe and version give "
+            "the same digests."
         )
+    print(f"To repair it, {remedy}")
     return 1
 
 
@@ -197,26 +200,28 @@ def merge(files: list[str], out: str, id: str = "", overwrite: bool = False) -> 
     Args:
         files: Paths or ids of two or more datasets, or folders with the shards of one.
         out: File .h5 to write, or a folder for many files.
-        id: Id of the new dataset. If empty, the name of the file; shards keep the id of
-            their recipe.
+        id: Id of the new dataset. If empty, the name of the file, or for shards, the id
+            of their recipe.
         overwrite: Replace an existing dataset.
     """
     from benchnav.datagen.files.describe import written
     from benchnav.datagen.files.merge import merge as merge_datasets
 
     path = Path(out)
-    sources = [
-        Path(file) if Path(file).is_dir() else datagen.find_dataset(file)
-        for file in files
-    ]
-    show_progress(merge_datasets(sources, path, id, overwrite), "maps")
+    sources = []
+    for file in files:
+        is_folder = Path(file).is_dir()
+        source = Path(file) if is_folder else datagen.find_dataset(file)
+        sources.append(source)
+    steps = merge_datasets(sources, path, id, overwrite)
+    show_progress(steps, "maps")
     written(path)
 
 
 def ground(file: str, out: str = "", overwrite: bool = False) -> None:
     """Write terrain statistics over all maps of the split train.
 
-    Beliefs need them for unobserved cells, and for look-alike classes.
+    Beliefs need them for unobserved cells and for look-alike classes.
 
     Args:
         file: Path or id of a dataset with a split train.
@@ -229,8 +234,9 @@ def ground(file: str, out: str = "", overwrite: bool = False) -> None:
     dataset = _opened(file)
     path = Path(out) if out else ground_file(dataset.path)
     expect(path.suffix == ".json", f"`out` as a file .json, got {out!r}.")
+    may_write = overwrite or not path.exists()
     expect(
-        overwrite or not path.exists(),
+        may_write,
         f"`out` as a new file, got {path}, which exists. Pass --overwrite to replace "
         "it.",
     )
@@ -241,10 +247,9 @@ def ground(file: str, out: str = "", overwrite: bool = False) -> None:
     if pairs:
         strength = f"{statistics.potts_strength:.2f}"
         look_alikes = f"; {pairs} look alike, strength of the field {strength}"
-    print(
-        f"wrote {path}: λ of {dataset.map_count('train')} maps by "
-        f"{len(statistics.weights)} Gaussians{look_alikes}"
-    )
+    n_maps = dataset.map_count("train")
+    n_gaussians = len(statistics.weights)
+    print(f"wrote {path}: λ of {n_maps} maps by {n_gaussians} Gaussians{look_alikes}")
 
 
 def export(
@@ -266,13 +271,13 @@ def export(
         out: Folder to write.
         splits: Only these splits, for example [test/std,test/hg].
         fields: Only these fields, for example [rgb,class_id].
-        maps_per_file: Maximum number of maps of a file; 0 limits files to a few hundred
-            MB.
+        maps_per_file: Maximum number of maps of a file; if 0, files have up to a few
+            hundred MB.
         license: Name in the SPDX list, such as CC-BY-4.0, or a URL. If empty, MIT for
             maps of a shipped recipe.
         creator: Creator of the maps. If empty, the BenchNav authors for maps of a
             shipped recipe.
-        url: Future address of the dataset.
+        url: Address at which the dataset will be published.
         date: Date of publication, YYYY-MM-DD. If empty, today.
         overwrite: Replace an existing exported dataset.
     """
@@ -283,8 +288,9 @@ def export(
 
     dataset = _opened(file)
     chosen = choose("splits", splits, dataset.splits)
+    has_origin = bool(license and creator) or is_ours(dataset, chosen)
     expect(
-        (license and creator) or is_ours(dataset, chosen),
+        has_origin,
         f"`license` and `creator` of {dataset.id}, whose maps are not of a shipped "
         "recipe, got none. Pass yours; for imported maps, those of the elevation "
         "model, its classes and photo.",
@@ -298,10 +304,11 @@ def export(
     )
     show_progress(steps, "maps")
     files = sorted(path.rglob("*.parquet"))
-    size = sum(item.stat().st_size for item in files)
+    n_bytes = sum(file.stat().st_size for file in files)
+    noun = "file" if len(files) == 1 else "files"
     print(
-        f"wrote {path} ({decimal(size)} in {len(files)} Parquet "
-        f"file{'s' * (len(files) > 1)}, with croissant.json)"
+        f"wrote {path} ({decimal(n_bytes)} in {len(files)} Parquet {noun}, with "
+        "croissant.json)"
     )
 
 
@@ -316,7 +323,7 @@ def preview(
 
     Args:
         file: Path or id of a dataset.
-        split: Split to draw. If empty, test/std, or else the first.
+        split: Split to draw. If empty, test/std, or the first if there is no test/std.
         maps: Indices of the maps. If not given, [0, 1, 2].
         out: Image file to write. If empty, preview-SPLIT.png or contact-SPLIT.png.
         contact_sheet: Draw thumbnails of up to 100 maps of the split instead.
@@ -325,10 +332,12 @@ def preview(
     from benchnav.viz.style import save
 
     dataset = _opened(file)
-    default = "test/std" if "test/std" in dataset.splits else next(iter(dataset.splits))
-    split = split or default
+    if not split:
+        names = list(dataset.splits)
+        split = "test/std" if "test/std" in names else names[0]
     kind = "contact" if contact_sheet else "preview"
-    path = Path(out or f"{kind}-{split.replace('/', '-')}.png")
+    file_name = f"{kind}-{split.replace('/', '-')}.png"
+    path = Path(out or file_name)
     expect(
         path.suffix in (".png", ".pdf", ".svg", ".jpg"),
         f"`out` to end in .png, .pdf, .svg or .jpg, got {str(path)!r}.",
@@ -339,7 +348,8 @@ def preview(
         figure = contact_sheet_figure(dataset, split)
     else:
         if maps is None:
-            maps = list(range(min(3, dataset.map_count(split))))
+            n_maps = min(3, dataset.map_count(split))
+            maps = list(range(n_maps))
         figure = preview_figure(dataset, split, sorted(set(maps)))
     with replacing(path) as partial:
         save(figure, partial, path.suffix[1:])

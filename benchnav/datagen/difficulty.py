@@ -46,7 +46,8 @@ def of_split(dataset: TerrainDataset, split: str) -> Maps:
         *dataset.truth_names,
     )
     chunks = dataset.chunks(split, fields)
-    return join_maps([measure(maps, dataset.recipe) for _, maps in chunks])
+    measured = [measure(maps, dataset.recipe) for _, maps in chunks]
+    return join_maps(measured)
 
 
 def measure(maps: Maps, recipe: Recipe) -> Maps:
@@ -67,20 +68,25 @@ def measure(maps: Maps, recipe: Recipe) -> Maps:
             reference_times_s: grid reference time, non-finite if it is missing.
     """
     truth = latent.stored_truth(maps, recipe.classes)
-    stuck = latent.expected_of(truth) <= recipe.stuck_threshold  # False at NaN
-    soft_weight = truth[0][:, 1:].sum(axis=1)
+    expected = latent.expected_of(truth)
+    stuck = expected <= recipe.stuck_threshold  # False at NaN
+    weights = truth[0]
+    soft_weight = weights[:, 1:].sum(axis=1)
     labelled = maps["class_id"] != UNLABELLED
+    n_labelled = labelled.sum(axis=(1, 2))
+    divisor = np.maximum(1, n_labelled)
     on_line = crossed_cells(recipe.grid, maps["start_m"], maps["goal_m"])
-    counts = np.maximum(1, labelled.sum(axis=(1, 2)))
+    blocked = stuck & on_line
 
     def mean(values: ndarray) -> ndarray:
-        return (values * labelled).sum(axis=(1, 2)) / counts
+        total = (values * labelled).sum(axis=(1, 2))
+        return total / divisor
 
     return {
         "stuck": mean(stuck),
         "soft_ground": mean(soft_weight > 0),
         "soft_spots": mean(soft_weight),
-        "straight": ~(stuck & on_line).any(axis=(1, 2)),
+        "straight": ~blocked.any(axis=(1, 2)),
         "reference_times_s": maps["reference_time_s"].astype(np.float64),
     }
 
@@ -88,31 +94,38 @@ def measure(maps: Maps, recipe: Recipe) -> Maps:
 def crossed_cells(grid: Grid, start_m: ndarray, goal_m: ndarray) -> ndarray:
     """Return a mask of the cells that straight lines cross.
 
-    A line along a border between cells lies in the cells beyond it, as positions do. A
-    corner that a line only touches is not crossed.
+    A line along a border between two cells belongs to the cell with the larger index,
+    as a position on the border does. A cell is not crossed if a line only touches its
+    corner.
 
     Args:
         grid: size and resolution of the maps.
-        start_m: (x, y) in metres, shape [B, 2].
-        goal_m: (x, y) in metres, shape [B, 2].
+        start_m: one end (x, y) of each line in metres, shape [B, 2].
+        goal_m: the other end in metres, shape [B, 2].
 
     Returns:
         bool, shape [B, H, W].
     """
     start = start_m.astype(np.float64) / grid.resolution_m
-    along = goal_m.astype(np.float64) / grid.resolution_m - start
-    # Cuts with the borders of rows and columns, as fractions of the line's length; a
-    # line along a border lies beyond it.
+    goal = goal_m.astype(np.float64) / grid.resolution_m
+    along = goal - start
+    # Cuts with the borders of rows and columns, as fractions of the line's length. A
+    # line along a border counts as beyond it: 0/0 becomes −∞.
+    borders = np.arange(max(grid.shape) + 1)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        cuts = (np.arange(max(grid.shape) + 1) - start[..., None]) / along[..., None]
+        cuts = (borders - start[..., None]) / along[..., None]
     cuts = np.nan_to_num(cuts, nan=-np.inf)
-    first = np.minimum(cuts[..., 1:], cuts[..., :-1]).clip(0, 1)
-    last = np.maximum(cuts[..., 1:], cuts[..., :-1]).clip(0, 1)
+    lower = cuts[..., :-1]
+    upper = cuts[..., 1:]
+    first = np.minimum(upper, lower).clip(0, 1)
+    last = np.maximum(upper, lower).clip(0, 1)
     x_in, y_in = np.moveaxis(first, 1, 0)
     x_out, y_out = np.moveaxis(last, 1, 0)
-    enter = np.maximum(x_in[:, None, : grid.width], y_in[:, : grid.height, None])
-    leave = np.minimum(x_out[:, None, : grid.width], y_out[:, : grid.height, None])
-    # Cuts of both kinds at a corner may differ in their last bits.
+    columns = np.s_[:, None, : grid.width]
+    rows = np.s_[:, : grid.height, None]
+    enter = np.maximum(x_in[columns], y_in[rows])
+    leave = np.minimum(x_out[columns], y_out[rows])
+    # At a corner, the cuts with its row and its column may differ in their last bits.
     return leave - enter > 1e-12
 
 
@@ -122,13 +135,14 @@ def table(dataset: TerrainDataset) -> Table:
     rows = []
     for split in dataset.splits:
         measured = of_split(dataset, split)
-        percent = (
-            f"{100 * measured[name].mean():.1f}"
-            for name in ("stuck", "soft_ground", "soft_spots")
-        )
+        percent = []
+        for name in ("stuck", "soft_ground", "soft_spots"):
+            mean = measured[name].mean()
+            percent.append(f"{100 * mean:.1f}")
         times = measured["reference_times_s"]
         times = times[np.isfinite(times)]
-        median = time_range = NOTHING
+        median = NOTHING
+        time_range = NOTHING
         if len(times):
             median = f"{np.median(times):.1f}"
             time_range = f"{times.min():.1f}–{times.max():.1f}"
@@ -136,7 +150,7 @@ def table(dataset: TerrainDataset) -> Table:
         straight_free = f"{straight.sum()}/{len(straight)}"
         rows.append((split, *percent, median, time_range, straight_free))
     return Table(
-        title=f"how hard the maps are (λ_stuck {stuck:g})",
+        title=f"difficulty of the maps (λ_stuck {stuck:g})",
         headings=_HEADINGS,
         numbers=True,
         rows=tuple(rows),

@@ -1,8 +1,9 @@
 """Terrain statistics over all training maps: fitting, and lookup.
 
-They describe unobserved cells by one mixture of λ over all environments, and the mean
-of each layer. They also contain the coupling of neighbouring cells of look-alike
-classes. Letters in shapes: B maps, H×W cells, N bins, K components, P pairs of classes.
+The statistics describe unobserved cells by one mixture of λ over all environments, and
+by the mean of each layer. They also contain the coupling of neighbouring cells of
+look-alike classes. Letters in shapes: B maps, H×W cells, N bins, K components, P pairs
+of classes.
 
 Sources: Dempster et al. (1977), "Maximum likelihood from incomplete data via the EM
 algorithm"; Besag (1975), "Statistical analysis of non-lattice data"
@@ -22,7 +23,8 @@ from benchnav.core.grid import is_azimuth
 from benchnav.core.ground import GroundStatistics
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.classes import look_alike_classes
-from benchnav.datagen.recipe.recipe import Recipe, load_recipe
+from benchnav.datagen.recipe.load import load_recipe
+from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.datagen.recipe.scenario import RECIPES
 from benchnav.datagen.schema import Maps
 
@@ -38,8 +40,8 @@ _MIN_STD = 2 / _BINS
 # which are clipped completely.
 _ATOMS = ((-1.0, 0.1), (2.0, 0.1))
 _DIGITS = 6
-# Settings of recipes that determine the terrain. The scenario of `train` is std in all
-# shipped recipes.
+# Settings of recipes that determine the terrain. Scenarios are not among them, since
+# that of `train` is std in all shipped recipes.
 _TERRAIN_SETTINGS = (
     "synthesis",
     "classes",
@@ -50,7 +52,8 @@ _TERRAIN_SETTINGS = (
     "correlation_m",
     "layers",
 )
-# Prior of h and β: both are finite even if classes are never neighbours.
+# Standard deviation of the Gaussian prior of h and β. The prior keeps both finite even
+# if classes are never neighbours.
 _PRIOR_STD = 10.0
 
 
@@ -64,12 +67,14 @@ def fit_ground(dataset: TerrainDataset) -> GroundStatistics:
         DatasetError: If there is no such split, or λ of all its cells is missing.
     """
     pairs = look_alike_pairs(dataset.recipe)
-    inner, ends = np.zeros(_BINS), np.zeros(2)
+    inner = np.zeros(_BINS)
+    ends = np.zeros(2)
     neighbours = np.zeros((len(pairs), 9, 2))
     for _, maps in dataset.chunks(TRAIN, ("traversability", "class_id")):
         value = maps["traversability"]
-        inside = value[(value > 0) & (value < 1)]
-        inner += np.histogram(inside, _BINS, (0, 1))[0]
+        is_inside = (value > 0) & (value < 1)
+        counts, _ = np.histogram(value[is_inside], _BINS, (0, 1))
+        inner += counts
         ends += (value == 0).sum(), (value == 1).sum()
         for index, pair in enumerate(pairs):
             neighbours[index] += count_neighbours(maps["class_id"], pair)
@@ -78,15 +83,19 @@ def fit_ground(dataset: TerrainDataset) -> GroundStatistics:
             f"Expected cells with traversability in split {TRAIN} of {dataset.path}, "
             "got only NaN. Terrain statistics need them."
         )
-    weights, means, stds = (_rounded(values) for values in fit_mixture(inner, ends))
+    weights, means, stds = fit_mixture(inner, ends)
+    potts_strength = 0.0
+    if pairs:
+        potts_strength = round(fit_potts_strength(neighbours), _DIGITS)
     names = [item.name for item in dataset.recipe.classes]
+    look_alikes = [(names[a], names[b]) for a, b in pairs]
     return GroundStatistics(
-        weights=weights,
-        means=means,
-        stds=stds,
+        weights=_rounded(weights),
+        means=_rounded(means),
+        stds=_rounded(stds),
         layer_means=layer_means(dataset),
-        look_alikes=tuple((names[a], names[b]) for a, b in pairs),
-        potts_strength=round(fit_potts_strength(neighbours), _DIGITS) if pairs else 0.0,
+        look_alikes=tuple(look_alikes),
+        potts_strength=potts_strength,
     )
 
 
@@ -94,11 +103,14 @@ def layer_means(dataset: TerrainDataset) -> dict[str, tuple[float, ...]]:
     """Return the means of the layers of `train` over all cells that are not missing.
 
     Returns:
-        By name: three numbers for `rgb`, one for each other layer, in its unit. For
-        directions, the mean direction.
+        Means by name of the layer: three numbers for `rgb`, one for each other layer,
+        in its unit. The mean of directions is a direction.
     """
     names = (*_OBSERVED_LAYERS, *dataset.layer_names)
-    sums = {name: np.zeros(4 if name == "rgb" else 3) for name in names}
+    sums = {}
+    for name in names:
+        n_sums = 4 if name == "rgb" else 3
+        sums[name] = np.zeros(n_sums)
     for _, maps in dataset.chunks(TRAIN, names):
         for name in names:
             sums[name] += _sums_of(name, maps)
@@ -107,8 +119,9 @@ def layer_means(dataset: TerrainDataset) -> dict[str, tuple[float, ...]]:
 
 def look_alike_pairs(recipe: Recipe) -> list[tuple[int, int]]:
     """Return the pairs of classes of one colour, by their ids."""
+    units = dict.fromkeys(look_alike_classes(recipe.classes))
     pairs: list[tuple[int, int]] = []
-    for unit in dict.fromkeys(look_alike_classes(recipe.classes)):
+    for unit in units:
         pairs += combinations(unit, 2)
     return pairs
 
@@ -116,8 +129,8 @@ def look_alike_pairs(recipe: Recipe) -> list[tuple[int, int]]:
 def fit_mixture(inner: ndarray, ends: ndarray) -> tuple[ndarray, ndarray, ndarray]:
     """Fit a Gaussian mixture, clipped to [0, 1], to counts of λ by EM.
 
-    Values at 0 and 1 are clipped: they enter by the moments of the components beyond
-    each end. Two more components, far outside, explain the remaining atoms.
+    Values at 0 and 1 are clipped; the moments of the components beyond each end account
+    for them. Two more components, far outside, explain the remaining atoms.
 
     Args:
         inner: counts of bins of equal width between 0 and 1, shape [N].
@@ -127,40 +140,53 @@ def fit_mixture(inner: ndarray, ends: ndarray) -> tuple[ndarray, ndarray, ndarra
         Weights, means and standard deviations before clipping, each of shape [K + 2].
     """
     total = inner.sum() + ends.sum()
-    centre = (np.arange(len(inner)) + 0.5) / len(inner)
+    n_bins = len(inner)
+    centre = (np.arange(n_bins) + 0.5) / n_bins
     # Initial means: quantiles of the counts.
     levels = (np.arange(_COMPONENTS) + 0.5) / _COMPONENTS
     cdf = inner.cumsum() / max(inner.sum(), 1)
-    means = centre[np.searchsorted(cdf, levels).clip(max=len(inner) - 1)]
+    bins = np.searchsorted(cdf, levels).clip(max=n_bins - 1)
+    means = centre[bins]
     stds = np.full(_COMPONENTS, 0.1)
-    weights = np.full(_COMPONENTS + 2, 1 / (_COMPONENTS + 2))
+    n_weights = _COMPONENTS + 2
+    weights = np.full(n_weights, 1 / n_weights)
     atoms = weights[-2:]
+    outward = np.array([-1, 1])
     for _ in range(_STEPS):
         inner_weights = weights[:_COMPONENTS, None]
-        z = (centre - means[:, None]) / stds[:, None]
-        density = inner_weights * _density(z) / stds[:, None]
+        scale = stds[:, None]
+        z = (centre - means[:, None]) / scale
+        density = inner_weights * _density(z) / scale
         # Expected counts of each component, inside [0, 1] and beyond each end.
-        inside = inner * density / density.sum(0).clip(min=1e-300)
-        to_end = np.stack([means, 1 - means], 1) / stds[:, None]
+        total_density = density.sum(0).clip(min=1e-300)
+        inside = inner * density / total_density
+        to_end = np.stack([means, 1 - means], 1) / scale
         tail = ndtr(-to_end)
         clipped = inner_weights * tail
-        beyond = ends * clipped / (clipped.sum(0) + atoms).clip(min=1e-300)
+        total_clipped = (clipped.sum(0) + atoms).clip(min=1e-300)
+        beyond = ends * clipped / total_clipped
         atom_counts = ends - beyond.sum(0)
         # E[Z] and E[Z²] beyond an end; Z points outwards.
         first = _density(to_end) / tail.clip(min=1e-300)
         second = 1 + to_end * first
         counts = inside.sum(1) + beyond.sum(1)
         divisor = counts.clip(min=1e-300)
-        outward = np.array([-1, 1])
-        shift = ((inside * z).sum(1) + (beyond * first * outward).sum(1)) / divisor
-        square = ((inside * z**2).sum(1) + (beyond * second).sum(1)) / divisor
+        inside_shift = (inside * z).sum(1)
+        beyond_shift = (beyond * first * outward).sum(1)
+        shift = (inside_shift + beyond_shift) / divisor
+        inside_square = (inside * z**2).sum(1)
+        beyond_square = (beyond * second).sum(1)
+        square = (inside_square + beyond_square) / divisor
+        variance = (square - shift**2).clip(min=0)
         means = means + stds * shift
-        stds = stds * np.sqrt((square - shift**2).clip(min=0))
+        stds = stds * np.sqrt(variance)
         stds = stds.clip(min=_MIN_STD)
         weights = np.concatenate([counts, atom_counts]) / total
         atoms = weights[-2:]
     far_means, far_stds = np.transpose(_ATOMS)
-    return weights, np.concatenate([means, far_means]), np.concatenate([stds, far_stds])
+    means = np.concatenate([means, far_means])
+    stds = np.concatenate([stds, far_stds])
+    return weights, means, stds
 
 
 def count_neighbours(class_id: ndarray, pair: tuple[int, int]) -> ndarray:
@@ -171,49 +197,58 @@ def count_neighbours(class_id: ndarray, pair: tuple[int, int]) -> ndarray:
         pair: ids of the classes a and b.
 
     Returns:
-        Counts, int64, shape [9, 2]: by n_a − n_b + 4 over the four neighbours, and by
-        whether the cell is of class a.
+        Counts, int64, shape [9, 2]. The first index is n_a − n_b + 4, where n_a and n_b
+        are numbers of neighbours; the second is 1 if the cell is of class a.
     """
-    sign = (class_id == pair[0]).astype(np.int8) - (class_id == pair[1]).astype(np.int8)
+    a, b = pair
+    is_a = class_id == a
+    is_b = class_id == b
+    sign = is_a.astype(np.int8) - is_b.astype(np.int8)
     padded = np.pad(sign, ((0, 0), (1, 1), (1, 1)))
     vertical = padded[:, :-2, 1:-1] + padded[:, 2:, 1:-1]
     horizontal = padded[:, 1:-1, :-2] + padded[:, 1:-1, 2:]
     difference = vertical + horizontal
     in_pair = sign != 0
-    bins = 2 * (difference[in_pair] + 4) + (sign[in_pair] > 0)
-    return np.bincount(bins, minlength=18).reshape(9, 2)
+    row = difference[in_pair] + 4
+    column = sign[in_pair] > 0
+    counts = np.bincount(2 * row + column, minlength=18)
+    return counts.reshape(9, 2)
 
 
 def fit_potts_strength(neighbours: ndarray) -> float:
     """Fit β of P(cell is a | its neighbours) = σ(h + β·(n_a − n_b)).
 
-    By maximum pseudo-likelihood and Newton's method. Each pair of classes has its own
-    h, which fits the frequencies of its classes.
+    The fit maximises the pseudo-likelihood by Newton's method. Each pair of classes has
+    its own h, which fits the frequencies of its classes.
 
     Args:
         neighbours: counts of each pair from `count_neighbours`, shape [P, 9, 2].
     """
     n_pairs = len(neighbours)
-    design = np.zeros((n_pairs, 9, n_pairs + 1))
+    n_coefficients = n_pairs + 1
+    design = np.zeros((n_pairs, 9, n_coefficients))
     design[..., -1] = np.arange(-4, 5)
     for index in range(n_pairs):
         design[index, :, index] = 1
-    rows = design.reshape(-1, n_pairs + 1)
+    rows = design.reshape(-1, n_coefficients)
     count_a = neighbours[..., 1].ravel()
     count = neighbours.sum(-1).ravel()
-    coefficients = np.zeros(n_pairs + 1)
+    coefficients = np.zeros(n_coefficients)
     precision = 1 / _PRIOR_STD**2
+    prior_hessian = precision * np.eye(n_coefficients)
 
     def loss(candidate: ndarray) -> float:
         logit = rows @ candidate
-        likelihood = (count * np.logaddexp(0, logit) - count_a * logit).sum()
-        return float(likelihood + precision * candidate @ candidate / 2)
+        terms = count * np.logaddexp(0, logit) - count_a * logit
+        penalty = precision * candidate @ candidate / 2
+        return float(terms.sum() + penalty)
 
     for _ in range(100):
         probability = expit(rows @ coefficients)
-        gradient = rows.T @ (count_a - count * probability) - precision * coefficients
+        residual = count_a - count * probability
+        gradient = rows.T @ residual - precision * coefficients
         variance = count * probability * (1 - probability)
-        hessian = (rows.T * variance) @ rows + precision * np.eye(n_pairs + 1)
+        hessian = (rows.T * variance) @ rows + prior_hessian
         step = np.linalg.solve(hessian, gradient)
         current = loss(coefficients)
         while loss(coefficients + step) > current and np.abs(step).max() > 1e-12:
@@ -233,17 +268,19 @@ def ground_file(path: Path) -> Path:
 def find_ground(dataset: TerrainDataset) -> GroundStatistics | None:
     """Return terrain statistics for a dataset; None if no file fits.
 
-    The file next to the dataset is used first, then those of the shipped recipe with
-    the same terrain.
+    A file next to the dataset comes first. Without it, statistics of a shipped recipe
+    with the same terrain are used.
 
     Args:
-        dataset: dataset of any splits; it need not have `train`.
+        dataset: dataset with any splits; it need not have `train`.
     """
     path = ground_file(dataset.path)
     if path.is_file():
         return GroundStatistics.from_json(path.read_text())
-    for path in sorted((RECIPES / "ground").glob("*.json")):
-        if _has_same_terrain(load_recipe(path.stem), dataset.recipe):
+    shipped_paths = sorted((RECIPES / "ground").glob("*.json"))
+    for path in shipped_paths:
+        shipped = load_recipe(path.stem)
+        if _has_same_terrain(shipped, dataset.recipe):
             return GroundStatistics.from_json(path.read_text())
     return None
 
@@ -257,11 +294,16 @@ def _sums_of(name: str, maps: Maps) -> ndarray:
     """Return sums of a layer's channels over its finite cells, and their number."""
     values = maps[name]
     if name == "rgb":
-        return np.array([*values.sum((0, 2, 3), dtype=np.float64), values[:, 0].size])
-    values = values[np.isfinite(values)].astype(np.float64)
+        sums = values.sum((0, 2, 3), dtype=np.float64)
+        n_cells = values[:, 0].size
+        return np.array([*sums, n_cells])
+    is_finite = np.isfinite(values)
+    values = values[is_finite].astype(np.float64)
     if is_azimuth(name):
         angle = np.deg2rad(values)
-        return np.array([np.cos(angle).sum(), np.sin(angle).sum(), values.size])
+        x = np.cos(angle).sum()
+        y = np.sin(angle).sum()
+        return np.array([x, y, values.size])
     return np.array([values.sum(), 0, values.size])
 
 
@@ -271,7 +313,8 @@ def _mean_of(name: str, sums: ndarray) -> ndarray:
     if name == "rgb":
         return sums[:3] / count
     if is_azimuth(name):
-        return np.rad2deg(np.arctan2(sums[1:2], sums[:1])) % 360
+        mean_angle = np.arctan2(sums[1:2], sums[:1])
+        return np.rad2deg(mean_angle) % 360
     return sums[:1] / count
 
 

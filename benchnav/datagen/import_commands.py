@@ -1,6 +1,6 @@
 """Commands that import real data: `benchnav-datagen import-dem` and `import-drives`.
 
-Slow modules are imported where they are used. The command's help is fast therefore.
+Slow modules are imported where they are used, so that the command's help is fast.
 """
 
 import shlex
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from benchnav.datagen.dem.recipe_fit import GroundError
 
 _MAX_BACKWARD = 0.1  # of the rows (choice)
-_FEW_REVERSES = 0.01  # of the rows, which noise may show (choice)
-_COARSE_M = 0.2  # resolution that is too coarse for speeds of 2 s (choice)
+_FEW_REVERSES = 0.01  # of the rows; noise may cause this fraction (choice)
+_COARSE_M = 0.2  # of positions; too coarse for speeds over 2 s (choice)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,8 +32,8 @@ class ImportOptions:
         id: Id of the dataset. If empty, the name of the output.
         recipe: Id or path of a recipe with size, resolution, start, goal, class table
             and light.
-        stride: Metres from one map to the next. If not given, a map's width; maps of a
-            split overlap if it is less.
+        stride: Metres from one map to the next; below a map's width, maps of a split
+            overlap. If not given, a map's width.
         solvable: Keep only maps whose goal can be reached, and store the grid reference
             time.
         overwrite: Replace an existing dataset.
@@ -75,11 +75,13 @@ def import_dem(
         options, overrides, splits, ground, scenario, dem=dem, rasters=rasters
     )
     for split, entry in dataset.splits.items():
-        left_out = entry["parts"][0]["source"]["left_out"]
+        source = entry["parts"][0]["source"]
+        left_out = source["left_out"]
         between = left_out.pop("between_splits")
-        reasons = [
-            f"{count} {reason.replace('_', ' ')}" for reason, count in left_out.items()
-        ]
+        reasons = []
+        for reason, count in left_out.items():
+            text = reason.replace("_", " ")
+            reasons.append(f"{count} {text}")
         print(f"  left out of {split}: {', '.join(reasons)}")
         _tell_unlabelled(dataset, split)
         _tell_groups(dataset, split)
@@ -101,8 +103,7 @@ def import_drives(
     speed: Literal["", "positions", "measured"] = "",
     splits: str = "train:0.6,valid:0.2,test/site:0.2",
 ) -> None:
-    """Make a dataset of measured traversability from a robot's drives; needs the extra
-    benchnav[geo].
+    """Make a dataset of traversability measured on drives; needs benchnav[geo].
 
     Traversability of a cell is the mean of measured over commanded speed. Rasters are
     as in import-dem.
@@ -151,17 +152,19 @@ def import_drives(
     sources = {
         split: entry["parts"][0]["source"] for split, entry in dataset.splits.items()
     }
-    entry = next(iter(sources.values()))["drives"]
+    first_source = next(iter(sources.values()))
+    entry = first_source["drives"]
     print(_sum_up(entry))
     for split, source in sources.items():
         n_rows = entry["used"][split]
-        print(f"  {split}: {n_rows} rows of {_few(entry['drives'][split])}")
-        counts = source["left_out"]
-        reasons = [
-            f"{counts[reason]} maps {text}"
-            for reason, text in REASONS.items()
-            if counts.get(reason)
-        ]
+        drive_names = _few(entry["drives"][split])
+        print(f"  {split}: {n_rows} rows of {drive_names}")
+        left_out = source["left_out"]
+        reasons = []
+        for reason, text in REASONS.items():
+            count = left_out.get(reason)
+            if count:
+                reasons.append(f"{count} maps {text}")
         if reasons:
             print(f"  left out of {split}: {', '.join(reasons)}")
         if classes:
@@ -173,15 +176,11 @@ def _sum_up(entry: Mapping[str, Any]) -> str:
     """Return a summary of the used and unused rows of a log, in sentences."""
     from benchnav.datagen.dem.drive_log import REASONS
 
-    lines = [
-        f"{sum(entry['used'].values())} of {entry['rows']} rows of {entry['file']} "
-        "were used"
-    ]
-    lines += [
-        f"{count} rows are left out: they {REASONS[reason]}"
-        for reason, count in entry["left_out"].items()
-        if count
-    ]
+    n_used = sum(entry["used"].values())
+    lines = [f"{n_used} of {entry['rows']} rows of {entry['file']} were used"]
+    for reason, count in entry["left_out"].items():
+        if count:
+            lines.append(f"{count} rows are left out: they {REASONS[reason]}")
     lines.append(_say_motion(entry))
     beyond = entry["beyond"]
     if any(beyond.values()):
@@ -190,17 +189,20 @@ def _sum_up(entry: Mapping[str, Any]) -> str:
             f"{beyond['above_1']} above 1 (faster than the command); they are stored "
             "as 0 and 1"
         )
-    if over := beyond["above_1.2"]:
+    n_fast = beyond["above_1.2"]
+    if n_fast:
         lines.append(
-            f"{over} rows exceed 1.2 times the command: if steady driving on flat, "
+            f"{n_fast} rows exceed 1.2 times the command: if steady driving on flat, "
             "firm terrain does, scale `commanded_m_s`"
         )
-    if entry["standing"]:
+    n_standing = entry["standing"]
+    if n_standing:
         lines.append(
-            f"{entry['standing']} rows have a position that stays the same under "
-            "command, and no measured speed; the robot counts as immobilised there"
+            f"{n_standing} rows have a position that stays the same under command, and "
+            "no measured speed; the robot counts as immobilised there"
         )
-    return "\n  ".join([*lines, *_doubts(entry)])
+    lines += _doubts(entry)
+    return "\n  ".join(lines)
 
 
 def _doubts(entry: Mapping[str, Any]) -> list[str]:
@@ -212,7 +214,9 @@ def _doubts(entry: Mapping[str, Any]) -> list[str]:
     below = entry["beyond"]["below_0"]
     period_s = entry["period_s"] or 0
     n_used = sum(entry["used"].values())
-    if by_positions and below > _MAX_BACKWARD * n_used:
+    slides_often = below > _MAX_BACKWARD * n_used
+    reverses_often = entry["reverses"] > _FEW_REVERSES * n_used
+    if by_positions and slides_often:
         doubts.append(
             f"more than {_MAX_BACKWARD:.0%} of rows slide back by their positions, "
             "which looks wrong: a robot that turned in place under its command looks "
@@ -223,15 +227,16 @@ def _doubts(entry: Mapping[str, Any]) -> list[str]:
             f"positions come every {period_s:g} s, too seldom to distinguish sliding "
             "back from turning, so that rows that slide back have λ above 0"
         )
-    if not by_positions and entry["reverses"] > _FEW_REVERSES * n_used:
+    if not by_positions and reverses_often:
         doubts.append(
             f"positions reverse in {entry['reverses']} rows, measured_m_s never does: "
             "where the robot did not turn round, it slid back, and speed must be "
             "negative"
         )
-    if entry["resolution_m"] > _COARSE_M:
+    resolution_m = entry["resolution_m"]
+    if resolution_m > _COARSE_M:
         doubts.append(
-            f"positions are multiples of {entry['resolution_m']:g} m: log more decimals"
+            f"positions are multiples of {resolution_m:g} m: log more decimals"
         )
     return doubts
 
@@ -239,23 +244,25 @@ def _doubts(entry: Mapping[str, Any]) -> list[str]:
 def _say_motion(entry: Mapping[str, Any]) -> str:
     """Return a comparison of positions with both speeds, in a sentence."""
     columns = {"pace": "measured_m_s", "commanded_pace": "commanded_m_s"}
-    ratios = (
-        f"{entry[name]:g} times as far as {column} says"
-        for name, column in columns.items()
-        if entry[name] is not None
-    )
+    ratios = []
+    for name, column in columns.items():
+        ratio = entry[name]
+        if ratio is not None:
+            ratios.append(f"{ratio:g} times as far as {column} says")
     compared = " and ".join(ratios) or "too little to be compared with speeds"
-    source = {
+    sources = {
         "": "",
         "positions": "; speeds are those of positions",
         "measured": "; speeds are as logged",
     }
-    return f"positions move {compared}{source[entry['speed']]}"
+    source = sources[entry["speed"]]
+    return f"positions move {compared}{source}"
 
 
 def _few(names: Sequence[str]) -> str:
     shown = [*names[:5], "…"] if len(names) > 5 else names
-    return f"{len(names)} drive{'s' * (len(names) > 1)} ({', '.join(shown)})"
+    noun = "drive" if len(names) == 1 else "drives"
+    return f"{len(names)} {noun} ({', '.join(shown)})"
 
 
 def _import(
@@ -309,9 +316,11 @@ def _with_command(error: "GroundError", overrides: Sequence[str]) -> ConfigError
     """Return an error with the user's command, changed to settings that fit."""
     if not error.settings and error.stride_m is None:
         return ConfigError(f"{error.problem} Or take a larger raster.")
-    unchanged = [
-        text for text in overrides if text.partition("=")[0] not in error.changes
-    ]
+    unchanged = []
+    for text in overrides:
+        key, _, _ = text.partition("=")
+        if key not in error.changes:
+            unchanged.append(text)
     words = []
     remaining = [word for word in sys.argv[1:] if word not in overrides]
     while remaining:
@@ -320,9 +329,10 @@ def _with_command(error: "GroundError", overrides: Sequence[str]) -> ConfigError
             remaining.pop(0)
         elif not word.startswith("--stride="):
             words.append(word)
-    stride = [] if error.stride_m is None else ["--stride", f"{error.stride_m:.10g}"]
     program = Path(sys.argv[0]).name
-    command = [program, *words, *unchanged, *error.settings, *stride]
+    command = [program, *words, *unchanged, *error.settings]
+    if error.stride_m is not None:
+        command += ["--stride", f"{error.stride_m:.10g}"]
     return ConfigError(error.advise(shlex.join(command)))
 
 
@@ -333,10 +343,11 @@ def _tell_unlabelled(dataset: "datagen.TerrainDataset", split: str) -> None:
     for part in dataset.splits[split]["parts"]:
         counts += part["source"]["unlabelled"]
     if any(counts):
-        n_maps = sum(count > 0 for count in counts)
+        n_unlabelled = sum(counts)
         n_cells = len(counts) * grid.height * grid.width
+        n_maps = sum(count > 0 for count in counts)
         print(
-            f"  unlabelled in {split}: {sum(counts)} of {n_cells} cells, on {n_maps} "
+            f"  unlabelled in {split}: {n_unlabelled} of {n_cells} cells, on {n_maps} "
             f"of {len(counts)} maps"
         )
 
@@ -344,9 +355,10 @@ def _tell_unlabelled(dataset: "datagen.TerrainDataset", split: str) -> None:
 def _tell_groups(dataset: "datagen.TerrainDataset", split: str) -> None:
     """Print the number of statistical units of a split if its maps overlap."""
     if "group" in dataset.fields:
-        groups = len(set(dataset.read(split, fields=["group"])["group"].tolist()))
+        groups = dataset.read(split, fields=["group"])["group"]
+        n_groups = len(set(groups.tolist()))
         print(
-            f"  {dataset.map_count(split)} maps of {split} overlap and form {groups} "
+            f"  {dataset.map_count(split)} maps of {split} overlap and form {n_groups} "
             "group(s), the statistical unit. Leave --stride out of test splits, so "
             "that their maps do not overlap"
         )

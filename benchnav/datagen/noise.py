@@ -21,14 +21,14 @@ def fractal_perlin(
     shape: tuple[int, int],
     periods: Sequence[float],
 ) -> ndarray:
-    """Return the sum of octaves of Perlin noise, each weighted by its period.
+    """Return the mean of octaves of Perlin noise, each weighted by its period.
 
-    Large shapes therefore dominate.
+    Coarse octaves therefore dominate.
 
     Args:
         seed: root of the random streams, one per octave.
         names: names of the streams.
-        indices: elements of each stream, one per map, shape [B].
+        indices: index of each map, one element of every stream, shape [B].
         shape: (H, W).
         periods: lattice spacing of each octave in cells.
 
@@ -41,21 +41,24 @@ def fractal_perlin(
         n_rows = int(np.ceil(height / period)) + 2
         n_columns = int(np.ceil(width / period)) + 2
         key = rng.stream_key(seed, *names, octave)
-        draws = rng.uniform(key, indices, (n_rows * n_columns + 2,))
-        angle = 2 * np.pi * draws[:, 2:].reshape(-1, n_rows, n_columns)
+        n_draws = n_rows * n_columns + 2
+        draws = rng.uniform(key, indices, (n_draws,))
+        lattice = draws[:, 2:].reshape(-1, n_rows, n_columns)
+        angle = 2 * np.pi * lattice
         # Random phases, so that the lattice has another position in each map.
-        rows = (np.arange(height) + 0.5) / period + draws[:, 0, None]
-        columns = (np.arange(width) + 0.5) / period + draws[:, 1, None]
+        phase_y = draws[:, 0, None]
+        phase_x = draws[:, 1, None]
+        rows = (np.arange(height) + 0.5) / period + phase_y
+        columns = (np.arange(width) + 0.5) / period + phase_x
         # Σ over a cell's four corners of fade_y·fade_x·(g_y·Δy + g_x·Δx) is separable:
         # the lattice's gradients are multiplied by weight matrices of rows and columns.
         weight_y, offset_y = _corner_weights(rows, n_rows)
-        weight_x, offset_x = (
-            np.swapaxes(w, 1, 2) for w in _corner_weights(columns, n_columns)
-        )
-        noise_y = offset_y @ (np.sin(angle) @ weight_x)
-        noise_x = weight_y @ (np.cos(angle) @ offset_x)
+        weight_x, offset_x = _corner_weights(columns, n_columns)
+        noise_y = offset_y @ (np.sin(angle) @ weight_x.swapaxes(1, 2))
+        noise_x = weight_y @ (np.cos(angle) @ offset_x.swapaxes(1, 2))
         octaves.append(period * (noise_y + noise_x))
-    return sum(octaves[1:], octaves[0]) / sum(periods)
+    total = sum(octaves[1:], octaves[0])
+    return total / sum(periods)
 
 
 def _corner_weights(position: ndarray, lattice: int) -> tuple[ndarray, ndarray]:

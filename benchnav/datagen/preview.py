@@ -1,8 +1,8 @@
 """Figures of maps: a sheet with a row for each map, and a contact sheet of a split.
 
-Lengths are in inches from the upper left corner; text is in points, as printed over the
-two columns of a page. A class has the same colour in all maps and figures, that of the
-class table; among look-alike classes, all except the first are lighter or darker. If
+Lengths are in inches from the upper left corner. Text is in points, for a figure that
+spans two columns of a page. A class has the same colour in all maps and figures: that
+of the class table, lighter or darker for all look-alike classes except the first. If
 classes have soft spots, terrain that may hide them is hatched and outlined.
 """
 
@@ -65,51 +65,55 @@ def preview_figure(
     """
     layers = dataset.layer_names
     maps = dataset.read(split, indices, (*FIELDS, *layers, "start_m", "goal_m"))
-    maps["rgb"] = np.moveaxis(maps["rgb"], 1, -1)
+    classes = dataset.recipe.classes
+    grid = dataset.grid
+    resolution_m = grid.resolution_m
+    unlabelled = maps["class_id"] == UNLABELLED
+    shown = np.unique(maps["class_id"][~unlabelled])
+    colours = class_colours(classes)
+    class_id = np.ma.masked_array(maps["class_id"], unlabelled)
+    soft = soft_ground(class_id, classes)
+    slope_deg = maps["slope_deg"]
+    traversability = maps["traversability"]
     # Heights above each map's lowest point are comparable between maps; heights above a
     # datum often are not.
-    maps["elevation_m"] -= maps["elevation_m"].min((1, 2), keepdims=True)
-    classes, grid = dataset.recipe.classes, dataset.grid
-    unlabelled = maps["class_id"] == UNLABELLED
-    shown, colours = np.unique(maps["class_id"][~unlabelled]), class_colours(classes)
-    maps["class_id"] = np.ma.masked_array(maps["class_id"], unlabelled)
-    soft = soft_ground(maps["class_id"], classes)
-    relief_m = float(maps["elevation_m"].max()) or 1.0
-    levels = np.array(MaxNLocator(9, steps=[1, 2, 2.5, 5, 10]).tick_values(0, relief_m))
+    elevation_m = maps["elevation_m"]
+    elevation_m -= elevation_m.min((1, 2), keepdims=True)
+    relief_m = float(elevation_m.max()) or 1.0
+    locator = MaxNLocator(9, steps=[1, 2, 2.5, 5, 10])
+    levels = np.array(locator.tick_values(0, relief_m))
     levels = levels[levels <= relief_m]
     relief = {"cmap": "cividis", "vmin": 0, "vmax": relief_m}
     slopes = {"cmap": "magma_r", "vmin": 0, "vmax": STEEP_DEG}
     contours = f"above the lowest point,\ncontours every {levels[1]:g} m"
     columns = [
-        SheetColumn("rgb", "RGB", maps["rgb"]),
-        SheetColumn("class_id", "Class", maps["class_id"], class_scale(colours)),
+        SheetColumn("rgb", "RGB", np.moveaxis(maps["rgb"], 1, -1)),
+        SheetColumn("class_id", "Class", class_id, class_scale(colours)),
+        SheetColumn("elevation_m", "Elevation [m]", elevation_m, relief, contours),
+        SheetColumn("slope_deg", "Slope [°]", slope_deg, slopes, "", "max"),
         SheetColumn(
-            "elevation_m", "Elevation [m]", maps["elevation_m"], relief, contours
+            "traversability", "Traversability λ", traversability, FRACTIONS, ""
         ),
-        SheetColumn("slope_deg", "Slope [°]", maps["slope_deg"], slopes, "", "max"),
-        SheetColumn(
-            "traversability", "Traversability λ", maps["traversability"], FRACTIONS, ""
-        ),
-        *(layer_column(name, maps[name], dataset.fields[name].unit) for name in layers),
     ]
-    names = [f"{number} {classes[number].name.replace('_', ' ')}" for number in shown]
+    for name in layers:
+        unit = dataset.fields[name].unit
+        columns.append(layer_column(name, maps[name], unit))
+    names = []
+    for number in shown:
+        name = classes[number].name.replace("_", " ")
+        names.append(f"{number} {name}")
     marks: list[Artist] = [
         mark_handle(name, scale=_MARK_SIZE) for name in ("start", "goal")
     ]
-    if unlabelled.any() or any(
-        np.isnan(maps[name]).any() for name in ("traversability", *layers)
-    ):
+    is_incomplete = unlabelled.any()
+    for name in ("traversability", *layers):
+        is_incomplete |= np.isnan(maps[name]).any()
+    if is_incomplete:
         marks.append(missing_handle())
     if soft.any():
-        marks.append(
-            Patch(
-                facecolor="white",
-                ec="black",
-                lw=0.5,
-                hatch=_HATCH,
-                label="may hide soft spots",
-            )
-        )
+        label = "may hide soft spots"
+        patch = Patch(facecolor="white", ec="black", lw=0.5, hatch=_HATCH, label=label)
+        marks.append(patch)
     figure = sheet_of_maps(
         columns,
         [f"map {index}" for index in indices],
@@ -119,47 +123,27 @@ def preview_figure(
         marks,
     )
     panels = {str(panel.get_label()): panel for panel in figure.axes}
-    resolution_m = grid.resolution_m
-    veils = _hillshade(maps["elevation_m"], maps["slope_deg"], resolution_m)
+    veils = _hillshade(elevation_m, slope_deg, resolution_m)
+    lines = {"colors": "black", "linewidths": 0.35, "alpha": 0.7}
     y, x = ((np.arange(cells) + 0.5) * resolution_m for cells in grid.shape)
     for row in range(len(indices)):
-        show_map(panels[f"elevation_m {row}"], veils[row], grid.extent_m)
-        heights = maps["elevation_m"][row]
-        crossed = levels[(levels > heights.min()) & (levels < heights.max())]
-        if len(crossed):
-            panels[f"elevation_m {row}"].contour(
-                x,
-                y,
-                heights,
-                levels=crossed,
-                colors="black",
-                linewidths=0.35,
-                alpha=0.7,
-            )
+        panel = panels[f"elevation_m {row}"]
+        show_map(panel, veils[row], grid.extent_m)
+        heights = elevation_m[row]
+        is_crossed = (levels > heights.min()) & (levels < heights.max())
+        if is_crossed.any():
+            panel.contour(x, y, heights, levels=levels[is_crossed], **lines)
         if soft[row].any():
-            draw_lines(
-                panels[f"class_id {row}"],
-                hatching(soft[row], resolution_m),
-                "black",
-                0.4,
-            )
+            hatch = hatching(soft[row], resolution_m)
+            draw_lines(panels[f"class_id {row}"], hatch, "black", 0.4)
+            edges = outline(soft[row], resolution_m)
             for name in ("class_id", "traversability"):
-                draw_lines(
-                    panels[f"{name} {row}"],
-                    outline(soft[row], resolution_m),
-                    "black",
-                    0.4,
-                    "white",
-                )
+                draw_lines(panels[f"{name} {row}"], edges, "black", 0.4, "white")
         for column in columns:
+            panel = panels[f"{column.name} {row}"]
             for name in ("start", "goal"):
-                mark(
-                    panels[f"{column.name} {row}"],
-                    name,
-                    maps[f"{name}_m"][row],
-                    _MARK_SIZE,
-                    clip_on=False,
-                )
+                position_m = maps[f"{name}_m"][row]
+                mark(panel, name, position_m, _MARK_SIZE, clip_on=False)
     panels["elevation_m bar"].vlines(levels, 0, 1, color="black", lw=0.35, alpha=0.7)
     return figure
 
@@ -183,62 +167,59 @@ def contact_sheet_figure(dataset: TerrainDataset, split: str) -> Figure:
     n_maps = dataset.map_count(split)
     grid = dataset.grid
     classes = dataset.recipe.classes
-    fields = (
-        ("rgb", "class_id", "traversability")
-        if any(item.soft for item in classes)
-        else ("rgb",)
-    )
-    across = grid.width * (2 if len(fields) > 1 else 1)
+    has_soft_spots = any(item.soft for item in classes)
+    fields = ["rgb"]
+    cells_across = grid.width
+    if has_soft_spots:
+        fields += ["class_id", "traversability"]
+        cells_across = 2 * grid.width
     count = min(n_maps, _MAX_THUMBNAILS)
-    ratio = grid.height / across
+    ratio = grid.height / cells_across
     gap = 0.05
     columns = contact_columns(count, ratio)
-    wide = min(max((TWO_COLUMNS_IN - gap) / columns, 0.5 / min(1, ratio)), 2.4) - gap
-    high, width = wide * ratio, columns * (wide + gap) + gap
+    rows = -(-count // columns)
+    min_pitch = 0.5 / min(1, ratio)
+    pitch_x = min(max((TWO_COLUMNS_IN - gap) / columns, min_pitch), 2.4)
+    image_width = pitch_x - gap
+    image_height = image_width * ratio
+    width = columns * (image_width + gap) + gap
     number = f"{n_maps} maps" if count == n_maps else f"first {count} of {n_maps} maps"
-    title = (
-        f"{dataset.id}, split {split} (scenario "
-        f"{dataset.splits[split]['scenario']}): {number}"
-    )
+    scenario = dataset.splits[split]["scenario"]
+    title = f"{dataset.id}, split {split} (scenario {scenario}): {number}"
     lines = textwrap.wrap(title, int(width / LETTER / 1.25))
     top = 0.1 + LINE * len(lines)
-    height = top + -(-count // columns) * (high + gap)
-    # With an integer number of dots per cell, all cells have one size. It is not used
-    # if it requires too many dots.
-    dots = max(1, round(_DPI * wide / across)) * across / wide
-    figure = Figure(figsize=(width, height), dpi=dots if dots <= 2 * _DPI else _DPI)
-    figure.text(
-        gap / width,
-        1 - 0.05 / height,
-        "\n".join(lines),
-        size=TITLE,
-        va="top",
-        parse_math=False,
-    )
+    height = top + rows * (image_height + gap)
+    # With an integer number of dots per cell, all cells have one size. That number is
+    # not used if it requires too many dots.
+    dots_per_cell = max(1, round(_DPI * image_width / cells_across))
+    dpi = dots_per_cell * cells_across / image_width
+    if dpi > 2 * _DPI:
+        dpi = _DPI
+    figure = Figure(figsize=(width, height), dpi=dpi)
+    title_x = gap / width
+    title_y = 1 - 0.05 / height
+    text = "\n".join(lines)
+    figure.text(title_x, title_y, text, size=TITLE, va="top", parse_math=False)
     sheet = figure.add_axes((0, 0, 1, 1))
     sheet.set(xlim=(0, width), ylim=(height, 0), autoscale_on=False)
     sheet.axis("off")
     for index in range(count):
-        stored = {
-            name: values[0]
-            for name, values in dataset.read(split, [index], fields).items()
-        }
-        x, y = (
-            gap + index % columns * (wide + gap),
-            top + index // columns * (high + gap),
-        )
-        image = np.moveaxis(stored["rgb"], 0, -1)
-        if "class_id" in stored:
-            values = np.ma.masked_invalid(stored["traversability"])
-            image = np.concatenate(
-                [image, FRACTIONS["cmap"](values, bytes=True)[..., :3]], axis=1
-            )
-            edges = outline(
-                soft_ground(stored["class_id"], classes), high / grid.height
-            )
+        maps = dataset.read(split, [index], fields)
+        row, column = divmod(index, columns)
+        x = gap + column * (image_width + gap)
+        y = top + row * (image_height + gap)
+        right = x + image_width
+        lower = y + image_height
+        image = np.moveaxis(maps["rgb"][0], 0, -1)
+        if has_soft_spots:
+            values = np.ma.masked_invalid(maps["traversability"][0])
+            coloured = FRACTIONS["cmap"](values, bytes=True)
+            image = np.concatenate([image, coloured[..., :3]], axis=1)
+            soft = soft_ground(maps["class_id"][0], classes)
+            edges = outline(soft, image_height / grid.height)
             # Inches of the page increase downward.
-            draw_lines(sheet, edges * (1, -1) + (x, y + high), "black", 0.2, "white")
-        box = (x, x + wide, y + high, y)
+            draw_lines(sheet, edges * (1, -1) + (x, lower), "black", 0.2, "white")
+        box = (x, right, lower, y)
         sheet.imshow(
             image, origin="lower", extent=box, aspect="auto", interpolation="none"
         )
@@ -258,13 +239,15 @@ def soft_ground(class_id: np.ndarray, classes: Sequence[TerrainClass]) -> np.nda
 def class_colours(classes: Sequence[TerrainClass]) -> np.ndarray:
     """Return the colours in which classes are drawn, RGB in [0, 1], shape [C, 3].
 
-    They are those of the class table, except for look-alike classes.
+    They are the colours of the class table, except for look-alike classes.
     """
     colours = np.array([item.colour for item in classes]) / 255
     for alike in set(look_alike_classes(tuple(classes))):
-        contrast = 0.0 if colours[alike[0]].mean() > 0.5 else 1.0
+        is_bright = colours[alike[0]].mean() > 0.5
+        contrast = 0.0 if is_bright else 1.0
         for rank, member in enumerate(alike):
-            colours[member] += (contrast - colours[member]) * 0.7 * rank / len(alike)
+            difference = contrast - colours[member]
+            colours[member] += difference * 0.7 * rank / len(alike)
     return colours
 
 
@@ -277,8 +260,11 @@ def contact_columns(count: int, ratio: float) -> int:
     """
     columns = np.arange(count, 0, -1)
     rows = -(-count // columns)
-    uneven = np.abs(np.log(columns / (rows * ratio))) + 2 * (rows * columns / count - 1)
-    return int(columns[np.argmin(uneven.round(6))])
+    elongation = np.abs(np.log(columns / (rows * ratio)))
+    gaps = rows * columns / count - 1
+    cost = elongation + 2 * gaps
+    best = np.argmin(cost.round(6))
+    return int(columns[best])
 
 
 def _hillshade(
@@ -286,14 +272,17 @@ def _hillshade(
 ) -> np.ndarray:
     """Return white and black overlays for a light in the north-west, [B, H, W, 4].
 
-    Level terrain has no overlay, and shows the colours of the bar. Heights are
+    Level terrain has no overlay, so it has the colours of the scale. Heights are
     exaggerated by one factor, which depends on the steepness of the maps.
     """
-    lift = np.clip(
-        0.8 / np.tan(np.radians(np.percentile(slope_deg, 95) + 1e-3)), 0.1, 30
-    )
+    steep_deg = np.percentile(slope_deg, 95) + 1e-3
+    steep = np.tan(np.radians(steep_deg))
+    exaggeration = np.clip(0.8 / steep, 0.1, 30)
     light = light_direction(np.array([0.75 * np.pi]), np.array([0.7]))
-    ground_m = pad_missing(lift * elevation_m.astype(np.float64))
-    lit = shade(*horn_gradient(ground_m, resolution_m), light, 0.0) - light[0, 2]
-    white = lit > 0
-    return np.stack([white, white, white, 0.7 * np.abs(lit)], axis=-1)
+    height_of_light = light[0, 2]
+    heights_m = pad_missing(exaggeration * elevation_m.astype(np.float64))
+    gradient = horn_gradient(heights_m, resolution_m)
+    contrast = shade(*gradient, light, 0.0) - height_of_light
+    white = contrast > 0
+    opacity = 0.7 * np.abs(contrast)
+    return np.stack([white, white, white, opacity], axis=-1)

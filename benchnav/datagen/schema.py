@@ -1,11 +1,11 @@
 """Dataset formats 1.0 to 1.4: fields, manifest and content digests.
 
-One HDF5 file is one dataset. Its groups are splits. Each contains the fields that the
-manifest lists (those of `FIELDS`, and optional ones), and the SHA-256 of each entry.
-The manifest is a JSON text in the dataset `manifest`. A folder of such files is one
-dataset too; its own manifest lists the maps of each file. Digests cover logical arrays
-instead of the file's bytes, so they do not depend on compression, machine or number of
-workers. For readers of files, see `docs/reference/format.md`.
+One HDF5 file is one dataset. Its groups are splits. Each split contains the fields that
+the manifest lists (those of `FIELDS`, and optional ones), and the SHA-256 of each
+entry. The manifest is JSON text in the HDF5 dataset `manifest`. A folder of such files
+is one dataset too; its own manifest lists the maps of each file. Digests cover logical
+arrays instead of the file's bytes, so they do not depend on compression, machine or
+number of workers. `docs/reference/format.md` describes the files for other readers.
 """
 
 import hashlib
@@ -37,11 +37,12 @@ class Field:
 
     Args:
         dtype: NumPy dtype in little-endian order.
-        shape: shape of one map's entry; "H" and "W" are rows and columns of the grid.
+        shape: shape of one map's entry; "H" and "W" are the numbers of rows and columns
+            of the grid.
         unit: SI unit, or "1".
         minimum: smallest valid value.
         maximum: largest valid value.
-        meaning: one line for readers.
+        meaning: description in one line.
     """
 
     dtype: str
@@ -57,7 +58,7 @@ class Field:
         return tuple(sizes[n] if isinstance(n, str) else n for n in self.shape)
 
 
-Fields = Mapping[str, Field]  # by name, in the order of being stored
+Fields = Mapping[str, Field]  # by name, in the order in which they are stored
 
 # Fields of every dataset. The texts are stored in manifests and never change.
 FIELDS: dict[str, Field] = {
@@ -139,26 +140,15 @@ _RESERVED = (
 
 def truth_fields(components: int) -> dict[str, Field]:
     """Return the fields of `TRUTH` for K components of the distribution of λ."""
-    mean, std = TRUTH
     shape = (components, "H", "W")
-    return {
-        mean: Field(
-            "<f4",
-            shape,
-            "1",
-            0,
-            1,
-            "mean of each component of λ before clipping, with layers",
-        ),
-        std: Field(
-            "<f4",
-            shape,
-            "1",
-            0,
-            1,
-            "standard deviation of each component of λ before clipping",
-        ),
-    }
+    meanings = (
+        "mean of each component of λ before clipping, with layers",
+        "standard deviation of each component of λ before clipping",
+    )
+    fields = {}
+    for name, meaning in zip(TRUTH, meanings, strict=True):
+        fields[name] = Field("<f4", shape, "1", 0, 1, meaning)
+    return fields
 
 
 def layer_names(fields: Fields) -> tuple[str, ...]:
@@ -166,11 +156,12 @@ def layer_names(fields: Fields) -> tuple[str, ...]:
 
     Layers are all float32 maps that are not in `FIELDS` or `OPTIONAL`. NaN is missing.
     """
-    return tuple(
-        name
-        for name, field in fields.items()
-        if name not in KNOWN and (field.dtype, field.shape) == ("<f4", ("H", "W"))
-    )
+    names = []
+    for name, field in fields.items():
+        is_map = field.dtype == "<f4" and field.shape == ("H", "W")
+        if is_map and name not in KNOWN:
+            names.append(name)
+    return tuple(names)
 
 
 def check_layer_name(what: str, name: str) -> None:
@@ -196,27 +187,32 @@ def check_layer_name(what: str, name: str) -> None:
 def quantise(values: ndarray, bits: int) -> ndarray:
     """Return values rounded to multiples of 2^−bits.
 
-    Rounding hides differences in the last bits of different machines' arithmetic.
+    Rounding removes differences between machines in the last bits of results.
     """
-    return np.rint(values * 2.0**bits) * 2.0**-bits
+    steps = np.rint(values * 2.0**bits)
+    return steps * 2.0**-bits
 
 
 def join_maps(parts: Sequence[Maps]) -> Maps:
     """Return the maps of one or more parts of a split, concatenated."""
     if len(parts) == 1:
         return parts[0]
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    joined = {}
+    for name in parts[0]:
+        arrays = [part[name] for part in parts]
+        joined[name] = np.concatenate(arrays)
+    return joined
 
 
 def stored_arrays(
     fields: Fields, height: int, width: int
 ) -> dict[str, tuple[str, tuple[int, ...]]]:
     """Return dtype and entry shape of each array of a split: fields, and digests."""
-    arrays = {
-        name: (field.dtype, field.entry_shape(height, width))
-        for name, field in fields.items()
-    }
-    return {**arrays, ENTRY_DIGESTS: ("|u1", (len(fields), DIGEST_BYTES))}
+    arrays: dict[str, tuple[str, tuple[int, ...]]] = {}
+    for name, field in fields.items():
+        arrays[name] = (field.dtype, field.entry_shape(height, width))
+    arrays[ENTRY_DIGESTS] = ("|u1", (len(fields), DIGEST_BYTES))
+    return arrays
 
 
 def entry_digests(maps: Maps, fields: Fields) -> ndarray:
@@ -234,7 +230,8 @@ def entry_digests(maps: Maps, fields: Fields) -> ndarray:
         entries = np.ascontiguousarray(maps[name], dtype=field.dtype)
         digests += [hashlib.sha256(entry.tobytes()).digest() for entry in entries]
     joined = np.frombuffer(b"".join(digests), np.uint8)
-    return joined.reshape(len(fields), -1, DIGEST_BYTES).swapaxes(0, 1)
+    by_field = joined.reshape(len(fields), -1, DIGEST_BYTES)
+    return by_field.swapaxes(0, 1)
 
 
 def split_digest(digests: ndarray, height: int, width: int, fields: Fields) -> str:
@@ -246,10 +243,10 @@ def split_digest(digests: ndarray, height: int, width: int, fields: Fields) -> s
         width: columns of a map.
         fields: the F fields.
     """
-    table = [
-        [name, field.dtype, [len(digests), *field.entry_shape(height, width)]]
-        for name, field in fields.items()
-    ]
+    table = []
+    for name, field in fields.items():
+        shape = [len(digests), *field.entry_shape(height, width)]
+        table.append([name, field.dtype, shape])
     text = json.dumps(table, separators=(",", ":")).encode()
     return hashlib.sha256(text + digests.tobytes()).hexdigest()
 
@@ -268,8 +265,12 @@ def version_of(recipes: Sequence[Json], splits: Iterable[Json], fields: Fields) 
 
 def has_unlabelled(entry: Json) -> bool:
     """Return whether a split has unlabelled cells, by its entry in the manifest."""
-    sources = [part.get("source", {}) for part in entry["parts"]]
-    return any(sum(source.get("unlabelled", ())) > 0 for source in sources)
+    for part in entry["parts"]:
+        source = part.get("source", {})
+        counts = source.get("unlabelled", ())
+        if sum(counts) > 0:
+            return True
+    return False
 
 
 def field_table(height: int, width: int, fields: Fields) -> Json:
@@ -290,11 +291,11 @@ def read_field_table(
 ) -> dict[str, Field]:
     """Return the fields that a manifest describes, in its order.
 
-    Fields that this package does not define may have any values.
+    A field that this package does not define may have any values.
 
     Args:
         table: fields by name, as in a manifest.
-        layers: layers, with their ranges.
+        layers: fields of the recipe's layers, with their ranges.
 
     Raises:
         KeyError, TypeError, ValueError: If one of `FIELDS` is missing, or a field is
@@ -308,11 +309,13 @@ def read_field_table(
     defined = {**layers, **KNOWN}
     for name, row in table.items():
         dtype = np.dtype(row["dtype"]).str
-        shape = tuple(row["shape"])
-        symbols = (*shape[:-2], "H", "W") if shape[-2:] == (height, width) else shape
-        foreign = Field(dtype, symbols, row["unit"], -np.inf, np.inf, row["meaning"])
-        if name in TRUTH and len(shape) == 3:
-            defined |= truth_fields(shape[0])
+        sizes = tuple(row["shape"])
+        shape = sizes
+        if sizes[-2:] == (height, width):
+            shape = (*sizes[:-2], "H", "W")
+        foreign = Field(dtype, shape, row["unit"], -np.inf, np.inf, row["meaning"])
+        if name in TRUTH and len(sizes) == 3:
+            defined |= truth_fields(sizes[0])
         fields[name] = defined.get(name, foreign)
     return fields
 
@@ -345,20 +348,24 @@ def check(manifest: Json) -> None:
         _check_kinds(recipe, _RECIPE)
     for name, entry in manifest["splits"].items():
         _check_kinds(entry, _ENTRY)
-        for part in entry["parts"]:
-            _check_kinds(part, _IMPORTED if "source" in part else _GENERATED)
+        parts = entry["parts"]
+        for part in parts:
+            kinds = _IMPORTED if "source" in part else _GENERATED
+            _check_kinds(part, kinds)
             if "recipe" in part:
                 recipe = manifest["recipes"][part["recipe"]]
-                scenario = recipe["splits"][part["split"]]["scenario"]
-                recipe["scenarios"][scenario]  # raises KeyError if it is missing
-        shards = manifest["shards"][name] if "shards" in manifest else entry["parts"]
-        for parts in (entry["parts"], shards):
-            if not 0 < sum(part["maps"] for part in parts) == entry["maps"]:
+                split = recipe["splits"][part["split"]]
+                recipe["scenarios"][split["scenario"]]  # KeyError if it is missing
+        shards = manifest["shards"][name] if "shards" in manifest else parts
+        for items in (parts, shards):
+            n_maps = sum(item["maps"] for item in items)
+            if n_maps <= 0 or n_maps != entry["maps"]:
                 raise ValueError(
                     f"the number of maps of split {name!r} is not that of its parts"
                 )
-        if any("/" in shard.get("file", "") for shard in shards):
-            raise ValueError(f"a file of split {name!r} is not in the folder")
+        for shard in shards:
+            if "/" in shard.get("file", ""):
+                raise ValueError(f"a file of split {name!r} is not in the folder")
 
 
 def _check_kinds(mapping: Any, kinds: Json) -> None:

@@ -44,7 +44,8 @@ class EnvBatch:
     Args:
         size: B.
         data: path or id of a dataset.
-        split: split of the dataset. If empty, `train`; without it, the first.
+        split: split of the dataset. If empty, `train`, or the first split if there is
+            no `train`.
         robot: name or mapping of a registered robot, or a robot.
         objective: name or mapping of an objective, or an objective. If empty, the
             shaped reward.
@@ -67,7 +68,7 @@ class EnvBatch:
 
         Raises:
             ConfigError: If a layer of the dataset has the name of another observation,
-                or the maps have no time budget or noise as `world` needs them.
+                or `world` needs a time budget or stored λ that the maps do not have.
         """
         guard.limit_threads()
         guard.warn_of_default_world(world)
@@ -88,7 +89,8 @@ class EnvBatch:
         dataset = TerrainDataset(find_dataset(data))
         self._dataset = dataset
         if not split:
-            split = "train" if "train" in dataset.splits else next(iter(dataset.splits))
+            names = list(dataset.splits)
+            split = "train" if "train" in names else names[0]
             if split != "train":
                 guard.warn(
                     f"{dataset.path} has no split 'train'; its split {split!r} is used."
@@ -100,20 +102,19 @@ class EnvBatch:
             f"layers that are not named 'state' or 'goal', got {sorted(clashes)} in "
             f"{dataset.path}.",
         )
-        places = dataset.read(split, fields=["start_m", "goal_m", "reference_time_s"])
-        self._places = Endpoints(
-            **{name: torch.from_numpy(values) for name, values in places.items()}
-        )
-        # Raise here rather than in the first reset.
+        stored = dataset.read(split, fields=["start_m", "goal_m", "reference_time_s"])
+        places = {name: torch.from_numpy(values) for name, values in stored.items()}
+        self._places = Endpoints(**places)
+        # Both raise here rather than in the first reset.
         self._world.budget_s(self._places.reference_time_s, robot_model.top_speed_mps)
         check_known(self._maps, self._world)
         self._map = np.zeros(size, dtype=np.int64)
         self._noise_seed = np.zeros(size, dtype=np.int64)
         self._simulation: Simulation | None = None
         self._now: SimulationState | None = None
-        self.action_space = spaces.Box(
-            np.float32(robot_model.action_low), np.float32(robot_model.action_high)
-        )
+        low = np.float32(robot_model.action_low)
+        high = np.float32(robot_model.action_high)
+        self.action_space = spaces.Box(low, high)
         self.observation_space = self._observation_space()
 
     @property
@@ -132,15 +133,17 @@ class EnvBatch:
         Args:
             generators: random generators of the sub-environments, length B.
             chosen: sub-environments that start, bool, shape [B].
-            map_index: map of all of them; if None, each map is drawn.
+            map_index: map of all sub-environments that start; if None, each map is
+                drawn.
         """
         guard.limit_threads()
         members = np.flatnonzero(chosen)
         for i in members.tolist():
-            # Always draw both: then a given map changes nothing else.
-            drawn = generators[i].integers(len(self._maps))
+            generator = generators[i]
+            # A map is drawn even if it is given, so that the noise seed is the same.
+            drawn = generator.integers(len(self._maps))
             self._map[i] = drawn if map_index is None else map_index
-            self._noise_seed[i] = generators[i].integers(2**48)
+            self._noise_seed[i] = generator.integers(2**48)
         maps = torch.from_numpy(self._map[members])
         # Tensors of inference mode cannot be changed in place outside of it.
         with torch.inference_mode(False):
@@ -154,17 +157,21 @@ class EnvBatch:
                 self._noise_seed[members].tolist(),
             )
             pose = heading_to(places.start_m, places.goal_m)
-            start = new_simulation.init(self._task.robot.initial_state(pose))
-        if self._simulation is None or self._now is None or len(members) == len(chosen):
+            initial_state = self._task.robot.initial_state(pose)
+            start = new_simulation.init(initial_state)
+        all_start = len(members) == len(chosen)
+        if self._simulation is None or self._now is None or all_start:
             self._simulation = new_simulation
             self._now = start
             return
         # Only new episodes are built: the others keep their maps and noise.
         indices = torch.from_numpy(members)
         self._simulation.exchange_(indices, new_simulation)
-        self._now = map_tensors(
-            self._now, lambda now, new: now.index_copy(0, indices, new), start
-        )
+
+        def put(now: Tensor, new: Tensor) -> Tensor:
+            return now.index_copy(0, indices, new)
+
+        self._now = map_tensors(self._now, put, start)
 
     def read_actions(
         self, actions: np.ndarray, hold: np.ndarray | None = None
@@ -212,10 +219,11 @@ class EnvBatch:
         guard.limit_threads()
         commanded = self.read_actions(actions, hold)
         simulation, now = self._current()
-        waits = (
-            torch.zeros_like(now.running) if hold is None else torch.from_numpy(hold)
-        )
-        if bool((~now.running & ~waits).any()):
+        waits = torch.zeros_like(now.running)
+        if hold is not None:
+            waits = torch.from_numpy(hold)
+        has_ended = ~now.running & ~waits
+        if bool(has_ended.any()):
             raise gymnasium.error.ResetNeeded(
                 "The episode has ended. Call reset() before the next step()."
             )
@@ -230,12 +238,10 @@ class EnvBatch:
         reward = self._reward(now, self._now, action, traversability)
         outcome = self._now.outcome
         terminated = (outcome == Outcome.SUCCESS) | _is_lost(outcome)
-        return (
-            torch.where(waits, 0.0, reward).double().numpy(),
-            terminated.numpy(),
-            (outcome == Outcome.TIMEOUT).numpy(),
-            torch.where(waits, 1.0, traversability).numpy(),
-        )
+        truncated = outcome == Outcome.TIMEOUT
+        reward = torch.where(waits, 0.0, reward).double()
+        observed = torch.where(waits, 1.0, traversability)
+        return reward.numpy(), terminated.numpy(), truncated.numpy(), observed.numpy()
 
     def observe(
         self, traversability: np.ndarray | None = None
@@ -249,14 +255,15 @@ class EnvBatch:
             Two dictionaries of arrays, whose first dimension is B.
         """
         _, now = self._current()
+        maps = self._maps
         observations = {
             "state": now.state.numpy().copy(),
             "goal": self._goal_m().numpy(),
-            "rgb": self._maps.rgb[self._map].numpy(),
-            "elevation_m": self._maps.elevation_m[self._map].numpy(),
-            "slope_deg": self._maps.slope_deg[self._map].numpy(),
+            "rgb": maps.rgb[self._map].numpy(),
+            "elevation_m": maps.elevation_m[self._map].numpy(),
+            "slope_deg": maps.slope_deg[self._map].numpy(),
         }
-        for name, layer in self._maps.layers.items():
+        for name, layer in maps.layers.items():
             observations[name] = layer[self._map].nan_to_num().numpy()
         return observations, self._diagnose(traversability)
 
@@ -265,10 +272,11 @@ class EnvBatch:
         _, now = self._current()
         if traversability is None:
             traversability = np.ones(len(self._map), np.float32)
+        is_success = now.outcome == Outcome.SUCCESS
         return {
             "map": self._map.copy(),
             "outcome": now.outcome.numpy().copy(),
-            "is_success": (now.outcome == Outcome.SUCCESS).numpy(),
+            "is_success": is_success.numpy(),
             "traversability": traversability,
             "distance_m": self._distance_m(now).numpy(),
         }
@@ -295,12 +303,15 @@ class EnvBatch:
         cost: Tensor = self._objective.stage(
             before.state, action, traversability, self._goal_m()
         )
-        # Without this factor, losing the robot would end a costly episode most cheaply.
-        return -cost * (1 + (simulation.steps - now.step) * is_lost)
+        # Without the remaining steps, losing the robot would be the cheapest end of a
+        # costly episode.
+        remaining_steps = (simulation.steps - now.step) * is_lost
+        return -cost * (1 + remaining_steps)
 
     def _observation_space(self) -> spaces.Dict:
         shape = self._maps.grid.shape
-        states = self._task.robot.initial_state(torch.zeros(1, 3)).shape[1]
+        initial_state = self._task.robot.initial_state(torch.zeros(1, 3))
+        states = initial_state.shape[1]
         boxes: dict[str, spaces.Space[Any]] = {
             "state": _unbounded((states,)),
             "goal": _unbounded((2,)),
@@ -330,4 +341,6 @@ def _unbounded(shape: tuple[int, ...]) -> spaces.Box:
 
 def _is_lost(outcome: Tensor) -> Tensor:
     """Return whether robots left the map or are immobilised for good."""
-    return (outcome == Outcome.OUT_OF_BOUNDS) | (outcome == Outcome.IMMOBILISED)
+    is_off_map = outcome == Outcome.OUT_OF_BOUNDS
+    is_immobilised = outcome == Outcome.IMMOBILISED
+    return is_off_map | is_immobilised

@@ -1,8 +1,8 @@
 """Gymnasium environment `benchnav/OffRoad-v1`, single and vectorised.
 
-The robot updates its knowledge during the episode. Observations contain what it knows
-at this step, in its own frame; never the truth. Letters in shapes: N×N cells of the
-crop, S state and A action dimensions.
+The robot updates its knowledge during the episode. Observations contain its current
+knowledge, in its own frame; they never contain the truth. Letters in shapes: N×N cells
+of the crop, S state and A action dimensions.
 """
 
 from typing import Any
@@ -16,13 +16,13 @@ from benchnav.env.environment import OffRoadEnv, OffRoadVectorEnv
 
 
 class EgocentricEnv(OffRoadEnv):
-    """Drive to the goal by online knowledge of uncertain λ; partially observed.
+    """Partially observed task: drive to the goal, learning about λ during the episode.
 
     ## Arguments
-    Arguments of `gymnasium.make("benchnav/OffRoad-v1", …)`: those of
+    `gymnasium.make("benchnav/OffRoad-v1", …)` takes the arguments of
     `benchnav/OffRoad-v0` (`data`, `split`, `robot`, `objective`, `world`,
     `goal_radius_m`), and the following. `make_vec` takes the same arguments, and
-    `num_envs`. Pass a part as in a suite: a name, `name:VALUE`, `file.py:Name`,
+    `num_envs`. A part is passed as in a suite: a name, `name:VALUE`, `file.py:Name`,
     `{"part": NAME, "options": {…}}`, or the part itself.
 
     | argument             | default     | meaning                                                            |
@@ -73,22 +73,24 @@ class EgocentricEnv(OffRoadEnv):
     | 5 …   | [−1, 1] | the robot's state beyond (x, y, θ), such as velocities: x / (1 + \\|x\\|)         |
 
     ## Hidden quantities
-    λ of all cells except what the sensors measure; its true distribution, unless the
-    model is privileged; the dwell time on immobilising terrain, after which the episode
-    ends; T, except for its remaining fraction; the position and heading on the map;
-    knowledge of terrain beyond the crop; and the time until the next update.
+    The following are hidden: λ of all cells that the sensors did not measure; the true
+    distribution of λ, unless the model is privileged; the dwell time on immobilising
+    terrain, after which the episode ends; T, except for its remaining fraction; the
+    position and heading on the map; knowledge of terrain beyond the crop; and the time
+    until the next update.
 
     ## Knowledge
-    As in `benchnav-eval`. With a belief that learns, λ is sensed at each step. The
-    appearance sensor observes at the start and every `replan_every_s`. Then the model
-    predicts from its observations, the belief is conditioned on the measured λ, and λ̂
-    and spread change. Each episode has its own noise of sensors: the same seed gives
-    the same noise. A belief that learns from λ, such as `"copula"`, needs a world of
-    fixed λ, such as `"stakes"`. The belief of unobserved terrain comes from the
-    checkpoint's training maps; for privileged models, from the dataset or its recipe.
+    Knowledge is updated as in `benchnav-eval`. With a belief that learns, λ is sensed
+    at each step. The appearance sensor observes at the start and every
+    `replan_every_s`. Then the model predicts from its observations, the belief is
+    conditioned on the measured λ, and λ̂ and spread change. Each episode has its own
+    sensor noise, which follows from the seed. A belief that learns from λ, such as
+    `"copula"`, needs a world of fixed λ, such as `"stakes"`. The belief of unobserved
+    terrain comes from the checkpoint's training maps, or for privileged models, from
+    the dataset or its recipe.
 
     ## Reward, world, start, end and info
-    As in `benchnav/OffRoad-v0`, see `OffRoadEnv`.
+    All are as in `benchnav/OffRoad-v0`, see `OffRoadEnv`.
 
     ## Rendering
     `render()` returns an image of 640×480 pixels, uint8, shape (480, 640, 3). It shows
@@ -144,7 +146,9 @@ class EgocentricEnv(OffRoadEnv):
             guard.warn(
                 'render() draws nothing without `render_mode="rgb_array"` or "human".'
             )
-        return self._batch.draw(0) if self.render_mode == "rgb_array" else None
+        if self.render_mode != "rgb_array":
+            return None
+        return self._batch.draw(0)
 
     def close(self) -> None:
         """Close the window."""
@@ -161,8 +165,9 @@ class EgocentricVectorEnv(OffRoadVectorEnv):
 
     Sub-environment i seeded with s equals the single environment seeded with s + i.
     Arguments, spaces and rewards are as in `EgocentricEnv`; `render()` returns an image
-    of each sub-environment. `reset(options={"reset_mask": mask})` restarts only those
-    of the mask, bool, shape [B]; the next step does not reset them again.
+    of each sub-environment. `reset(options={"reset_mask": mask})` restarts only the
+    sub-environments of the mask, bool, shape [B]; the next step does not reset them
+    again.
 
     Args:
         num_envs: number of sub-environments.

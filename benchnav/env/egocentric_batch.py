@@ -77,7 +77,7 @@ class EgocentricBatch(EnvBatch):
 
     Args:
         size: B.
-        drawn: whether to store what pictures need.
+        drawn: whether to store the data of pictures.
         arguments: fields of `Perception`, and arguments of `EnvBatch`.
     """
 
@@ -88,8 +88,11 @@ class EgocentricBatch(EnvBatch):
             ConfigError: If an argument is invalid, or the world resamples λ for a
                 belief that learns.
         """
-        names = [field.name for field in fields(Perception) if field.name in arguments]
-        perception = Perception(**{name: arguments.pop(name) for name in names})
+        options = {}
+        for field in fields(Perception):
+            if field.name in arguments:
+                options[field.name] = arguments.pop(field.name)
+        perception = Perception(**options)
         self.view = View(cells=perception.crop_cells, behind=perception.crop_behind)
         super().__init__(size, **arguments)
         rules = replace(
@@ -105,14 +108,16 @@ class EgocentricBatch(EnvBatch):
         predictor: Any = model
         if not isinstance(model, TraversabilityModel):
             predictor = load_model(model)
-        if mismatch := class_mismatch(predictor, self._dataset.recipe):
+        mismatch = class_mismatch(predictor, self._dataset.recipe)
+        if mismatch:
             guard.warn(f"{mismatch}.")
         sensor: Any = registry.take("sensor", perception.sensor)
         belief: Any = registry.take("belief", perception.belief)
         is_clairvoyant = isinstance(predictor, Clairvoyant)
         needs_fixed_field = belief.learns or is_clairvoyant
+        has_fixed_field = self._world.noise != "resampled"
         expect(
-            self._world.noise != "resampled" or not needs_fixed_field,
+            has_fixed_field or not needs_fixed_field,
             "a world of fixed λ for `clairvoyant` or a belief that learns, got `noise` "
             "'resampled'. Pass world='stakes'.",
         )
@@ -120,13 +125,15 @@ class EgocentricBatch(EnvBatch):
         if not sensor.sees_all or belief.needs_statistics:
             source: Any = "oracle" if predictor is model else model
             statistics = find_ground_statistics(source, self._dataset)
-        risk = perception.risk
+        measure = perception.risk
+        if not callable(measure):
+            measure = registry.make("risk", measure)
         learner = Learner(
             sensor=sensor,
             ground=registry.take("ground", perception.ground),
             belief=belief,
             covariance=self._covariance(predictor, statistics),
-            measure=risk if callable(risk) else registry.make("risk", risk),
+            measure=measure,
             rules=rules,
             predict=partial(predict, predictor),
             keeps_spread=True,
@@ -159,14 +166,16 @@ class EgocentricBatch(EnvBatch):
         field = self._field()
         maps = torch.from_numpy(self._map[chosen])
         seeds = self._noise_seed[chosen]
+        is_sensing = torch.from_numpy(chosen)
+        root_key = rng.stream_key(0, "environment")
         with torch.inference_mode(False), torch.no_grad():
             truth = Truth(
                 terrain=self._maps.select(maps),
                 field=field[members],
-                keys=sensor_keys(rng.stream_key(0, "environment"), seeds.tolist()),
+                keys=sensor_keys(root_key, seeds.tolist()),
             )
             self._experience.begin(members, maps.tolist(), truth, now.state[members])
-            self._experience.learn(now.step, now.state, field, torch.from_numpy(chosen))
+            self._experience.learn(now.step, now.state, field, is_sensing)
         for member in np.flatnonzero(chosen):
             self._tracks[member] = []
         self._extend_tracks(chosen)
@@ -182,8 +191,9 @@ class EgocentricBatch(EnvBatch):
         result = super().step(actions, hold)
         _, now = self._current()
         has_stepped = now.step > before.step
+        field = self._field()
         with torch.inference_mode(False), torch.no_grad():
-            self._experience.learn(now.step, now.state, self._field(), has_stepped)
+            self._experience.learn(now.step, now.state, field, has_stepped)
         self._extend_tracks(has_stepped.numpy())
         return result
 
@@ -195,15 +205,17 @@ class EgocentricBatch(EnvBatch):
         info = self._diagnose(traversability)
         self._observed = info["traversability"]
         time_s = now.step * self._task.robot.dt_s
-        observations = self.view.observe(
+        time_left = 1 - time_s / simulation.time_budget_s
+        tensors = self.view.observe(
             self._maps.grid,
             self._experience.map_knowledge,
             now.state,
             self._goal_m(),
             torch.from_numpy(self._observed),
-            1 - time_s / simulation.time_budget_s,
+            time_left,
         )
-        return {name: values.numpy() for name, values in observations.items()}, info
+        observations = {name: values.numpy() for name, values in tensors.items()}
+        return observations, info
 
     def draw(self, member: int) -> np.ndarray:
         """Return the image of a sub-environment, uint8, shape [480, 640, 3]."""
@@ -215,18 +227,23 @@ class EgocentricBatch(EnvBatch):
         knowledge = self._experience.map_knowledge.select(indices)
         state = now.state[indices]
         grid = self._maps.grid
+        map_index = int(self._map[member])
+        crops = self.view.crop(grid, knowledge, state)
+        corners_m = self.view.corners_m(grid, state)
+        n_steps = int(now.step[member])
+        outcome = Outcome(int(now.outcome[member]))
         scene = Scene(
-            rgb=self._maps.rgb[int(self._map[member])].numpy(),
+            rgb=self._maps.rgb[map_index].numpy(),
             seen=knowledge.seen[0].numpy(),
-            crop=self.view.crop(grid, knowledge, state)[0].numpy(),
-            corners_m=self.view.corners_m(grid, state)[0].numpy(),
+            crop=crops[0].numpy(),
+            corners_m=corners_m[0].numpy(),
             behind=self.view.behind,
             state=state[0].numpy(),
             goal_m=self._goal_m()[member].numpy(),
             track=np.array(self._tracks[member]),
-            time_s=int(now.step[member]) * self._task.robot.dt_s,
+            time_s=n_steps * self._task.robot.dt_s,
             observed=float(self._observed[member]),
-            outcome=Outcome(int(now.outcome[member])).name.lower(),
+            outcome=outcome.name.lower(),
         )
         return self._picture.draw(scene)
 
@@ -235,11 +252,13 @@ class EgocentricBatch(EnvBatch):
     ) -> CovarianceModel:
         """Return the covariance model of the λ field."""
         recipe = self._dataset.recipe
-        is_stored = self._world.noise == "stored"
+        correlation_m = self._world.correlation_m
+        if self._world.noise == "stored":
+            correlation_m = recipe.correlation_m
         class_names = tuple(item.name for item in recipe.classes)
         return CovarianceModel(
             grid=self._maps.grid,
-            correlation_m=(recipe if is_stored else self._world).correlation_m,
+            correlation_m=correlation_m,
             nugget=nugget_of(model),
             statistics=statistics,
             class_names=model.class_names or class_names,
@@ -248,7 +267,7 @@ class EgocentricBatch(EnvBatch):
     def _field(self) -> Tensor:
         """Return λ of every cell, for sensors.
 
-        If λ is resampled at each step, it is not sensed, and the field has no meaning.
+        If λ is resampled at each step, sensors do not read the field.
         """
         simulation, _ = self._current()
         if simulation.field is None:
@@ -262,7 +281,7 @@ class EgocentricBatch(EnvBatch):
         return low + (action + 1) / 2 * (high - low)
 
     def _extend_tracks(self, chosen: np.ndarray) -> None:
-        """Append positions of some robots, bool, shape [B], to the tracks to draw."""
+        """Append the positions of the chosen robots, bool, shape [B], to their tracks."""
         if self._picture is None:
             return
         _, now = self._current()
@@ -272,21 +291,20 @@ class EgocentricBatch(EnvBatch):
 
     def _observation_space(self) -> spaces.Dict:
         cells = self.view.cells
-        states = self._task.robot.initial_state(torch.zeros(1, 3)).shape[1]
+        initial_state = self._task.robot.initial_state(torch.zeros(1, 3))
         crop_low = np.zeros((len(CHANNELS), cells, cells), np.float32)
         crop_low[CHANNELS.index("rise")] = -1
         crop_high = np.ones_like(crop_low)
-        low, high = (np.array(values, np.float32) for values in bounds(states))
-        return spaces.Dict(
-            {
-                "crop": spaces.Box(crop_low, crop_high, dtype=np.float32),
-                "state": spaces.Box(low, high, dtype=np.float32),
-            }
-        )
+        low, high = bounds(initial_state.shape[1])
+        state_low = np.array(low, np.float32)
+        state_high = np.array(high, np.float32)
+        crop = spaces.Box(crop_low, crop_high, dtype=np.float32)
+        state = spaces.Box(state_low, state_high, dtype=np.float32)
+        return spaces.Dict({"crop": crop, "state": state})
 
 
 def _make_picture(grid: Grid) -> "Picture":
-    # Imported here, since importing Matplotlib takes longer than all other imports.
+    # Matplotlib is imported here, since it takes longer than all other imports.
     from benchnav.env.picture import Picture
 
     return Picture(grid)

@@ -1,8 +1,8 @@
 """Gymnasium environment `benchnav/OffRoad-v0`, single and vectorised.
 
 It is the base of all later versions. Observations contain the robot's state, its goal
-and the paper's Observation of the map; never the truth. Letters in shapes: B
-sub-environments, H×W cells, S state and A action dimensions.
+and the paper's Observation of the map; they never contain the truth. Letters in shapes:
+B sub-environments, H×W cells, S state and A action dimensions.
 """
 
 from typing import Any
@@ -20,16 +20,18 @@ from benchnav.planning.world.outcome import Outcome
 
 
 class OffRoadEnv(gymnasium.Env[Any, np.ndarray]):
-    """Drive to the goal over terrain of uncertain traversability λ; partially observed.
+    """Partially observed task: drive to the goal over terrain of uncertain λ.
+
+    λ is traversability.
 
     ## Arguments
-    Arguments of `gymnasium.make("benchnav/OffRoad-v0", …)`. `make_vec` takes the same
-    arguments, and `num_envs`.
+    These are the arguments of `gymnasium.make("benchnav/OffRoad-v0", …)`. `make_vec`
+    takes the same arguments, and `num_envs`.
 
     | argument        | default      | meaning                                                                 |
     |-----------------|--------------|-------------------------------------------------------------------------|
     | `data`          | `"paper-v1"` | path or id of a dataset                                                 |
-    | `split`         | `""`         | split; if empty, `train`, or else the first split, with a warning       |
+    | `split`         | `""`         | split; if empty, `train`; without it, the first split, with a warning   |
     | `robot`         | `"unicycle"` | F: a name, `file.py:Name`, `{"part": NAME, "options": {…}}`, or a robot |
     | `objective`     | `""`         | J, likewise; if empty, the shaped reward                                |
     | `world`         | `""`         | dynamics of λ: `"paper"` (default, warns), `"stakes"`, or changes       |
@@ -80,10 +82,10 @@ class OffRoadEnv(gymnasium.Env[Any, np.ndarray]):
 
     ## Start and end
     An episode begins at the start of a map of the split, facing the goal. The map is
-    drawn at random, or given by `options={"map": i}`. The episode terminates at the
-    goal, off the map, or when the robot is immobilised for good; it is truncated after
-    T. A step after the end raises `gymnasium.error.ResetNeeded`. Other options and
-    other types of `map` raise `ConfigError`.
+    drawn at random, or given by `options={"map": i}`. The episode terminates when the
+    robot reaches the goal, leaves the map or is immobilised for good; it is truncated
+    after T. A step after the end raises `gymnasium.error.ResetNeeded`. Other options
+    and other types of `map` raise `ConfigError`.
 
     ## Info
 
@@ -122,9 +124,9 @@ class OffRoadEnv(gymnasium.Env[Any, np.ndarray]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
         """Start an episode; see the class."""
-        map_index = guard.read_options(options, ("map",), self._batch.maps).get("map")
+        checked = guard.read_options(options, ("map",), self._batch.maps)
         super().reset(seed=seed)
-        self._batch.reset([self.np_random], np.array([True]), map_index)
+        self._batch.reset([self.np_random], np.array([True]), checked.get("map"))
         return _only(*self._batch.observe())
 
     def step(
@@ -132,7 +134,8 @@ class OffRoadEnv(gymnasium.Env[Any, np.ndarray]):
     ) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
         """Take one time step; see the class."""
         numbers = guard.read_numbers(action, self.action_space.shape)
-        reward, terminated, truncated, traversability = self._batch.step(numbers[None])
+        result = self._batch.step(numbers[None])
+        reward, terminated, truncated, traversability = result
         observation, info = _only(*self._batch.observe(traversability))
         return observation, reward.item(), terminated.item(), truncated.item(), info
 
@@ -203,7 +206,10 @@ class OffRoadVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             )
         if seed is not None or not self._generators:
             _, root = seeding.np_random(seed)
-            generators = [seeding.np_random(root + i)[0] for i in range(self.num_envs)]
+            generators = []
+            for i in range(self.num_envs):
+                generator, _ = seeding.np_random(root + i)
+                generators.append(generator)
             for i in np.flatnonzero(~chosen).tolist():
                 generators[i] = self._generators[i]
             self._generators = generators
@@ -214,7 +220,7 @@ class OffRoadVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
     def step(
         self, actions: np.ndarray
     ) -> tuple[Observations, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Take one time step, or reset where the last step ended an episode.
+        """Take one time step; sub-environments whose episode has ended reset instead.
 
         Raises:
             ConfigError: If the actions are invalid. Then nothing is reset.
@@ -236,6 +242,8 @@ def _only(
     observations: Observations, info: Observations
 ) -> tuple[Observations, dict[str, Any]]:
     """Return observation and info of a batch of one; the outcome by its name."""
+    observation = {name: values[0] for name, values in observations.items()}
     diagnostics = {name: values[0].item() for name, values in info.items()}
-    diagnostics["outcome"] = Outcome(diagnostics["outcome"]).name.lower()
-    return {name: values[0] for name, values in observations.items()}, diagnostics
+    outcome = Outcome(diagnostics["outcome"])
+    diagnostics["outcome"] = outcome.name.lower()
+    return observation, diagnostics

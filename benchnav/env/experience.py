@@ -1,9 +1,9 @@
 """Knowledge of the robots of an environment, updated during their episodes.
 
-A stateful shell over `benchnav.planning.sensing.learner`, which evaluations use too.
-λ is sensed at each step; the knowledge is updated every `replan_every_s` of an episode.
-Here episodes begin at different times. Letters in shapes: B episodes, M of them, S
-state dimensions, H×W cells.
+It is a stateful shell over `benchnav.planning.sensing.learner`, which evaluations use
+too. λ is sensed at each step; the knowledge is updated every `replan_every_s` of an
+episode. Unlike in an evaluation, episodes begin at different times. Letters in shapes:
+B episodes, M selected episodes, S state dimensions, H×W cells.
 """
 
 from collections import OrderedDict
@@ -75,7 +75,7 @@ class Experience:
 
         Args:
             members: indices of the sub-environments, int64, shape [M].
-            maps: indices of their maps, length M.
+            maps: index of the map of each of these sub-environments, length M.
             truth: terrain, λ and sensor keys of these episodes.
             state: initial states of the robots, shape [M, S].
         """
@@ -95,7 +95,7 @@ class Experience:
     def learn(
         self, step: Tensor, state: Tensor, field: Tensor, is_sensing: Tensor
     ) -> None:
-        """Sense in some sub-environments, and update their knowledge where it is due.
+        """Sense in some sub-environments, and update their knowledge if it is due.
 
         Args:
             step: steps that each episode has taken, int64, shape [B].
@@ -114,12 +114,12 @@ class Experience:
             self._update(due, truth)
 
     def _update(self, due: Tensor, truth: Truth) -> None:
-        """Update the knowledge of the episodes where it is due, bool, shape [B]."""
+        """Update the knowledge of the episodes that are due, bool, shape [B]."""
         learner = self._learner
         now = self._current()
         needs_prediction = now.has_news & due
         if bool(needs_prediction.any()):
-            # Episodes are selected, since a prediction costs more than selecting.
+            # Only some episodes are updated: a prediction costs more than selecting.
             members = needs_prediction.nonzero()[:, 0]
             selected = learner.select(now, members)
             updated, _ = learner.update(selected, truth.select(members))
@@ -127,8 +127,9 @@ class Experience:
         needs_update = (due & ~needs_prediction)[:, None, None]
         sensed = now.sensed
         news = now.has_news
-        if bool((sensed.mask & needs_update).any()):
-            # The whole batch is updated, since selecting costs more than the update.
+        has_measurements = sensed.mask & needs_update
+        if bool(has_measurements.any()):
+            # The whole batch is updated: selecting costs more than the update.
             no_news = torch.zeros_like(news)
             now = replace(now, sensed=_only(sensed, needs_update), has_news=no_news)
             now, _ = learner.update(now, truth)
@@ -152,9 +153,8 @@ class Experience:
         while len(self._cache) > _MAX_CACHED:
             self._cache.popitem(last=False)
         joined = map_tensors(starts[0], lambda *values: torch.cat(values), *starts[1:])
-        return replace(
-            joined.knowledge, belief_state=self._learner.believe(joined.prior)
-        )
+        belief_state = self._learner.believe(joined.prior)
+        return replace(joined.knowledge, belief_state=belief_state)
 
     def _start(self, truth: Truth, state: Tensor) -> Knowledge:
         """Return the initial knowledge of some episodes."""

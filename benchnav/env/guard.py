@@ -23,8 +23,9 @@ _MAIN_PROCESS = 0 if multiprocessing.parent_process() else os.getpid()
 def limit_threads() -> None:
     """Limit PyTorch to one thread in a worker process.
 
-    The limit is set once, so a program may then set another number. Threads do not
-    survive a fork: an operation that waits for threads of the parent never ends.
+    The limit is set once, so a program may set another number afterwards. It is needed
+    since threads do not survive a fork: an operation that waits for threads of the
+    parent never ends.
     """
     _limit_threads(os.getpid())
 
@@ -44,8 +45,8 @@ def check_render_mode(render_mode: str | None, modes: Collection[str]) -> None:
     """Check that an environment has a render mode.
 
     Args:
-        render_mode: as passed by the user.
-        modes: modes of the environment; empty for version 0.
+        render_mode: mode that the user passed.
+        modes: render modes of the environment; empty for version 0.
 
     Raises:
         ConfigError: If the mode is not in `modes`.
@@ -62,18 +63,20 @@ def check_render_mode(render_mode: str | None, modes: Collection[str]) -> None:
 
 
 def has_display() -> bool:
-    """Return whether Matplotlib may draw: to a display, or by `MPLBACKEND`."""
+    """Return whether Matplotlib can draw: to a display, or as `MPLBACKEND` says."""
+    if sys.platform != "linux":
+        return True
     names = ("MPLBACKEND", "DISPLAY", "WAYLAND_DISPLAY")
-    return sys.platform != "linux" or any(os.environ.get(name) for name in names)
+    return any(os.environ.get(name) for name in names)
 
 
 def read_options(options: Any, names: Collection[str], maps: int) -> dict[str, Any]:
     """Return the checked options of a reset.
 
     Args:
-        options: as passed by the user.
-        names: options of the environment.
-        maps: number of its maps.
+        options: options that the user passed.
+        names: names of the environment's options.
+        maps: number of the environment's maps.
 
     Returns:
         The options; `map`, if given, as a Python integer.
@@ -81,10 +84,8 @@ def read_options(options: Any, names: Collection[str], maps: int) -> dict[str, A
     Raises:
         ConfigError: If a name is unknown, or `map` is not the index of a map.
     """
-    expect(
-        options is None or isinstance(options, Mapping),
-        f"`options` as a mapping, got {options!r}.",
-    )
+    is_valid = options is None or isinstance(options, Mapping)
+    expect(is_valid, f"`options` as a mapping, got {options!r}.")
     checked = dict(options or {})
     for name in checked:
         check_known("an option of `reset`", name, names)
@@ -140,7 +141,8 @@ def check_actions(actions: np.ndarray, acting: np.ndarray) -> None:
     Raises:
         ConfigError: If an action that is used is not finite.
     """
-    faulty = np.flatnonzero(acting & ~np.isfinite(actions).all(axis=1))
+    is_finite = np.isfinite(actions).all(axis=1)
+    faulty = np.flatnonzero(acting & ~is_finite)
     if len(faulty):
         index = int(faulty[0])
         suffix = f" for sub-environment {index}" if len(actions) > 1 else ""
@@ -151,10 +153,10 @@ def check_actions(actions: np.ndarray, acting: np.ndarray) -> None:
 
 
 def warn_of_default_world(world: str | Mapping[str, Any] | World) -> None:
-    """Warn if a user did not choose a world, since by default it is without stakes.
+    """Warn if a user did not choose a world: by default, no terrain immobilises robots.
 
-    A user chooses a world by the preset `paper`, by `immobile` or by a `World`. A
-    mapping of other changes does not choose the preset, so it warns.
+    A preset, the key `immobile` and a `World` are choices. A mapping with other keys
+    only leaves the preset open.
     """
     is_default = world == ""
     if isinstance(world, Mapping):

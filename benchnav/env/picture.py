@@ -22,10 +22,16 @@ from benchnav.viz import drives, maps
 
 SIZE = (640, 480)  # width and height in pixels
 _DPI = 100
+_FIGSIZE = (SIZE[0] / _DPI, SIZE[1] / _DPI)
 # Squares: the map, and to its right two channels of the policy's observation.
 _PANELS = {
-    **{"width_ratios": (424, 176), "wspace": 16 / 300, "hspace": 48 / 176},
-    **{"left": 16 / 640, "right": 632 / 640, "bottom": 16 / 480, "top": 440 / 480},
+    "width_ratios": (424, 176),
+    "wspace": 16 / 300,
+    "hspace": 48 / 176,
+    "left": 16 / 640,
+    "right": 632 / 640,
+    "bottom": 16 / 480,
+    "top": 440 / 480,
 }
 _UNSEEN = 0.35  # brightness of unobserved terrain, relative to observed terrain
 _TEXT = 8.5  # points
@@ -47,7 +53,7 @@ class Scene:
         track: positions of the robot up to now, in metres, shape [P, 2].
         time_s: time since the start of the episode, in seconds.
         observed: λ of the last step.
-        outcome: `running`, or how the episode ended.
+        outcome: `running`, or the outcome of the episode.
     """
 
     rgb: np.ndarray
@@ -73,35 +79,36 @@ class Picture:
     def __init__(self, grid: Grid) -> None:
         """Prepare an empty figure."""
         self._grid = grid
-        self._figure = Figure(figsize=(SIZE[0] / _DPI, SIZE[1] / _DPI), dpi=_DPI)
+        self._figure = Figure(figsize=_FIGSIZE, dpi=_DPI)
         self._canvas = FigureCanvasAgg(self._figure)
 
     def draw(self, scene: Scene) -> np.ndarray:
         """Return the image of a scene, uint8, shape [480, 640, 3]."""
         self._figure.clear()
-        panels = self._figure.subplot_mosaic(
-            [["map", "risk"], ["map", "spread"]], gridspec_kw=_PANELS
-        )
+        layout: list[Any] = [["map", "risk"], ["map", "spread"]]
+        panels = self._figure.subplot_mosaic(layout, gridspec_kw=_PANELS)
         for panel in panels.values():
             panel.set(xticks=[], yticks=[])
         self._draw_map(panels["map"], scene)
-        self._draw_crop(
-            panels["risk"], scene, "risk", "λ̂ ahead", maps.TRAVERSABILITY_COLOURS
+        channels = (
+            ("risk", "λ̂ ahead", maps.TRAVERSABILITY_COLOURS),
+            ("spread", "spread of λ", maps.SPREAD_COLOURS),
         )
-        self._draw_crop(
-            panels["spread"], scene, "spread", "spread of λ", maps.SPREAD_COLOURS
-        )
+        for channel, title, colours in channels:
+            self._draw_crop(panels[channel], scene, channel, title, colours)
         self._canvas.draw()
-        return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
+        rgba = np.asarray(self._canvas.buffer_rgba())
+        return rgba[..., :3].copy()
 
     def _draw_map(self, panel: Axes, scene: Scene) -> None:
         light = np.where(scene.seen, 1.0, _UNSEEN)[..., None]
-        image = (scene.rgb.transpose(1, 2, 0) * light).astype(np.uint8)
-        maps.show_map(panel, image, self._grid.extent_m)
-        for colour, line in (("black", 2.4), ("white", 1.2)):
-            panel.add_patch(
-                Polygon(scene.corners_m, closed=True, fill=False, ec=colour, lw=line)
+        image = scene.rgb.transpose(1, 2, 0) * light
+        maps.show_map(panel, image.astype(np.uint8), self._grid.extent_m)
+        for colour, width in (("black", 2.4), ("white", 1.2)):
+            outline = Polygon(
+                scene.corners_m, closed=True, fill=False, ec=colour, lw=width
             )
+            panel.add_patch(outline)
         outcome = scene.outcome.replace("running", "")
         track = np.vstack((scene.track, scene.state[:2]))
         drive = drives.Drive(
@@ -122,13 +129,15 @@ class Picture:
         seen = scene.crop[CHANNELS.index("known")]
         spread = scene.crop[CHANNELS.index("spread")]
         light = np.where(seen > 0, 1.0, _UNSEEN)[..., None]
-        image = matplotlib.colormaps[colours](values)[..., :3] * light
+        rgba = matplotlib.colormaps[colours](values)
+        image = rgba[..., :3] * light
         is_off_map = (seen <= 0) & (spread == 0) & (scene.crop[0] == 0)
         image[is_off_map] = to_rgb(maps.MISSING)
         cells = len(values)
-        # Ahead is up, and the robot's left is left.
-        maps.show_map(panel, image.transpose(1, 0, 2)[:, ::-1], (cells, cells))
-        ahead = drives.robot_marker(np.pi / 2)
+        # In the image, ahead is up, and the robot's left is left.
+        image = image.transpose(1, 0, 2)[:, ::-1]
+        maps.show_map(panel, image, (cells, cells))
+        ahead = maps.robot_marker(np.pi / 2)
         robot = (cells / 2, scene.behind * cells)
         drives.mark(panel, "robot", robot, _MARKS, marker=ahead)
         panel.set_title(title, fontsize=_TEXT, loc="left", pad=4)
@@ -147,25 +156,26 @@ class Window:
         """Open the window.
 
         Raises:
-            ConfigError: If there is no display, and `MPLBACKEND` names no backend that
-                works without one.
+            ConfigError: If there is no display, and `MPLBACKEND` does not name a
+                backend that works without a display.
         """
-        # Imported here, since the import searches for a display.
+        # pyplot is imported here, since the import searches for a display.
         from matplotlib import pyplot
 
         self._pyplot: Any = pyplot
-        if pyplot.get_backend().lower() == "agg" and not os.environ.get("MPLBACKEND"):
+        is_chosen = bool(os.environ.get("MPLBACKEND"))
+        if pyplot.get_backend().lower() == "agg" and not is_chosen:
             raise ConfigError(
                 'Expected a display for `render_mode` "human", got no display that '
                 'Matplotlib can use. Pass "rgb_array". If there is a display, install '
                 "a GUI toolkit that Matplotlib supports, such as PyQt6."
             )
-        self._figure = pyplot.figure(
-            "benchnav", figsize=(SIZE[0] / _DPI, SIZE[1] / _DPI), dpi=_DPI
-        )
+        self._figure = pyplot.figure("benchnav", figsize=_FIGSIZE, dpi=_DPI)
         panel = self._figure.add_axes((0, 0, 1, 1))
         panel.set_axis_off()
-        self._image = panel.imshow(np.full((SIZE[1], SIZE[0], 3), 255, np.uint8))
+        width, height = SIZE
+        blank = np.full((height, width, 3), 255, np.uint8)
+        self._image = panel.imshow(blank)
 
     def show(self, image: np.ndarray) -> None:
         """Show an image, uint8, shape [480, 640, 3], instead of the last one."""
@@ -176,5 +186,5 @@ class Window:
         self._figure.canvas.flush_events()
 
     def close(self) -> None:
-        """Close the window; may be called again."""
+        """Close the window; repeated calls are allowed."""
         self._pyplot.close(self._figure)

@@ -28,7 +28,7 @@ class PolicyState(Batch):
 
     Args:
         problem: B problems.
-        knowledge: knowledge of the terrain in each of them.
+        knowledge: knowledge of the terrain in each problem.
     """
 
     problem: Problem
@@ -60,18 +60,19 @@ class PolicyPlanner(Planner[PolicyState]):
         crop_behind: float = 1 / 3,
         normalised_actions: bool = False,
     ) -> None:
-        """Create the planner of a policy; nothing is called yet."""
+        """Create the planner of a policy, without a call of the policy."""
         self.policy = policy
         self.normalised_actions = normalised_actions
         self.view = View(cells=crop_cells, behind=crop_behind)
 
     def follows(self, task: Task) -> str:
-        """Return the objective: none; see `Planner`."""
+        """Return a description instead of an objective; see `Planner`."""
         return "none (a policy, which does what it was trained for)"
 
     def init(self, problem: Problem, generator: torch.Generator) -> PolicyState:
-        """Return the plan state of the predicted λ; see `Planner`. Draws nothing."""
-        return PolicyState(problem=problem, knowledge=_knowledge_of(problem))
+        """Return the plan state of the predicted λ, without draws; see `Planner`."""
+        knowledge = _knowledge_of(problem)
+        return PolicyState(problem=problem, knowledge=knowledge)
 
     def plan(
         self, step: Step, plan_state: PolicyState
@@ -83,7 +84,8 @@ class PolicyPlanner(Planner[PolicyState]):
         """
         problem = plan_state.problem
         observations = self.observe(step, plan_state)
-        array = np.asarray(self.policy(observations), np.float32)
+        result = self.policy(observations)
+        array = np.asarray(result, np.float32)
         low, high = problem.action_bounds
         shape = list(array.shape)
         expected_shape = [len(problem), len(low)]
@@ -122,7 +124,8 @@ class PolicyPlanner(Planner[PolicyState]):
 
     def revise(self, plan_state: PolicyState, problem: Problem) -> PolicyState:
         """Return the plan state of the updated λ; see `Planner`."""
-        return PolicyState(problem=problem, knowledge=_knowledge_of(problem))
+        knowledge = _knowledge_of(problem)
+        return PolicyState(problem=problem, knowledge=knowledge)
 
     def select(self, plan_state: PolicyState, members: Tensor) -> PolicyState:
         """Return the plan state of some episodes; see `Planner`."""

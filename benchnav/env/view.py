@@ -1,9 +1,9 @@
 """Observations of a policy: a crop that turns with the robot, and a state vector.
 
-`benchnav/OffRoad-v1` and `PolicyPlanner` compute observations by the same function.
-A policy therefore observes in an evaluation what it observed in training. The robot's
-frame has x ahead and y to its left. A crop is indexed as maps are, [row = y, column =
-x]. Letters in shapes: B episodes, H×W cells of the map, N×N cells of the crop, S state
+`benchnav/OffRoad-v1` and `PolicyPlanner` compute observations by the same function, so
+a policy observes the same in an evaluation as in training. In the robot's frame, x
+points ahead and y to the left. A crop is indexed as maps are, [row = y, column = x].
+Letters in shapes: B episodes, H×W cells of the map, N×N cells of the crop, S state
 dimensions.
 """
 
@@ -52,8 +52,8 @@ class View:
     """Part of the map that a policy observes.
 
     Args:
-        cells: N, rows and columns of the crop, at least 2; its cells have the size of
-            the map's.
+        cells: N, number of rows and columns of the crop, at least 2; a cell of the crop
+            has the size of a cell of the map.
         behind: fraction of the crop's length that is behind the robot, in [0, 1); at
             0.5 the robot is in the middle.
     """
@@ -72,7 +72,7 @@ class View:
         expect(0 <= self.behind < 1, f"`crop_behind` in [0, 1), got {self.behind}.")
 
     def reach_m(self, grid: Grid) -> float:
-        """Return half of the crop's length in metres, by which lengths are scaled."""
+        """Return half of the crop's length in metres, the unit of observed lengths."""
         return self.cells * grid.resolution_m / 2
 
     def corners_m(self, grid: Grid, state: Tensor) -> Tensor:
@@ -86,9 +86,11 @@ class View:
             Positions in metres, shape [B, 4, 2].
         """
         length = 2 * self.reach_m(grid)
-        ahead = torch.tensor([0.0, 1.0, 1.0, 0.0], dtype=state.dtype) - self.behind
-        to_left = torch.tensor([-0.5, -0.5, 0.5, 0.5], dtype=state.dtype)
-        positions = _to_map(state, length * ahead[None], length * to_left[None])
+        along = torch.tensor([0.0, 1.0, 1.0, 0.0], dtype=state.dtype) - self.behind
+        across = torch.tensor([-0.5, -0.5, 0.5, 0.5], dtype=state.dtype)
+        ahead = length * along[None]
+        to_left = length * across[None]
+        positions = _to_map(state, ahead, to_left)
         return torch.stack(positions, dim=-1)
 
     def crop(self, grid: Grid, knowledge: MapKnowledge, state: Tensor) -> Tensor:
@@ -114,18 +116,21 @@ class View:
         cell = (row * grid.width + column).flatten(1)
 
         def read(values: Tensor) -> Tensor:
-            return values.flatten(1).gather(1, cell).view(x.shape).float()
+            cropped = values.flatten(1).gather(1, cell)
+            return cropped.view(x.shape).float()
 
         episode = torch.arange(len(state), device=state.device)
         robot_row, robot_column = grid.cell_of(state[:, 0], state[:, 1])
         robot_elevation_m = knowledge.elevation_m[episode, robot_row, robot_column]
         rise_m = read(knowledge.elevation_m) - robot_elevation_m[:, None, None]
-        rise = rise_m / reach_m
+        rise = (rise_m / reach_m).clamp(-1, 1)
         seen = inside & (read(knowledge.seen) > 0)
+        risk = read(knowledge.risk_map)
+        spread = 2 * read(knowledge.spread)
         channels = [
-            torch.where(inside, read(knowledge.risk_map), 0.0),
-            torch.where(inside, 2 * read(knowledge.spread), 0.0),
-            torch.where(seen, rise.clamp(-1, 1), 0.0),
+            torch.where(inside, risk, 0.0),
+            torch.where(inside, spread, 0.0),
+            torch.where(seen, rise, 0.0),
             seen.float(),
         ]
         return torch.stack(channels, dim=1)
@@ -154,21 +159,22 @@ class View:
             `crop`, shape [B, 4, N, N], and `state`, shape [B, 5 + S − 3], both float32.
         """
         to_goal = goal_m - state[:, :2]
-        bearing = torch.atan2(to_goal[:, 1], to_goal[:, 0]) - state[:, 2]
+        azimuth = torch.atan2(to_goal[:, 1], to_goal[:, 0])
+        bearing = azimuth - state[:, 2]
+        goal_distance = distance(state, goal_m) / self.reach_m(grid)
         numbers = [
-            _squash(distance(state, goal_m) / self.reach_m(grid)),
+            _squash(goal_distance),
             bearing.cos(),
             bearing.sin(),
             torch.where(observed.isnan(), 1.0, observed),
             time_left.clamp(0, 1),
         ]
         numbers = [number.float() for number in numbers]
-        # Velocities, and whatever else the state of this robot has beyond its pose.
+        common = torch.stack(numbers, dim=1)
+        # Velocities, and all other dimensions of the robot's state beyond its pose.
         extra = _squash(state[:, _POSE:]).float()
-        return {
-            "crop": self.crop(grid, knowledge, state),
-            "state": torch.cat((torch.stack(numbers, dim=1), extra), dim=1),
-        }
+        vector = torch.cat((common, extra), dim=1)
+        return {"crop": self.crop(grid, knowledge, state), "state": vector}
 
 
 def bounds(states: int) -> tuple[list[float], list[float]]:
@@ -181,8 +187,9 @@ def bounds(states: int) -> tuple[list[float], list[float]]:
         Two lists of length 5 + S − 3.
     """
     n_extra = states - _POSE
-    minimum = [0.0, -1.0, -1.0, 0.0, 0.0] + [-1.0] * n_extra
-    maximum = [1.0] * (len(NUMBERS) + n_extra)
+    minimum = [0.0, -1.0, -1.0, 0.0, 0.0]
+    minimum += [-1.0] * n_extra
+    maximum = [1.0] * len(minimum)
     return minimum, maximum
 
 
@@ -191,10 +198,12 @@ def _to_map(state: Tensor, ahead: Tensor, to_left: Tensor) -> tuple[Tensor, Tens
 
     Args:
         state: states of the robots, shape [B, …, S].
-        ahead: distance ahead of the robot; broadcasts to [B, *K].
-        to_left: distance to the left of the robot; likewise.
+        ahead: distance ahead of the robot in metres; broadcasts to [B, *K].
+        to_left: distance to the left of the robot in metres; broadcasts to [B, *K].
     """
-    x, y, heading = (state[..., i, None] for i in range(_POSE))
+    x = state[..., 0, None]
+    y = state[..., 1, None]
+    heading = state[..., 2, None]
     cos = heading.cos()
     sin = heading.sin()
     x = x + cos * ahead - sin * to_left

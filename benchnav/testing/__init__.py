@@ -1,4 +1,4 @@
-"""Checks of custom parts: that a planner, model, … fulfils its contract."""
+"""Checks that custom parts, such as planners and models, fulfil their contracts."""
 
 from benchnav.core.public_names import face
 

@@ -4,7 +4,8 @@ Letters in shapes: B episodes; H×W cells; M joint samples; V values of λ.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -16,12 +17,19 @@ from benchnav.core.errors import ConfigError
 from benchnav.planning.sensing.belief import Belief, CovarianceModel, draw_scores
 from benchnav.planning.sensing.sensor import MIN_STD, Measurement
 from benchnav.testing.belief_fields import VALUES, check_fields
-from benchnav.testing.belief_inputs import KEYS, UNOBSERVED, measure, measurements, pose
+from benchnav.testing.belief_inputs import (
+    KEYS,
+    UNOBSERVED,
+    measure,
+    measurements,
+    no_measurement,
+    pose,
+)
 from benchnav.testing.breaches import NOTHING, Breaches, same
 from benchnav.testing.distribution import check_functions
 
 _DRAWS = 8  # joint samples of all measurements
-_SAMPLING_ERROR = 0.01  # tolerated rise of the mean variance over so few samples
+_SAMPLING_ERROR = 0.01  # tolerated rise of the mean variance, for `_DRAWS` samples
 _AT_TOLERANCE = 0.01  # between λ̂ of `at` and of `distribution`
 
 
@@ -34,8 +42,8 @@ def check_belief(
     """Check that a belief fulfils its contract.
 
     It receives measurements of λ along a path in three of four episodes. The
-    predictions are a mixture of three classes, two of them look-alike, and quantiles;
-    a belief that requires a mixture rejects quantiles with a ConfigError that names
+    predictions are quantiles, and a mixture of three classes, two of them look-alike.
+    A belief that requires a mixture must reject quantiles with a ConfigError that names
     their class.
 
     The contract:
@@ -43,11 +51,11 @@ def check_belief(
     - the distribution is a TraversabilityDistribution of shape [B, H, W] on the
       prediction's device, with consistent functions;
     - it equals the prediction, or a new prediction, until λ is measured;
-    - an update without measurements changes nothing, nor does a repeated measurement
-      without noise, nor any measurement if the belief does not learn;
+    - three updates change nothing: one without measurements, a repeated measurement
+      without noise, and any measurement if the belief does not learn;
     - measurements sampled from the prediction reduce the variance on average;
     - `changed` marks all cells whose belief changed;
-    - `at` returns λ̂ of selected cells within 0.01 of that of the distribution;
+    - `at` returns λ̂ of selected cells, within 0.01 of the distribution's;
     - `sample_fields` returns λ in [0, 1] of shape [B, M, H, W]; it depends only on the
       keys, and its marginals are those of the distribution;
     - arguments and global generators are unchanged;
@@ -65,23 +73,24 @@ def check_belief(
     """
     new_belief = registry.take("belief", belief)
     breaches = Breaches("belief", type(new_belief).__name__)
-    breaches.expect(
-        isinstance(new_belief.learns, bool),
-        f"Expected `learns` of type bool, got {new_belief.learns!r}.",
-    )
+    learns = new_belief.learns
+    is_bool = isinstance(learns, bool)
+    breaches.expect(is_bool, f"Expected `learns` of type bool, got {learns!r}.")
     breaches.raise_any()
     for index, (height, width) in enumerate(shapes):
         kinds = ("a mixture",) if index else ("a mixture", "quantiles")
         for kind in kinds:
             breaches.location = f"{height}×{width}, {kind}"
-            covariance, prior, other = pose(
-                height, width, kind == "quantiles", torch.device(device)
+            by_quantiles = kind == "quantiles"
+            covariance, prior, new_prior = pose(
+                height, width, by_quantiles, torch.device(device)
             )
-            if kind == "quantiles" and _rejects_by_name(new_belief, prior, covariance):
+            if by_quantiles and _rejects_by_name(new_belief, prior, covariance):
                 continue
-            _BeliefCheck(
-                new_belief, covariance, prior, other, tolerance, breaches
-            ).run()
+            check = _BeliefCheck(
+                new_belief, covariance, prior, new_prior, tolerance, breaches
+            )
+            check.run()
     breaches.raise_any()
 
 
@@ -92,21 +101,19 @@ class _BeliefCheck:
     belief: Belief[Any]
     covariance: CovarianceModel
     prior: TraversabilityDistribution
-    other: TraversabilityDistribution  # another prediction
+    new_prior: TraversabilityDistribution
     tolerance: float
     breaches: Breaches
 
     def run(self) -> None:
         """Update step by step, then again in ways that should change nothing."""
         looks = list(measurements(self.prior, self.covariance))
-        state = first = self.begin(self.prior)
-        if state is NOTHING or not self.is_sound(state):
+        first = self.begin(self.prior)
+        if first is NOTHING or not self.is_sound(first):
             return
-        self.expect_of(
-            state,
-            self.prior,
-            "Expected what is believed at first to be the prediction, got another.",
-        )
+        breach = "Expected the initial belief to equal the prediction, got another."
+        self.expect_of(first, self.prior, breach)
+        state = first
         for sensed in looks:
             before = state
             state = self.update(before, sensed)
@@ -115,17 +122,18 @@ class _BeliefCheck:
             again = self.belief.update(before, sensed)
             self.expect(
                 self.alike(again, state, 0),
-                "Expected the same from `update` when asked again, got another.",
+                "Expected the same result from `update` when called again, got another.",
             )
             self.try_changed(before, state)
         shown = _cdf(self.belief.distribution(state))
-        self.begin(self.other)
+        self.begin(self.new_prior)
         again = _cdf(self.belief.distribution(state))
         self.expect(
             same(again, shown),
-            "Expected the same after other maps were begun, got another.",
+            "Expected the same belief after `init` on other maps, got another.",
         )
-        check_functions(self.belief.distribution(state), self.tolerance, self.breaches)
+        distribution = self.belief.distribution(state)
+        check_functions(distribution, self.tolerance, self.breaches)
         self.try_nothing(first, state)
         self.try_repeated(state, looks[-1])
         self.try_drawn(first, looks)
@@ -170,25 +178,28 @@ class _BeliefCheck:
         if belief is NOTHING:
             return False
         name = type(belief).__name__
-        if not self.expect(
+        is_distribution = self.expect(
             isinstance(belief, TraversabilityDistribution),
             f"Expected a TraversabilityDistribution from `distribution`, got {name}.",
-        ):
+        )
+        if not is_distribution:
             return False
         shape = list(self.prior.shape)
         device = self.prior.device
         got = list(belief.shape)
-        fits = got == shape and belief.device == device
-        if not self.expect(
-            fits and belief.dtype.is_floating_point,
+        is_in_place = got == shape and belief.device == device
+        fits = self.expect(
+            is_in_place and belief.dtype.is_floating_point,
             f"Expected a distribution of shape {shape} on {device}, got one of "
             f"shape {got} in {belief.dtype} on {belief.device}.",
-        ):
+        )
+        if not fits:
             return False
         probabilities = _cdf(belief)
+        in_range = (probabilities >= 0) & (probabilities <= 1)
         return self.expect(
-            bool(((probabilities >= 0) & (probabilities <= 1)).all()),
-            "Expected probabilities in [0, 1] of what is believed, got others.",
+            bool(in_range.all()),
+            "Expected probabilities of the belief in [0, 1], got others.",
         )
 
     def alike(
@@ -202,40 +213,38 @@ class _BeliefCheck:
             tolerance: tolerance between probabilities.
             members: indices of episodes of the second state; if None, all.
         """
-        probabilities = _cdf(self.belief.distribution(first))
-        others = _cdf(self.belief.distribution(second))
+        a = _cdf(self.belief.distribution(first))
+        b = _cdf(self.belief.distribution(second))
         if members is not None:
-            others = others[:, members]
-        return same(probabilities, others, tolerance)
+            b = b[:, members]
+        return same(a, b, tolerance)
 
     def expect_of(
         self, state: Any, prior: TraversabilityDistribution, breach: str, first: int = 0
     ) -> None:
-        """Expect a prediction in the episodes from an index on."""
-        probabilities = _cdf(self.belief.distribution(state))[:, first:]
+        """Expect a state to equal a prediction, in the episodes from an index on."""
+        distribution = self.belief.distribution(state)
+        probabilities = _cdf(distribution)[:, first:]
         expected = _cdf(prior)[:, first:]
-        self.expect(same(probabilities, expected, self.tolerance), breach)
+        is_same = same(probabilities, expected, self.tolerance)
+        self.expect(is_same, breach)
 
     def try_changed(self, before: Any, after: Any, has_measured: bool = True) -> None:
         """Expect `changed` to mark the cells whose belief changed."""
-        marked = self.breaches.watch(
-            "changed",
-            lambda: self.belief.changed(before, after),
-            before=before,
-            after=after,
-        )
+        changed = partial(self.belief.changed, before, after)
+        marked = self.breaches.watch("changed", changed, before=before, after=after)
         shape = tuple(self.prior.shape)
         is_bool = isinstance(marked, Tensor) and marked.dtype == torch.bool
         is_map = is_bool and tuple(marked.shape) == shape
-        if marked is NOTHING or not self.expect(
-            is_map, f"Expected a bool map of shape {list(shape)} from `changed`."
-        ):
+        breach = f"Expected a bool map of shape {list(shape)} from `changed`."
+        if marked is NOTHING or not self.expect(is_map, breach):
             return
-        probabilities = _cdf(self.belief.distribution(before))
-        difference = probabilities - _cdf(self.belief.distribution(after))
-        is_changed = (difference.abs() > self.tolerance).any(0)
+        old = _cdf(self.belief.distribution(before))
+        new = _cdf(self.belief.distribution(after))
+        is_changed = ((old - new).abs() > self.tolerance).any(0)
+        is_missed = is_changed & ~marked
         self.expect(
-            not bool((is_changed & ~marked).any()),
+            not bool(is_missed.any()),
             "Expected `changed` to mark all cells whose belief changed, got some "
             "left out.",
         )
@@ -248,12 +257,13 @@ class _BeliefCheck:
 
     def try_nothing(self, first: Any, last: Any) -> None:
         """Expect an update without measurements to change nothing."""
-        nothing = measure(torch.full(self.prior.shape, torch.nan), self.prior)
+        nothing = no_measurement(self.prior)
         for state in (first, last):
             after = self.update(state, nothing)
+            is_same = after is NOTHING or self.alike(after, state, self.tolerance)
             self.expect(
-                after is NOTHING or self.alike(after, state, self.tolerance),
-                "Expected that nothing changes where nothing is sensed, got a change.",
+                is_same,
+                "Expected an update without measurements to change nothing, got a change.",
             )
         breach = (
             "Expected the prediction of an episode in which nothing was sensed, "
@@ -263,12 +273,12 @@ class _BeliefCheck:
 
     def try_repeated(self, last: Any, sensed: Measurement) -> None:
         """Expect λ that is measured again without noise to change nothing."""
-        exact = Measurement(
-            traversability=sensed.traversability,
-            std=torch.full_like(sensed.traversability, MIN_STD),
-        )
+        std = torch.full_like(sensed.traversability, MIN_STD)
+        exact = replace(sensed, std=std)
         once = self.update(last, exact)
-        twice = NOTHING if once is NOTHING else self.update(once, exact)
+        if once is NOTHING:
+            return
+        twice = self.update(once, exact)
         if twice is not NOTHING and self.is_sound(twice):
             self.expect(
                 self.alike(twice, once, self.tolerance),
@@ -279,43 +289,46 @@ class _BeliefCheck:
     def try_drawn(self, first: Any, looks: Sequence[Measurement]) -> None:
         """Expect measurements sampled from the prediction to reduce the variance.
 
-        With p = P(λ ≤ value), the variance of the event is p (1 − p). Its mean over
-        possible measurements cannot rise (law of total variance), although that of a
-        single update may.
+        With p = P(λ ≤ value), the variance of the event is p (1 − p). A single update
+        may increase it, but its mean over possible measurements cannot rise (law of
+        total variance).
         """
         if not self.belief.learns:
             return
-        observed = torch.stack([sensed.mask for sensed in looks]).any(0)
+        masks = torch.stack([sensed.mask for sensed in looks])
+        observed = masks.any(0)
         scores = draw_scores(self.covariance, _DRAWS, KEYS)
         scores = scores.to(self.prior.device, self.prior.dtype)
         prior = _cdf(self.prior)
         variances = []
         for index in range(_DRAWS):
             field = self.prior.from_normal(scores[:, index])
-            sensed = measure(torch.where(observed, field, torch.nan), self.prior)
+            values = torch.where(observed, field, torch.nan)
+            sensed = measure(values, self.prior)
             state = self.update(first, sensed)
             if state is NOTHING or not self.is_sound(state):
                 return
             posterior = _cdf(self.belief.distribution(state))
             variances.append(posterior * (1 - posterior))
-        rise = torch.stack(variances).mean(0) - prior * (1 - prior)
+        mean_variance = torch.stack(variances).mean(0)
+        rise = mean_variance - prior * (1 - prior)
+        mean_rise = float(rise[:, ~observed].mean())
         self.expect(
-            float(rise[:, ~observed].mean()) <= _SAMPLING_ERROR,
+            mean_rise <= _SAMPLING_ERROR,
             "Expected measurements sampled from the prediction to reduce the "
             "variance on average, got a rise.",
         )
 
     def try_prior(self, last: Any) -> None:
         """Expect a new prediction to replace the old one."""
-        nothing = measure(torch.full(self.prior.shape, torch.nan), self.prior)
-        after = self.update(last, nothing, self.other)
+        after = self.update(last, no_measurement(self.prior), self.new_prior)
         if after is NOTHING or not self.is_sound(after):
             return
         breach = (
             "Expected a new prediction to replace the old one where nothing was "
             "sensed, got another."
         )
-        self.expect_of(after, self.other, breach, UNOBSERVED)
+        self.expect_of(after, self.new_prior, breach, UNOBSERVED)
         self.try_changed(last, after, has_measured=False)
 
     def try_at(self, state: Any) -> None:
@@ -335,17 +348,16 @@ class _BeliefCheck:
         got: Any = type(selected).__name__
         if isinstance(selected, TraversabilityDistribution):
             got = list(selected.shape)
-        if not self.expect(
-            got == shape,
-            f"Expected a distribution of shape {shape} from `at`, got {got}.",
-        ):
+        breach = f"Expected a distribution of shape {shape} from `at`, got {got}."
+        if not self.expect(got == shape, breach):
             return
         belief = self.belief.distribution(state)
         mean = belief.mean()[cells][None]
         cvar = belief.cvar(0.8)[cells][None]
+        has_mean = same(selected.mean(), mean, _AT_TOLERANCE)
+        has_cvar = same(selected.cvar(0.8), cvar, _AT_TOLERANCE)
         self.expect(
-            same(selected.mean(), mean, _AT_TOLERANCE)
-            and same(selected.cvar(0.8), cvar, _AT_TOLERANCE),
+            has_mean and has_cvar,
             f"Expected mean and CVaR of `at` within {_AT_TOLERANCE} of the "
             "distribution's, got others.",
         )
@@ -357,7 +369,7 @@ class _BeliefCheck:
         check_fields(self.belief, state, selected, self.tolerance, self.breaches)
 
     def try_members(self, looks: Sequence[Measurement], last: Any) -> None:
-        """Expect the same for episodes in another batch, order or selection."""
+        """Expect equal beliefs for episodes in another batch, order or selection."""
         for indices in ([3], [1], [2, 0]):
             members = torch.tensor(indices, device=self.prior.device)
             separate = self.begin(self.prior.select(members))
@@ -374,13 +386,13 @@ class _BeliefCheck:
                 return
             self.expect(
                 self.alike(separate, last, self.tolerance, members),
-                "Expected for episodes alone and in another order what they got in "
-                "the batch, got another.",
+                "Expected the same results for single episodes and in another order as "
+                "in the batch, got others.",
             )
             self.expect(
                 self.alike(selected, last, self.tolerance, members),
-                "Expected of episodes that `select` keeps what they got in the batch, "
-                "got another.",
+                "Expected the same beliefs for episodes that `select` keeps as in the "
+                "batch, got others.",
             )
 
     def try_put(self, state: Any) -> None:
@@ -390,12 +402,8 @@ class _BeliefCheck:
         others = self.select(state, members)
         if others is NOTHING:
             return
-        combined = self.breaches.watch(
-            "put",
-            lambda: self.belief.put(state, replaced, others),
-            state=state,
-            others=others,
-        )
+        put = partial(self.belief.put, state, replaced, others)
+        combined = self.breaches.watch("put", put, state=state, others=others)
         order = torch.tensor([0, 2, 2, 0], device=self.prior.device)
         if combined is not NOTHING and self.is_sound(combined):
             self.expect(
@@ -414,17 +422,17 @@ class _BeliefCheck:
             return NOTHING
         shape = [len(members), *self.prior.shape[1:]]
         got = list(self.belief.distribution(selected).shape)
-        fits = self.expect(
-            got == shape,
+        breach = (
             f"Expected a distribution of shape {shape} of episodes that `select` "
-            f"keeps, got {got}.",
+            f"keeps, got {got}."
         )
-        return selected if fits else NOTHING
+        return selected if self.expect(got == shape, breach) else NOTHING
 
 
 def _cdf(distribution: TraversabilityDistribution) -> Tensor:
     """Return P(λ ≤ value) for several values, shape [V, B, H, W]."""
-    return torch.stack([distribution.cdf(value).double() for value in VALUES])
+    probabilities = [distribution.cdf(value).double() for value in VALUES]
+    return torch.stack(probabilities)
 
 
 def _rejects_by_name(

@@ -46,29 +46,29 @@ def check_fields(
     got: Any = type(fields).__name__
     if isinstance(fields, Tensor):
         got = list(fields.shape)
-    if fields is NOTHING or not expect(
-        got == shape, f"Expected fields of shape {shape}, got {got}."
-    ):
+    breach = f"Expected fields of shape {shape}, got {got}."
+    if fields is NOTHING or not expect(got == shape, breach):
         return
-    expect(
-        bool(((fields >= 0) & (fields <= 1)).all()),
-        "Expected fields of λ in [0, 1], got others.",
-    )
+    in_range = (fields >= 0) & (fields <= 1)
+    expect(bool(in_range.all()), "Expected fields of λ in [0, 1], got others.")
     fewer = draw(state, 2, KEYS)
     others = draw(state, 2, _OTHER_KEYS)
     expect(
         same(draw(state, 2, KEYS), fewer),
-        "Expected the same fields when asked again, got others.",
+        "Expected the same fields when called again, got others.",
     )
+    differ = others is NOTHING or not any(map(same, fewer, others))
     expect(
-        others is NOTHING or not any(map(same, fewer, others)),
+        differ,
         "Expected other fields under other keys, got the same.",
     )
     if selected is not NOTHING:
         of_selected = draw(selected, 2, [KEYS[2], KEYS[0]])
         members = torch.tensor([2, 0], device=fields.device)
+        expected = fewer[members]
+        is_same = of_selected is NOTHING or same(of_selected, expected, tolerance)
         expect(
-            of_selected is NOTHING or same(of_selected, fewer[members], tolerance),
+            is_same,
             "Expected an episode's fields to depend only on its key, got others.",
         )
     for value in VALUES[1:]:
@@ -76,8 +76,8 @@ def check_fields(
         error = (probability * (1 - probability) / _FIELDS).sqrt()
         frequency = (fields <= value).double().mean(1)
         deviation = (frequency - probability).abs()
+        is_close = deviation <= _MAX_ERRORS * error + 0.03
         expect(
-            bool((deviation <= _MAX_ERRORS * error + 0.03).all()),
-            "Expected fields whose cells have the distribution that is believed, "
-            "got others.",
+            bool(is_close.all()),
+            "Expected fields whose cells have the belief's distribution, got others.",
         )

@@ -28,10 +28,16 @@ def measure(values: Tensor, prior: TraversabilityDistribution) -> Measurement:
 
     Args:
         values: λ, NaN in cells without a measurement, shape [B, H, W].
-        prior: prediction that has the dtype and device.
+        prior: prediction, whose dtype and device the measurement has.
     """
     values = values.to(dtype=prior.dtype, device=prior.device)
-    return Measurement(traversability=values, std=torch.full_like(values, _STD))
+    std = torch.full_like(values, _STD)
+    return Measurement(traversability=values, std=std)
+
+
+def no_measurement(prior: TraversabilityDistribution) -> Measurement:
+    """Return a measurement without any measured cell."""
+    return measure(torch.full(prior.shape, torch.nan), prior)
 
 
 def measurements(
@@ -39,21 +45,22 @@ def measurements(
 ) -> Iterator[Measurement]:
     """Yield measurements of λ along a path from left to right, with λ of 0 and 1.
 
-    The second episode has none in the first step, the last has none in all steps.
+    The second episode has no measurement in the first step; the last never has one.
 
     Args:
-        prior: prediction that λ is sampled from.
+        prior: prediction from which λ is sampled.
         covariance: covariance model of the λ field.
     """
     score = draw_scores(covariance, 1, KEYS)[:, 0].to(prior.device)
     field = prior.from_normal(score.to(prior.dtype))
     height, width = covariance.grid.shape
     row = height // 2
+    rows = slice(row - 1, row + 1)
     for step in range(_STEPS):
         begin = step * width // (_STEPS + 1)
         end = (step + 1) * width // (_STEPS + 1)
         values = torch.full_like(field, torch.nan)
-        values[:, row - 1 : row + 1, begin:end] = field[:, row - 1 : row + 1, begin:end]
+        values[:, rows, begin:end] = field[:, rows, begin:end]
         values[0, row, begin] = 0.0
         values[2, row, begin] = 1.0
         values[UNOBSERVED] = torch.nan
@@ -73,17 +80,18 @@ def pose(
         by_quantiles: whether predictions are quantiles instead of mixtures.
         device: device of the predictions.
     """
+    statistics = GroundStatistics(
+        weights=(0.3, 0.7),
+        means=(0.1, 0.7),
+        stds=(0.1, 0.15),
+        layer_means={"rgb": (120.0, 110.0, 90.0)},
+        look_alikes=(("firm", "soft"),),
+        potts_strength=0.8,
+    )
     covariance = CovarianceModel(
         grid=Grid(height, width, 0.5),
         correlation_m=1.0,
-        statistics=GroundStatistics(
-            weights=(0.3, 0.7),
-            means=(0.1, 0.7),
-            stds=(0.1, 0.15),
-            layer_means={"rgb": (120.0, 110.0, 90.0)},
-            look_alikes=(("firm", "soft"),),
-            potts_strength=0.8,
-        ),
+        statistics=statistics,
         class_names=("firm", "soft", "sand"),
     )
     generator = torch.Generator().manual_seed(SEED)
@@ -98,6 +106,8 @@ def pose(
         means = min_means + 0.1 * uniform[1]
         stds = 0.08 + 0.05 * uniform[2]
         mixture = TraversabilityMixture(weights, means, stds, (0, 1, 2))
-        return quantiles_at(mixture, LEVELS) if by_quantiles else mixture
+        if by_quantiles:
+            return quantiles_at(mixture, LEVELS)
+        return mixture
 
     return covariance, predict(), predict()

@@ -1,4 +1,4 @@
-"""Common tools of all checks: observed calls, comparisons, and a list of breaches."""
+"""Tools of all checks: calls with checks of side effects, comparisons, breaches."""
 
 import pickle
 import random
@@ -17,18 +17,18 @@ from benchnav.core.batch import find_tensor_fault
 from benchnav.core.errors import BenchnavError, ConfigError
 
 SEED = 20240229
-NOTHING = object()  # stands for the answer of a call that raised
+NOTHING = object()  # replaces the answer of a call that raised
 
 
 class Breaches:
-    """A collection of breaches of a contract: each once, with its locations.
+    """Collection of the breaches of a contract, each listed once with its locations.
 
     Args:
         kind: kind of the part, as in `check_<kind>`.
         name: name of the part in messages.
 
     Attributes:
-        location: where the next breaches are noted, such as a size of maps.
+        location: location of the next breaches, such as a size of maps.
     """
 
     def __init__(self, kind: str, name: str) -> None:
@@ -54,7 +54,7 @@ class Breaches:
         """Return a function that expects finite numbers of a shape.
 
         Args:
-            what: the values in messages.
+            what: description of the values, for messages.
             like: tensor of the expected dtype and device.
             shape: expected shape.
         """
@@ -74,7 +74,8 @@ class Breaches:
             for leading in ((6,), (6, 5), (6, 5, 2)):
                 self.location = f"*B = {list(leading)}, {dtype}"
                 like = torch.zeros(1, dtype=dtype, device=device)
-                yield Draws(leading, like, torch.Generator().manual_seed(SEED))
+                generator = torch.Generator().manual_seed(SEED)
+                yield Draws(leading, like, generator)
 
     def try_function(
         self,
@@ -89,8 +90,8 @@ class Breaches:
         Args:
             what: name of the function in messages.
             act: the function.
-            arguments: its arguments by name: tensors whose first dimension is the
-                batch, or values with a method `select`.
+            arguments: arguments of the function by name: tensors whose first dimension
+                is the batch, or values with a method `select`.
             is_usable: function that returns whether an answer can be checked further.
             tolerance: tolerance between answers for a single element and a batch.
 
@@ -100,16 +101,18 @@ class Breaches:
         answer = self.watch(what, lambda: act(**arguments), **arguments)
         if answer is NOTHING or not is_usable(answer):
             return NOTHING
+        again = act(**arguments)
         self.expect(
-            same(act(**arguments), answer),
-            f"Expected the same from `{what}` when asked again, got another.",
+            same(again, answer),
+            f"Expected the same result from `{what}` when called again, got another.",
         )
         last_only = {name: _last(value) for name, value in arguments.items()}
         single = self.watch(what, lambda: act(**last_only))
+        expected = _last(answer)
         self.expect(
-            same(single, _last(answer), tolerance),
-            f"Expected the same from `{what}` for one alone and in a batch, got "
-            "another.",
+            same(single, expected, tolerance),
+            f"Expected the same result from `{what}` for a single element as in a batch, "
+            "got another.",
         )
         return answer
 
@@ -119,8 +122,8 @@ class Breaches:
         Args:
             what: name of the function in messages.
             act: the call.
-            arguments: its arguments by name; all tensors, arrays, generators and
-                numbers nested in them are compared before and after the call.
+            arguments: arguments of the call by name; all tensors, arrays, generators
+                and numbers nested in them are compared before and after the call.
 
         Returns:
             The answer; `NOTHING` if the call raised.
@@ -134,19 +137,21 @@ class Breaches:
             got = f"{_text_of(error)} {_origin_of(error)}"
             self.expect(False, f"Expected an answer from `{what}`, got {got}")
         after = dict(_leaves(arguments))
-        changed = [
-            name for name, leaf in before.items() if not same(leaf, after.get(name))
-        ]
+        changed = []
+        for name, leaf in before.items():
+            if not same(leaf, after.get(name)):
+                changed.append(name)
         listed = ", ".join(changed[:3])
         self.expect(
             not changed,
-            f"Expected `{what}` to leave its arguments as they were, got another "
+            f"Expected `{what}` to leave its arguments unchanged, got another "
             f"{listed}.",
         )
         for whose, state in _generators().items():
+            previous = states.get(whose, state)
             self.expect(
-                states.get(whose, state) == state,
-                f"Expected {whose} global generator to be unchanged, got it changed. "
+                previous == state,
+                f"Expected {whose} global generator to be unchanged, got a change. "
                 "Draw from a generator of your own, or from the one that is passed.",
             )
         return answer
@@ -169,7 +174,7 @@ class Breaches:
             if where:
                 listed += f" [{where}]"
         raise ConfigError(
-            f"Expected a {self._kind} that keeps the contract of "
+            f"Expected a {self._kind} that fulfils the contract of "
             f"`benchnav.testing.check_{self._kind}`, got "
             f"{self._name}, which breaks it:{listed}"
         )
@@ -205,21 +210,23 @@ def same(first: Any, second: Any, tolerance: float = 0.0) -> bool:
         second: any value.
         tolerance: tolerance between tensors; if above 0, their dtypes may differ.
     """
+    is_same = partial(same, tolerance=tolerance)
     if is_dataclass(first) and type(first) is type(second):
+        names = [field.name for field in fields(first)]
         return all(
-            same(getattr(first, field.name), getattr(second, field.name), tolerance)
-            for field in fields(first)
+            is_same(getattr(first, name), getattr(second, name)) for name in names
         )
     if isinstance(first, tuple) and isinstance(second, tuple):
-        is_same = partial(same, tolerance=tolerance)
         return len(first) == len(second) and all(map(is_same, first, second))
     if not isinstance(first, Tensor) or not isinstance(second, Tensor):
         return type(first) is type(second) and bool(first == second)
-    if first.shape != second.shape or not (tolerance or first.dtype == second.dtype):
+    if first.shape != second.shape:
         return False
-    return torch.allclose(
-        first.double(), second.double(), tolerance, tolerance, equal_nan=True
-    )
+    if tolerance == 0 and first.dtype != second.dtype:
+        return False
+    a = first.double()
+    b = second.double()
+    return torch.allclose(a, b, tolerance, tolerance, equal_nan=True)
 
 
 def _text_of(error: Exception) -> str:
@@ -238,7 +245,9 @@ def _origin_of(error: Exception) -> str:
 
 
 def _last(value: Any) -> Any:
-    return value[-1:] if isinstance(value, Tensor) else value.select(torch.tensor([-1]))
+    if isinstance(value, Tensor):
+        return value[-1:]
+    return value.select(torch.tensor([-1]))
 
 
 def _leaves(
@@ -265,7 +274,8 @@ def _leaves(
         elif isinstance(value, list | tuple):
             parts = dict(enumerate(value))
         for key, part in list(parts.items()):
-            yield from _leaves(part, f"{name}.{key}".lstrip("."), seen)
+            path = f"{name}.{key}".lstrip(".")
+            yield from _leaves(part, path, seen)
 
 
 def _generators() -> dict[str, bytes]:

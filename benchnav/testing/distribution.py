@@ -16,7 +16,8 @@ from benchnav.testing.breaches import NOTHING, Breaches
 _TENTHS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 _VALUES = (0.0, 0.01, 0.05, *_TENTHS, 0.95, 0.99, 1.0)
 _PROBABILITIES = (0.0, 0.01, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.99, 1.0)
-_LEVEL, _FLOOR = 0.9, 0.05  # of the compared CVaR and expected time
+_LEVEL = 0.9  # of the compared CVaR
+_FLOOR = 0.05  # of λ in the compared expected time
 # Factor of the tolerance between closed forms and the base's quadrature.
 _QUADRATURE = 10
 
@@ -40,9 +41,11 @@ def check_functions(
         """Return a method's answer, or `NOTHING` if it is not usable."""
         method = getattr(distribution, name)
         answer = breaches.watch(name, lambda: method(*arguments))
-        what = f"what `{name}` of the distribution gives"
+        if answer is NOTHING:
+            return NOTHING
+        what = f"results of `{name}` of the distribution"
         is_map = breaches.is_tensor(what, like, distribution.shape)
-        return answer if answer is not NOTHING and is_map(answer) else NOTHING
+        return answer if is_map(answer) else NOTHING
 
     probabilities = [call("cdf", value) for value in (-tolerance, *_VALUES)]
     values = [call("quantile", probability) for probability in _PROBABILITIES]
@@ -50,13 +53,15 @@ def check_functions(
         return
     starts_at_0 = bool((probabilities[0] == 0).all())
     ends_at_1 = bool((probabilities[-1] == 1).all())
+    ascends = _ascend(probabilities, tolerance)
     expect(
-        _ascend(probabilities, tolerance) and starts_at_0 and ends_at_1,
+        ascends and starts_at_0 and ends_at_1,
         "Expected `cdf` to ascend from 0 below λ = 0 to 1 at λ = 1, got another.",
     )
-    is_within = bool((values[0] >= 0).all()) and bool((values[-1] <= 1).all())
+    starts_inside = bool((values[0] >= 0).all())
+    ends_inside = bool((values[-1] <= 1).all())
     expect(
-        _ascend(values, 0) and is_within,
+        _ascend(values, 0) and starts_inside and ends_inside,
         "Expected `quantile` to ascend within [0, 1], got another.",
     )
     for value, probability in zip(values, _PROBABILITIES, strict=True):
@@ -68,7 +73,8 @@ def check_functions(
             bool(is_inverse.all()),
             "Expected `quantile` to be the inverse of `cdf`, got another.",
         )
-    if type(distribution).cdf_limits is not TraversabilityDistribution.cdf_limits:
+    base = TraversabilityDistribution
+    if type(distribution).cdf_limits is not base.cdf_limits:
         for value, probability in zip(_VALUES, probabilities[1:], strict=True):
             lower, upper = distribution.cdf_limits(value)
             minimum = distribution.cdf(value - tolerance) - tolerance
@@ -89,25 +95,30 @@ def _check_integrals(
 ) -> None:
     """Note where an overridden integral differs from the base's quadrature."""
     base = TraversabilityDistribution
-    for name, arguments in (
-        ("mean", ()),
-        ("cvar", (_LEVEL,)),
-        ("expected_time", (_FLOOR,)),
-        ("time_cvar", (_LEVEL, _FLOOR)),
-    ):
+    integrals: dict[str, tuple[float, ...]] = {
+        "mean": (),
+        "cvar": (_LEVEL,),
+        "expected_time": (_FLOOR,),
+        "time_cvar": (_LEVEL, _FLOOR),
+    }
+    for name, arguments in integrals.items():
         integral = call(name, *arguments)
-        is_inherited = getattr(type(distribution), name) is getattr(base, name)
+        by_quadrature = getattr(base, name)
+        is_inherited = getattr(type(distribution), name) is by_quadrature
         if integral is NOTHING or is_inherited:
             continue
-        expected = getattr(base, name)(distribution, *arguments)
-        error = ((integral - expected).abs() / expected.clamp(min=1)).max()
+        expected = by_quadrature(distribution, *arguments)
+        scale = expected.clamp(min=1)
+        error = (integral - expected).abs() / scale
         breaches.expect(
-            bool(error <= tolerance),
+            bool(error.max() <= tolerance),
             f"Expected `{name}` to follow from `cdf` and `quantile`, got another.",
         )
 
 
 def _ascend(maps: list[Tensor], tolerance: float) -> bool:
-    return all(
-        bool((second >= first - tolerance).all()) for first, second in pairwise(maps)
-    )
+    for first, second in pairwise(maps):
+        ascends = second >= first - tolerance
+        if not bool(ascends.all()):
+            return False
+    return True

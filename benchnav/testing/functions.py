@@ -1,7 +1,7 @@
 """Checks of robots, objectives and risk measures on random arguments.
 
-All are pure functions of a batch. Letters in shapes: *B leading, S state and A action
-dimensions; for distributions B maps, H×W cells, K components, Q quantiles.
+All three are pure functions of a batch. Letters in shapes: *B leading, S state and A
+action dimensions; for distributions B maps, H×W cells, K components, Q quantiles.
 """
 
 import itertools
@@ -57,24 +57,23 @@ def check_robot(
     breaches = Breaches("robot", type(new_robot).__name__)
     for name in ("dt_s", "top_speed_mps"):
         value = getattr(new_robot, name)
-        breaches.expect(
-            0 < value < math.inf, f"Expected `{name}` > 0 and finite, got {value}."
-        )
+        is_valid = 0 < value < math.inf
+        breaches.expect(is_valid, f"Expected `{name}` > 0 and finite, got {value}.")
     low = new_robot.action_low
     high = new_robot.action_high
     rates = new_robot.action_rates
     n_actions = len(new_robot.action_names)
-    is_ordered = all(
-        -math.inf < lower < upper < math.inf
-        for lower, upper in zip(low, high, strict=False)
-    )
+    bounds = zip(low, high, strict=False)
+    is_ordered = all(-math.inf < lower < upper < math.inf for lower, upper in bounds)
+    is_complete = len(low) == len(high) == n_actions
     breaches.expect(
-        is_ordered and len(low) == len(high) == n_actions,
+        is_ordered and is_complete,
         f"Expected finite bounds, low below high, of {n_actions} actions, got {low} "
         f"and {high}.",
     )
+    are_rates = rates is None or (len(rates) == n_actions and min(rates) > 0)
     breaches.expect(
-        rates is None or (len(rates) == n_actions and min(rates) > 0),
+        are_rates,
         f"Expected `action_rates` > 0 of {n_actions} actions, got {rates}.",
     )
     breaches.raise_any()
@@ -91,11 +90,12 @@ def _try_robot(
     state = breaches.watch(
         "initial_state", lambda: robot.initial_state(pose), pose=pose
     )
-    if not expect(
+    has_pose = expect(
         isinstance(state, Tensor) and same(state[..., :3], pose),
         f"Expected initial states in {pose.dtype} that begin with the pose (x, y, θ), "
         "got others.",
-    ):
+    )
+    if not has_pose:
         return
     state = state.reshape(*draws.leading, -1)
     max_length = 1.001 * robot.top_speed_mps * robot.dt_s
@@ -104,11 +104,12 @@ def _try_robot(
         action = draws.uniform(robot.action_low, robot.action_high)
         traversability = draws.uniform([0], [1])[..., 0]
         arguments = {"state": state, "action": action, "traversability": traversability}
-        is_state = breaches.is_tensor("what `F` gives", draws.like, state.shape)
+        is_state = breaches.is_tensor("results of `F`", draws.like, state.shape)
         next_state = breaches.try_function("F", robot, arguments, is_state)
         if next_state is NOTHING:
             return
-        expect(bool((_lengths(state, next_state) <= max_length).all()), too_long)
+        is_short = _lengths(state, next_state) <= max_length
+        expect(bool(is_short.all()), too_long)
         at_zero = robot(state, action, torch.zeros_like(traversability))
         stands = not stands_at_zero or same(at_zero[..., :2], state[..., :2], 1e-6)
         expect(
@@ -119,20 +120,21 @@ def _try_robot(
         state = next_state
     # An accelerating robot reaches its top speed only after several steps, with its
     # actions at their bounds.
-    for corner in itertools.product(
-        *zip(robot.action_low, robot.action_high, strict=True)
-    ):
+    bounds = zip(robot.action_low, robot.action_high, strict=True)
+    for corner in itertools.product(*bounds):
         action = state.new_tensor(corner).expand(*draws.leading, -1)
         full = torch.ones_like(traversability)
         state = robot.initial_state(pose).reshape(state.shape)
         for _ in range(_CONSTANT_STEPS):
             previous = state
             state = robot(state, action, full)
-        expect(bool((_lengths(previous, state) <= max_length).all()), too_long)
+        is_short = _lengths(previous, state) <= max_length
+        expect(bool(is_short.all()), too_long)
 
 
 def _lengths(state: Tensor, next_state: Tensor) -> Tensor:
-    return torch.linalg.vector_norm((next_state - state)[..., :2], dim=-1)
+    motion = (next_state - state)[..., :2]
+    return torch.linalg.vector_norm(motion, dim=-1)
 
 
 def check_objective(
@@ -169,24 +171,29 @@ def check_objective(
     for draws in breaches.batches(device):
         pose = draws.uniform((0, 0, -3), (9, 9, 3)).reshape(-1, 3)
         state = new_robot.initial_state(pose).reshape(*draws.leading, -1)
-        traversability = torch.linspace(0, 1, len(pose)).to(pose).reshape(draws.leading)
-        target_shape = (draws.leading[0], *[1] * (len(draws.leading) - 1))
-        target = replace(draws, leading=target_shape).uniform((0, 0), (9, 9))
+        levels = torch.linspace(0, 1, len(pose)).to(pose)
+        traversability = levels.reshape(draws.leading)
+        n_inner = len(draws.leading) - 1
+        target_shape = (draws.leading[0], *[1] * n_inner)
+        target_draws = replace(draws, leading=target_shape)
+        target = target_draws.uniform((0, 0), (9, 9))
         action = draws.uniform(new_robot.action_low, new_robot.action_high)
         grade = draws.uniform([-1], [1])[..., 0]
         at = {"traversability": traversability, "target": target}
         of_motion = traversability.clamp(min=rules.min_traversability)
-        for method, arguments in (
-            ("stage", {"state": state, "action": action, **at}),
-            ("terminal", {"state": state, **at}),
-            ("path_cost", {"traversability": of_motion, "grade": grade}),
-        ):
-            what = f"what `{method}` gives"
+        calls = {
+            "stage": {"state": state, "action": action, **at},
+            "terminal": {"state": state, **at},
+            "path_cost": {"traversability": of_motion, "grade": grade},
+        }
+        for method, arguments in calls.items():
+            what = f"results of `{method}`"
             is_cost = breaches.is_tensor(what, draws.like, draws.leading)
             function = getattr(new_objective, method)
             cost = breaches.try_function(method, function, arguments, is_cost)
+        is_positive = cost is NOTHING or bool((cost > 0).all())
         breaches.expect(
-            cost is NOTHING or bool((cost > 0).all()),
+            is_positive,
             "Expected costs above 0 from `path_cost`, got others. Return a cost > 0 "
             "per metre.",
         )
@@ -253,13 +260,15 @@ def _try_measure(
     cells[0, ::2] = True
     cells[2, 1] = True
     on_map = breaches.watch("risk", lambda: measure(distribution))
-    if not (isinstance(on_map, Tensor) and on_map.shape == distribution.shape):
+    is_map_of_shape = isinstance(on_map, Tensor) and on_map.shape == distribution.shape
+    if not is_map_of_shape:
         return  # noted above
     selected = map_tensors(distribution.at(cells), lambda values: values[None])
     of_selected = breaches.watch("risk", lambda: measure(selected))
     expected = on_map[cells][None, None]
+    is_same = of_selected is NOTHING or same(of_selected, expected, tolerance)
     breaches.expect(
-        of_selected is NOTHING or same(of_selected, expected, tolerance),
+        is_same,
         "Expected the same λ̂ of selected cells as on the map, got another.",
     )
 
@@ -290,9 +299,9 @@ def _create_mixture(
 def _create_quantiles(device: torch.device) -> QuantileDistribution:
     """Return quantiles with atoms at 0, at 1 and in between, shape [3, Q, 8, 11]."""
     generator = torch.Generator().manual_seed(0)
-    first, second = torch.rand(2, 3, 1, 8, 11, generator=generator)
+    a, b = torch.rand(2, 3, 1, 8, 11, generator=generator)
     levels = torch.tensor(LEVELS).view(-1, 1, 1)
-    ascending = torch.lerp(first.minimum(second), first.maximum(second), levels)
+    ascending = torch.lerp(a.minimum(b), a.maximum(b), levels)
     values = (1.4 * ascending - 0.2).clamp(0, 1)
     values[:, 30:40] = values[:, 30:31]
     return QuantileDistribution(values.to(device))

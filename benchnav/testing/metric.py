@@ -16,7 +16,8 @@ def check_metric(metric: Any, robot: Any = "unicycle") -> None:
 
     - its attributes are those of `benchnav.metrics.Metric`;
     - `compute` returns a finite number or NaN for a success, a failure without motion
-      and a failure of one step, and the same number again;
+      and a failure of one step;
+    - the number is the same when repeated;
     - arguments and global generators are unchanged.
 
     Args:
@@ -36,8 +37,9 @@ def check_metric(metric: Any, robot: Any = "unicycle") -> None:
         compute = partial(measure, new_metric, episode)
         value = breaches.watch("compute", compute, metric=new_metric)
         again = breaches.watch("compute", compute, metric=new_metric)
+        is_same = NOTHING in (value, again) or repr(value) == repr(again)
         breaches.expect(
-            NOTHING in (value, again) or repr(value) == repr(again),
+            is_same,
             "Expected the same value when computed again, got another.",
         )
     breaches.raise_any()

@@ -19,7 +19,8 @@ from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Terrain
 from benchnav.datagen.files.stored_terrain import terrain_of
-from benchnav.datagen.recipe.recipe import Split, load_recipe
+from benchnav.datagen.recipe.load import load_recipe
+from benchnav.datagen.recipe.recipe import Split
 from benchnav.datagen.synth.generate import generate
 from benchnav.models.base import TraversabilityModel, predict
 from benchnav.models.nets.trainable import TrainableModel
@@ -49,8 +50,8 @@ def check_model(
 
     - the prediction is a TraversabilityDistribution of shape [B, H, W] for maps of any
       size, on the observation's device, of one floating-point dtype;
-    - its CDF ascends from 0 to 1, its quantiles in [0, 1] are the inverse, and its
-      integrals follow from these;
+    - its CDF ascends from 0 to 1, its quantiles are in [0, 1] and are the inverse of
+      the CDF, and its integrals follow from both;
     - a mixture has finite parameters, weights ≥ 0 that sum to 1, and standard
       deviations ≥ 0;
     - the observation and the global generators of Python, NumPy and PyTorch are
@@ -67,8 +68,8 @@ def check_model(
     lacks are random.
 
     Args:
-        model: a model, or an argument of `load_model`; the oracle receives the Terrain.
-            Or a class of trainable models, as a class, path/to/file.py:Class or name.
+        model: a model, an argument of `load_model`, or a class of trainable models, as
+            a class, path/to/file.py:Class or name. The oracle receives the Terrain.
         shapes: (H, W) of the maps; for a model with a fixed size of maps, that size.
         recipe: recipe of the maps, a shipped id or the path of a YAML file; its first
             scenario is used.
@@ -116,14 +117,15 @@ def _is_sound(
     tolerance: float,
     breaches: Breaches,
 ) -> bool:
-    """Note faults of a prediction of the right shape; return if its device is right."""
+    """Note faults of a prediction; return whether it is on the right device."""
     if isinstance(predicted, TraversabilityMixture):
         values = {
             "weights": predicted.weights,
             "means": predicted.means,
             "stds": predicted.stds,
         }
-        if not _are_on(device, list(values.values()), breaches):
+        tensors = list(values.values())
+        if not _are_on(device, tensors, breaches):
             return False
         if not _are_parameters(values, tolerance, breaches):
             return True
@@ -149,35 +151,38 @@ def _are_on(
 def _are_parameters(
     values: Mapping[str, Tensor], tolerance: float, breaches: Breaches
 ) -> bool:
-    """Note faults of a mixture's parameters; return whether there are none."""
+    """Note faults of a mixture's parameters; return whether it is free of faults."""
     expect = breaches.expect
     weights = values["weights"]
     dtypes = sorted({str(value.dtype) for value in values.values()})
+    listed = ", ".join(dtypes)
     is_sound = expect(
         len(dtypes) == 1 and weights.is_floating_point(),
-        f"Expected parameters of one floating-point dtype, got {', '.join(dtypes)}.",
+        f"Expected parameters of one floating-point dtype, got {listed}.",
     )
     for name, value in values.items():
+        is_finite = bool(value.isfinite().all())
         is_sound &= expect(
-            bool(value.isfinite().all()),
-            f"Expected finite `{name}`, got some that are not.",
+            is_finite, f"Expected finite `{name}`, got some that are not."
         )
         is_negative = name != "means" and bool((value < 0).any())
         is_sound &= expect(not is_negative, f"Expected `{name}` ≥ 0, got some below.")
     sums = weights.double().sum(1)
+    ones = torch.ones_like(sums)
     return is_sound & expect(
-        same(sums, torch.ones_like(sums), tolerance),
+        same(sums, ones, tolerance),
         "Expected `weights` that sum to 1 over the components, got other sums.",
     )
 
 
 def _fit_names(names: int, predicted: TraversabilityDistribution) -> str:
-    """Return a message if the number of `class_names` is wrong; otherwise, no text."""
+    """Return a message if the number of `class_names` is wrong, else an empty text."""
     if names == 0:
         return ""
     if not isinstance(predicted, TraversabilityMixture):
         try:
-            got: Any = list(predicted.class_probabilities(names).shape)
+            probabilities = predicted.class_probabilities(names)
+            got: Any = list(probabilities.shape)
         except ConfigError:
             got = f"a {type(predicted).__name__} without classes"
         shape = [*predicted.shape[:-2], names, *predicted.shape[-2:]]
@@ -229,17 +234,17 @@ def _check_classes(
         weights = predicted.weights
     else:
         return
-    got = list(members.shape) if isinstance(members, Tensor) else type(members).__name__
-    fits = (
-        isinstance(members, Tensor)
-        and members.shape[1:] == weights.shape
-        and len(members) > 0
-    )
+    got: Any = type(members).__name__
+    fits = False
+    if isinstance(members, Tensor):
+        got = list(members.shape)
+        fits = members.shape[1:] == weights.shape and len(members) > 0
     shape = f"[M, {str(list(weights.shape))[1:]}"
     if expect(fits, f"Expected `member_probabilities` of shape {shape}, got {got}."):
-        # In each cell, a class with a larger average has no smaller weight.
+        # In each cell, the weights descend in the order of the average.
         descending = members.mean(0).argsort(1, descending=True)
-        is_ordered = weights.gather(1, descending).diff(dim=1) <= tolerance
+        rise = weights.gather(1, descending).diff(dim=1)
+        is_ordered = rise <= tolerance
         order = "in the order of the average of `member_probabilities`"
         expect(
             bool(is_ordered.all()),
@@ -254,13 +259,14 @@ def _create_terrain(
     original = load_recipe(recipe)
     name, scenario = next(iter(original.scenarios.items()))
     cell_m = original.resolution_m
+    goal_m = ((width - 0.5) * cell_m, (height - 0.5) * cell_m)
     adapted = replace(
         original,
         height=height,
         width=width,
         places=None,
         start_m=(0.0, 0.0),
-        goal_m=((width - 0.5) * cell_m, (height - 0.5) * cell_m),
+        goal_m=goal_m,
         scenarios={name: scenario},
         splits={"contract": Split(scenario=name, maps=_MAPS)},
     )

@@ -12,9 +12,6 @@ import torch
 from torch import Tensor
 
 from benchnav.core import registry
-from benchnav.core.grid import Grid
-from benchnav.core.mixture import TraversabilityMixture
-from benchnav.core.terrain import Observation
 from benchnav.planning.free_space import FreeSpace, Rules
 from benchnav.planning.objective import GoalDistance
 from benchnav.planning.planners.boundary import (
@@ -23,12 +20,18 @@ from benchnav.planning.planners.boundary import (
     find_layer_faults,
 )
 from benchnav.planning.planners.planner import INPUTS, Plan, Planner, PlanStatus
-from benchnav.planning.problem import Prediction, Problem, Task, pose_problem
-from benchnav.planning.sensing.belief import CovarianceModel, Fields, Static
+from benchnav.planning.problem import Problem, Task
 from benchnav.planning.sensing.sensor import Step
 from benchnav.testing.breaches import NOTHING, SEED, Breaches, same
+from benchnav.testing.planner_inputs import (
+    change_input,
+    create_problem,
+    first_step,
+    invert_prediction,
+    numbered_step,
+    step_after,
+)
 
-_RESOLUTION_M = 0.5
 _STEPS = 3
 
 
@@ -58,7 +61,8 @@ def check_planner(
     - it is the same for a single episode, and for episodes selected by `select`, as in
       the batch;
     - robots of the batch that have reached the goal or left the map cause no error;
-    - inputs that are not in `uses` have no effect, whatever free space derives from.
+    - inputs that are not in `uses` have no effect, from whichever input free space
+      derives.
 
     Args:
         planner: a planner, or its name, file or mapping as in suites.
@@ -77,18 +81,21 @@ def check_planner(
     new_planner = registry.take("planner", planner)
     breaches = Breaches("planner", type(new_planner).__name__)
     steers = new_planner.steers
+    are_names = isinstance(steers, tuple) and all(map(_are_lines, steers))
     breaches.expect(
-        steers is None or (isinstance(steers, tuple) and all(map(_are_lines, steers))),
+        steers is None or are_names,
         f"Expected `steers` as tuples of action names, got {steers!r}.",
     )
+    is_bool = isinstance(new_planner.blind, bool)
     breaches.expect(
-        isinstance(new_planner.blind, bool),
-        f"Expected `blind` of type bool, got {new_planner.blind!r}.",
+        is_bool, f"Expected `blind` of type bool, got {new_planner.blind!r}."
     )
     breaches.raise_any()
     n_robots = 0
     rules = Rules()
-    for label in registry.names("robot") if robots is None else robots:
+    if robots is None:
+        robots = registry.names("robot")
+    for label in robots:
         robot = registry.take("robot", label)
         if steers is not None and tuple(robot.action_names) not in steers:
             continue
@@ -104,9 +111,9 @@ def check_planner(
         )
         task = Task(robot=robot, objective=goal, rules=rules)
         create = partial(
-            _create_problem,
+            create_problem,
             device=torch.device(device),
-            known=new_planner.given_truth,
+            is_certain=new_planner.given_truth,
         )
         for height, width in shapes:
             breaches.location = f"{name} on {height}×{width}"
@@ -119,15 +126,16 @@ def check_planner(
             problem = create(replace(task, rules=free_space_rules), height, width)
             _PlannerCheck(new_planner, problem, tolerance, breaches).check_uses()
     breaches.expect(
-        n_robots > 0, "Expected a robot among those tried that it steers, got none."
+        n_robots > 0,
+        "Expected the planner to steer one of the tried robots, got no such robot.",
     )
     breaches.raise_any()
 
 
 def _are_lines(values: Any) -> bool:
-    return isinstance(values, tuple) and all(
-        isinstance(line, str) and "\n" not in line for line in values
-    )
+    if not isinstance(values, tuple):
+        return False
+    return all(isinstance(line, str) and "\n" not in line for line in values)
 
 
 @dataclass(frozen=True)
@@ -147,15 +155,17 @@ class _PlannerCheck:
         problem = self.problem
         start = problem.start
         self.check_words()
-        first_state = plan_state = self.begin(problem)
-        step = _first_step(problem)
+        first_state = self.begin(problem)
+        plan_state = first_state
+        step = first_step(problem)
         answered: list[tuple[Step, Tensor]] = []
         last = torch.tensor([len(problem) - 1], device=start.device)
         last_two = torch.cat((last, last - 1))
         indices = torch.arange(len(problem), device=start.device)
         for number in range(_STEPS + 1):
+            # In the last step, only the last two episodes are still running.
             running = indices >= (number == _STEPS) * last_two[1]
-            step = _step(problem, step, ~running, number)
+            step = numbered_step(problem, step, ~running, number)
             answer = self.ask(step, plan_state, problem)
             if answer is NOTHING:
                 return
@@ -164,16 +174,15 @@ class _PlannerCheck:
             self.ask_again(step, plan_state, action)
             answered.append((step, action))
             plan_state = next_plan_state
-            step = _moved(problem, step, action)
+            step = step_after(problem, step, action)
         breach = (
             "Expected the same action from a generator of the same seed, got another."
         )
-        second_state = self.expect_action(
-            breach, answered[0], self.begin(problem), problem
-        )
+        repeated_state = self.begin(problem)
+        second_state = self.expect_action(breach, answered[0], repeated_state, problem)
         plan_state = self.begin(problem.select(last))
         breach = (
-            "Expected for an episode alone the action that it got in a batch, got "
+            "Expected the same action for a single episode as in the batch, got "
             "another."
         )
         for pair in answered[:_STEPS]:
@@ -184,19 +193,18 @@ class _PlannerCheck:
             selected = self.breaches.watch("select", select, plan_state=second_state)
         if selected is not NotImplemented:
             breach = (
-                "Expected of episodes that `select` keeps the actions that they "
-                "got among all, got others."
+                "Expected the same actions for episodes that `select` keeps as in "
+                "the batch, got others."
             )
             self.expect_action(breach, answered[1], selected, problem, last_two)
-        self.begin(_with_other_prediction(problem.select(last_two)))
-        self.expect_action(
+        different = invert_prediction(problem.select(last_two))
+        self.begin(different)
+        breach = (
             "Expected the first step's action to be the same after other steps and "
             "problems, got another. "
-            "Keep what evolves in the plan state, not on the planner.",
-            answered[0],
-            first_state,
-            problem,
+            "Keep changing values in the plan state, not on the planner."
         )
+        self.expect_action(breach, answered[0], first_state, problem)
 
     def check_uses(self) -> None:
         """Plan several steps, and again with other values of each unused input."""
@@ -207,35 +215,33 @@ class _PlannerCheck:
             return
         are_inputs = isinstance(used, frozenset) and used <= INPUTS
         listed = ", ".join(sorted(INPUTS))
-        if not expect(
-            are_inputs,
-            f"Expected `uses` to return a frozenset of {listed}, got {used!r}.",
-        ):
+        breach = f"Expected `uses` to return a frozenset of {listed}, got {used!r}."
+        if not expect(are_inputs, breach):
             return
         is_consistent = not self.planner.blind or not used
         expect(
             is_consistent,
-            "Expected `uses` of a `blind` planner to give no input, got some.",
+            "Expected `uses` of a `blind` planner to be empty, got some inputs.",
         )
         for name in sorted(INPUTS - used):
-            other = _with_other(problem, name)
+            changed = change_input(problem, name)
             breach = (
-                f"Expected the same action whatever `{name}` holds, which "
+                f"Expected the same action for any value of `{name}`, which "
                 "is not in `uses`, got another."
             )
-            step = _first_step(problem)
+            step = first_step(problem)
             plan_state = self.begin(problem)
-            other_state = self.begin(other)
+            changed_state = self.begin(changed)
             for number in range(_STEPS):
                 step = replace(step, time_s=number * problem.dt_s)
                 answer = self.ask(step, plan_state, problem)
                 if answer is NOTHING:
                     return
                 action, plan_state, _ = answer
-                other_state = self.expect_action(
-                    breach, (step, action), other_state, other
+                changed_state = self.expect_action(
+                    breach, (step, action), changed_state, changed
                 )
-                step = _moved(problem, step, action)
+                step = step_after(problem, step, action)
 
     def begin(self, problem: Problem) -> Any:
         """Return the initial plan state, or `NOTHING`."""
@@ -286,7 +292,8 @@ class _PlannerCheck:
         low, high = problem.action_bounds
         is_same = same(action, expected)
         if members is not None and not is_same:
-            is_close = (action - expected).abs() <= self.tolerance * (high - low)
+            margin = self.tolerance * (high - low)
+            is_close = (action - expected).abs() <= margin
             is_same = bool(is_close.all())
         self.breaches.expect(is_same, breach)
         return next_plan_state
@@ -302,11 +309,12 @@ class _PlannerCheck:
         if same(action, expected):
             return
         answer = self.ask(step, plan_state, self.problem)
-        if self.breaches.expect(
+        is_repeatable = self.breaches.expect(
             answer is not NOTHING and same(answer[0], expected),
             "Expected the same action for the same step and plan state, got "
-            "another when asked again.",
-        ):
+            "another when called again.",
+        )
+        if is_repeatable:
             self.breaches.expect(
                 False,
                 "Expected the same action whether it is drawn or not, got another.",
@@ -319,13 +327,14 @@ class _PlannerCheck:
         task = self.problem.task
         follows = watch("follows", lambda: self.planner.follows(task))
         remarks = watch("remarks", lambda: self.planner.remarks(task))
+        is_line = follows is NOTHING or _are_lines((follows,))
         expect(
-            follows is NOTHING or _are_lines((follows,)),
-            "Expected `follows` to give a single line, got something else.",
+            is_line,
+            "Expected `follows` to return a single line, got something else.",
         )
         expect(
             remarks is NOTHING or _are_lines(remarks),
-            "Expected `remarks` to give a tuple of single lines, got something else.",
+            "Expected `remarks` to return a tuple of single lines, got something else.",
         )
 
     def check_answer(self, action: Tensor, plan: Plan) -> None:
@@ -351,100 +360,3 @@ class _PlannerCheck:
         """Note invalid layers of a plan."""
         for fault in find_layer_faults(plan, self.problem):
             self.breaches.expect(False, fault)
-
-
-def _with_other_prediction(problem: Problem) -> Problem:
-    """Return the problem with 1 − λ for λ in map and distribution."""
-    return _with_other(_with_other(problem, "risk_map"), "distribution")
-
-
-def _with_other(problem: Problem, name: str) -> Problem:
-    """Return the problem with other values of an input and of derived free space.
-
-    Args:
-        problem: the problem.
-        name: name of the input, one of `INPUTS`.
-    """
-    mixture = problem.distribution
-    assert isinstance(mixture, TraversabilityMixture)  # of `_create_problem`
-    inverted = replace(mixture, means=1 - mixture.means)
-    others: dict[str, Any] = {
-        "risk_map": 1 - problem.risk_map,
-        "distribution": inverted,
-        "fields": _fields_of(inverted, problem.grid),
-    }
-    is_source = problem.task.rules.free_space.source == name
-    return replace(problem, free=problem.free ^ is_source, **{name: others[name]})
-
-
-def _first_step(problem: Problem) -> Step:
-    unobserved = torch.full_like(problem.start[:, 0], torch.nan)
-    return Step(state=problem.start, traversability=unobserved, time_s=0.0)
-
-
-def _moved(problem: Problem, step: Step, action: Tensor) -> Step:
-    """Return the step after an action."""
-    observed = problem.traversability_at(step.state)
-    command = action.clamp(*problem.action_bounds)
-    state = problem.robot(step.state, command, observed)
-    return replace(step, state=state, traversability=observed)
-
-
-def _step(problem: Problem, step: Step, ended: Tensor, number: int) -> Step:
-    """Return a step by number; one ended robot is off the map, others at the goal."""
-    position_m = problem.goal_m.index_fill(0, ended.nonzero()[:1, 0], -0.3)
-    state = step.state.clone()
-    state[ended, :2] = position_m[ended]
-    return replace(
-        step, state=state, time_s=number * problem.dt_s, draw=number % 2 == 1
-    )
-
-
-def _create_problem(
-    task: Task, height: int, width: int, device: torch.device, known: bool
-) -> Problem:
-    """Return a problem on four maps.
-
-    They are free terrain, a closed wall, a start on terrain predicted 0, and a wall
-    with a gap.
-
-    Args:
-        task: task of all episodes.
-        height: number of rows.
-        width: number of columns.
-        device: device of the problem.
-        known: whether λ is known, so that the prediction is certain.
-    """
-    rows = torch.arange(height, device=device)[:, None]
-    columns = torch.arange(width, device=device)
-    # Waves, so that all cells differ.
-    waves = 0.8 + 0.1 * torch.sin(0.7 * rows + 1.3 * columns)
-    traversability = waves.repeat(4, 1, 1)
-    wall = slice(height // 2, height // 2 + 2)
-    traversability[1, wall] = 0.1
-    traversability[2, :5, :5] = 0
-    traversability[3, wall, : width - 7] = 0
-    traversability[3, wall, width - 3 :] = 0
-    hills = 0.2 * torch.sin(0.4 * rows) * torch.cos(0.3 * columns)
-    elevation = hills.repeat(4, 1, 1)
-    rgb = (255 * traversability).to(torch.uint8)[:, None].repeat(1, 3, 1, 1)
-    spread = 0.0 if known else 1.0
-    half_gap = 0.05 * spread
-    means = torch.stack((traversability - half_gap, traversability + half_gap), dim=1)
-    weights = torch.full_like(means, 0.5)
-    stds = torch.full_like(means, 0.1 * spread)
-    mixture = TraversabilityMixture(weights, means, stds)
-    grid = Grid(height, width, _RESOLUTION_M)
-    observation = Observation(rgb, elevation, 10 * elevation.abs(), grid)
-    start = means.new_tensor([1.2, 1.3]).repeat(4, 1)
-    corner = means.new_tensor(grid.extent_m)
-    goal = (corner - means.new_tensor([1.7, 1.4])).repeat(4, 1)
-    fields = _fields_of(mixture, grid)
-    prediction = Prediction(observation, mixture, traversability, fields=fields)
-    return pose_problem(task, prediction, start, goal, 60.0)
-
-
-def _fields_of(mixture: TraversabilityMixture, grid: Grid) -> Fields:
-    """Return joint samples of a prediction, with a correlation length of 1 m."""
-    state = Static().init(mixture, CovarianceModel(grid=grid, correlation_m=1.0))
-    return Fields(Static(), state, tuple(range(mixture.shape[0])))

@@ -25,7 +25,8 @@ from benchnav.planning.sensing.sensor import (
 from benchnav.testing.breaches import NOTHING, SEED, Breaches, same
 
 _RESOLUTION_M = 0.5
-_KEYS, _OTHER_KEYS = (3, 14, 15, 92), (65, 35, 89, 79)
+_KEYS = (3, 14, 15, 92)
+_OTHER_KEYS = (65, 35, 89, 79)
 _STEPS = (0, 7)
 
 
@@ -55,8 +56,8 @@ def check_sensor(
     The measurement must not depend on unobserved truth. It is the same when λ, its
     distribution and its class are replaced in cells without measured λ, and when
     colour, slope and layers are replaced in unobserved cells. The elevation of
-    unobserved cells is lowered by 1 to 3 m, since raised terrain may come into view;
-    that under the robot stays, since it carries the sensor.
+    unobserved cells is lowered by 1 to 3 m, since raised terrain may come into view.
+    The robot's cell keeps its elevation, since it carries the sensor.
 
     Args:
         sensor: a sensor, or its name, file or mapping as in suites.
@@ -71,19 +72,21 @@ def check_sensor(
     """
     name = sensor.get("part") if isinstance(sensor, Mapping) else sensor
     kind = "sensor"
-    if isinstance(name, str) and name.partition(":")[0] in registry.names("ground"):
-        kind = "ground"
+    if isinstance(name, str):
+        base_name, _, _ = name.partition(":")
+        if base_name in registry.names("ground"):
+            kind = "ground"
     new_sensor = registry.take(kind, sensor)
     breaches = Breaches("sensor", type(new_sensor).__name__)
-    breaches.expect(
-        isinstance(new_sensor.sees_all, bool),
-        f"Expected `sees_all` of type bool, got {new_sensor.sees_all!r}.",
-    )
+    sees_all = new_sensor.sees_all
+    is_bool = isinstance(sees_all, bool)
+    breaches.expect(is_bool, f"Expected `sees_all` of type bool, got {sees_all!r}.")
     for height, width in shapes:
         hills = _create_hills(height, width, torch.device(device))
         for step in _STEPS:
             breaches.location = f"{height}×{width} in step {step}"
-            _SensorCheck(new_sensor, hills, step, sinks, breaches, tolerance).run()
+            check = _SensorCheck(new_sensor, hills, step, sinks, breaches, tolerance)
+            check.run()
     breaches.raise_any()
 
 
@@ -113,16 +116,17 @@ class _SensorCheck:
         if sensed is NOTHING:
             return
         appearance = sensed.appearance
+        has_sensed = bool(sensed.mask.any())
         has_seen = appearance is not None and bool(appearance.seen.any())
         self.breaches.expect(
-            bool(sensed.mask.any()) or has_seen,
-            "Expected a robot in the middle of a map to sense or see some cell, got "
-            "none.",
+            has_sensed or has_seen,
+            "Expected a robot in the middle of a map to measure or see a cell, got no "
+            "such cell.",
         )
         reported = _reported(sensed)
         is_same = self.breaches.expect(
             self.is_alike(self.ask(self.truth), reported, 0),
-            "Expected the same when asked again, got another.",
+            "Expected the same measurement when called again, got another.",
         )
         for indices in ([3], [2, 0]):
             members = torch.tensor(indices, device=self.truth.field.device)
@@ -131,16 +135,16 @@ class _SensorCheck:
             expected = tuple(values[members] for values in reported)
             self.breaches.expect(
                 self.is_alike(of_members, expected, self.tolerance),
-                "Expected for episodes alone and in another order what they got in "
-                "the batch, got another. Draw noise by `NoiseKey.normal`.",
+                "Expected the same results for single episodes and in another order as "
+                "in the batch, got others. Draw noise by `NoiseKey.normal`.",
             )
         if not is_same:
             return  # the following comparisons would all fail
         for what, changed in _replaced(self.truth, sensed, self.sinks):
             self.breaches.expect(
                 self.is_alike(self.ask(changed), reported, self.tolerance),
-                f"Expected the same whatever {what}, got another. Look at no cell "
-                "that is not reported.",
+                f"Expected the same measurement whatever {what}, got another. Read only "
+                "cells that are reported.",
             )
         self.try_noise(sensed)
 
@@ -165,7 +169,9 @@ class _SensorCheck:
         self, truth: _Truth, keys: Sequence[int] = _KEYS, step: int | None = None
     ) -> Any:
         """Return the sensor's answer, or `NOTHING` if it is not usable."""
-        noise_key = NoiseKey(tuple(keys), self.step if step is None else step)
+        if step is None:
+            step = self.step
+        noise_key = NoiseKey(tuple(keys), step)
         answer = self.breaches.watch(
             "sense",
             lambda: self.sensor.sense(
@@ -199,10 +205,12 @@ def _faults(sensed: Any, truth: _Truth) -> Iterator[str]:
         yield from filter(None, faults)
         return
     traversability = sensed.traversability[sensed.mask]
-    std = sensed.std[sensed.mask]
-    if not bool(((traversability >= 0) & (traversability <= 1)).all()):
+    in_range = (traversability >= 0) & (traversability <= 1)
+    if not bool(in_range.all()):
         yield "Expected λ in [0, 1], or NaN where it is not sensed, got other numbers."
-    if not bool(((std >= MIN_STD) & std.isfinite()).all()):
+    std = sensed.std[sensed.mask]
+    is_valid = (std >= MIN_STD) & std.isfinite()
+    if not bool(is_valid.all()):
         yield (
             f"Expected `Measurement.std` of at least {MIN_STD:g}, and finite, where λ "
             "is sensed, got others."
@@ -225,10 +233,11 @@ def _appearance_faults(appearance: Any, truth: _Truth) -> Iterator[str]:
     layers = observation.layers
     has_layers = layers.keys() == expected.layers.keys()
     if not has_layers or observation.grid != expected.grid:
+        expected_names = ", ".join(expected.layers)
+        names = ", ".join(layers) or "no layers"
         yield (
             "Expected the terrain's own grid and layers in `Appearance.observation`, "
-            f"{', '.join(expected.layers)}, got "
-            f"{observation.grid} and {', '.join(layers) or 'no layers'}."
+            f"{expected_names}, got {observation.grid} and {names}."
         )
         return
     pairs = {
@@ -239,16 +248,20 @@ def _appearance_faults(appearance: Any, truth: _Truth) -> Iterator[str]:
     }
     for name, layer in expected.layers.items():
         pairs[f"observation.layers[{name!r}]"] = (layers[name], layer)
-    faults = [
-        _tensor_fault(f"`Appearance.{name}`", *pair) for name, pair in pairs.items()
-    ]
-    yield from filter(None, faults)
-    if any(faults):
+    is_sound = True
+    for name, (values, like) in pairs.items():
+        fault = _tensor_fault(f"`Appearance.{name}`", values, like)
+        if fault:
+            is_sound = False
+            yield fault
+    if not is_sound:
         return
     seen = appearance.seen
-    if not bool((appearance.noise_level[seen] >= 0).all()):
+    noise_level = appearance.noise_level[seen]
+    if not bool((noise_level >= 0).all()):
         yield "Expected `Appearance.noise_level` ≥ 0 where a cell is seen, got others."
-    if not bool(observation.elevation_m[seen].isfinite().all()):
+    elevation_m = observation.elevation_m[seen]
+    if not bool(elevation_m.isfinite().all()):
         yield "Expected finite elevation where a cell is seen, got others."
 
 
@@ -278,73 +291,84 @@ def _channels(appearance: Appearance) -> tuple[Tensor, ...]:
 def _differ(first: Measurement, second: Measurement) -> bool:
     """Return whether two measurements differ in a cell that both report."""
     common = first.mask & second.mask
-    differ = bool((first.traversability != second.traversability)[common].any())
+    is_different = first.traversability != second.traversability
+    differ = bool(is_different[common].any())
     if differ or first.appearance is None or second.appearance is None:
         return differ
     common = first.appearance.seen & second.appearance.seen
-    pairs = zip(_channels(first.appearance), _channels(second.appearance), strict=True)
+    channels = _channels(first.appearance)
+    pairs = zip(channels, _channels(second.appearance), strict=True)
     return not all(same(a[common], b[common]) for a, b in pairs)
 
 
 def _replaced(
     truth: _Truth, sensed: Measurement, sinks: bool
 ) -> Iterator[tuple[str, _Truth]]:
-    """Yield what is replaced where it is not reported, and the resulting truth."""
+    """Yield descriptions of unreported values that were replaced, and the new truth."""
     terrain = truth.terrain
     mask = sensed.mask
-    reported = mask if sensed.appearance is None else mask | sensed.appearance.seen
+    reported = mask
+    if sensed.appearance is not None:
+        reported = mask | sensed.appearance.seen
     # The new values differ in each cell, and in summaries such as mean and maximum.
     mixture = terrain.truth
     is_fixed = mask[:, None]
+    new_means = 0.4 * (1 - mixture.means)
     distribution = replace(
         mixture,
         weights=mixture.weights.where(is_fixed, mixture.weights.flip(1, 2)),
-        means=mixture.means.where(is_fixed, 0.4 * (1 - mixture.means)),
+        means=mixture.means.where(is_fixed, new_means),
         stds=mixture.stds.where(is_fixed, 0.5 * mixture.stds),
     )
     traversability = terrain.traversability
-    other = replace(
+    new_traversability = 0.4 * (1 - traversability)
+    changed = replace(
         terrain,
         class_id=terrain.class_id.where(mask, terrain.class_id + 1),
         truth=distribution,
-        traversability=traversability.where(mask, 0.4 * (1 - traversability)),
+        traversability=traversability.where(mask, new_traversability),
     )
-    field = truth.field.where(mask, 0.4 * (1 - truth.field))
+    new_field = 0.4 * (1 - truth.field)
+    field = truth.field.where(mask, new_field)
     yield (
         "λ, its distribution and its class are where λ is not sensed",
-        replace(truth, terrain=other, field=field),
+        replace(truth, terrain=changed, field=field),
     )
-    layers = {
-        name: layer.where(reported, layer + 1) for name, layer in terrain.layers.items()
-    }
-    other = replace(
+    layers = {}
+    for name, layer in terrain.layers.items():
+        layers[name] = layer.where(reported, layer + 1)
+    new_rgb = (255 - terrain.rgb) // 2
+    changed = replace(
         terrain,
-        rgb=terrain.rgb.where(reported[:, None], (255 - terrain.rgb) // 2),
+        rgb=terrain.rgb.where(reported[:, None], new_rgb),
         slope_deg=terrain.slope_deg.where(reported, terrain.slope_deg + 5),
         layers=layers,
     )
     yield (
         "colour, slope and layers are where nothing is sensed or seen",
-        replace(truth, terrain=other),
+        replace(truth, terrain=changed),
     )
     if not sinks:
         return
-    x, y = truth.robot_state[:, 0], truth.robot_state[:, 1]
+    x = truth.robot_state[:, 0]
+    y = truth.robot_state[:, 1]
     rows, columns = terrain.grid.cell_of(x, y)
     is_kept = reported.clone()
-    is_kept[torch.arange(len(is_kept), device=is_kept.device), rows, columns] = True
+    episodes = torch.arange(len(is_kept), device=is_kept.device)
+    is_kept[episodes, rows, columns] = True
     height = terrain.elevation_m
-    lowered = height.where(is_kept, height - 2 - (7 * height).sin())
+    new_height = height - 2 - (7 * height).sin()
+    changed = replace(terrain, elevation_m=height.where(is_kept, new_height))
     yield (
         "the elevation is where nothing is sensed or seen",
-        replace(truth, terrain=replace(terrain, elevation_m=lowered)),
+        replace(truth, terrain=changed),
     )
 
 
 def _create_hills(height: int, width: int, device: torch.device) -> _Truth:
     """Return four maps of hills that occlude each other, with some λ of 0 and 1.
 
-    They have two classes and a layer.
+    The maps have two classes and a layer.
 
     Args:
         height: number of rows.
@@ -356,15 +380,23 @@ def _create_hills(height: int, width: int, device: torch.device) -> _Truth:
     uniform = torch.rand(8, 4, height, width, generator=generator).to(device)
     rows = torch.arange(height, device=device)[:, None]
     columns = torch.arange(width, device=device)
-    waves = 0.7 * torch.sin(0.9 * rows + 0.3) + 0.7 * torch.sin(0.8 * columns)
-    means = torch.stack((0.1 + 0.1 * uniform[0], 0.5 + 0.3 * uniform[1]), dim=1)
-    weight = 0.1 + 0.2 * uniform[2]
-    weights = torch.stack((weight, 1 - weight), dim=1)
-    truth = TraversabilityMixture(weights, means, torch.full_like(means, 0.1), (0, 0))
-    field = truth.from_normal(0.2 + 2 * (uniform[3] - 0.5))
+    waves_y = 0.7 * torch.sin(0.9 * rows + 0.3)
+    waves_x = 0.7 * torch.sin(0.8 * columns)
+    waves = waves_y + waves_x
+    low_mean = 0.1 + 0.1 * uniform[0]
+    high_mean = 0.5 + 0.3 * uniform[1]
+    means = torch.stack((low_mean, high_mean), dim=1)
+    low_weight = 0.1 + 0.2 * uniform[2]
+    weights = torch.stack((low_weight, 1 - low_weight), dim=1)
+    stds = torch.full_like(means, 0.1)
+    truth = TraversabilityMixture(weights, means, stds, (0, 0))
+    scores = 0.2 + 2 * (uniform[3] - 0.5)
+    field = truth.from_normal(scores)
+    colours = (255 * uniform[4:7]).to(torch.uint8)
+    has_class_1 = uniform[0] > 0.5
     terrain = Terrain(
-        rgb=(255 * uniform[4:7]).to(torch.uint8).movedim(0, 1).contiguous(),
-        class_id=(uniform[0] > 0.5).long(),
+        rgb=colours.movedim(0, 1).contiguous(),
+        class_id=has_class_1.long(),
         elevation_m=waves.repeat(4, 1, 1) + 0.1 * uniform[7],
         slope_deg=20 * uniform[2],
         truth=truth,

@@ -25,9 +25,10 @@ def untrained(model: Any) -> TrainableModel | None:
     if isinstance(model, str | Mapping | registry.Part):
         try:
             part = registry.read_part("model", model)
-            model, options = registry.find("model", part.part).target, part.options
+            model = registry.find("model", part.part).target
+            options = part.options
         except BenchnavError:
-            return None  # a checkpoint, or what `load_model` refuses
+            return None  # a checkpoint, or a value that `load_model` rejects
     if not (isinstance(model, type) and issubclass(model, TrainableModel)):
         return None
     kind = config_class(model)
@@ -38,15 +39,15 @@ def untrained(model: Any) -> TrainableModel | None:
 
 
 def with_inputs(terrain: Terrain, model: TrainableModel) -> Terrain:
-    """Add random layers that a model requires and a recipe lacks, a tenth missing."""
+    """Return maps with all layers of a model; added ones are random, a tenth is NaN."""
     generator = torch.Generator().manual_seed(SEED)
     layers = dict(terrain.layers)
+    like = terrain.elevation_m
     for name in model.inputs:
         if name not in ("rgb", "elevation_m", "slope_deg", *layers):
-            drawn = torch.rand(terrain.elevation_m.shape, generator=generator)
-            layers[name] = torch.where(drawn < 0.1, torch.nan, drawn).to(
-                terrain.elevation_m
-            )
+            drawn = torch.rand(like.shape, generator=generator)
+            drawn = torch.where(drawn < 0.1, torch.nan, drawn)
+            layers[name] = drawn.to(like)
     return replace(terrain, layers=layers)
 
 
@@ -68,45 +69,43 @@ def try_training(
         Whether the model can predict.
     """
     try:
+        device = terrain.rgb.device
         maps = _maps(model, terrain)
-        model.build({name: _scale(name) for name in model.inputs}, classes, SEED).to(
-            terrain.rgb.device
-        )
+        scales = {name: _scale(name) for name in model.inputs}
+        model.build(scales, classes, SEED).to(device)
         try_network(model, maps)
         target = maps[model.target]
         partial = torch.where(maps["slope_deg"] > 5, torch.nan, target)
         missing = torch.full_like(target, torch.nan)
-        for what, values in (("in part", partial), ("anywhere", missing)):
-            loss, _ = model.train().assess(maps | {model.target: values})
+        for what, values in (("some", partial), ("all", missing)):
+            changed = maps | {model.target: values}
+            loss, _ = model.train().assess(changed)
             breaches.expect(
                 bool(loss.isfinite()),
-                f"Expected a finite loss where λ is not observed {what}, got "
+                f"Expected a finite loss if λ of {what} cells is unobserved, got "
                 f"{loss.item()}.",
             )
         before = {name: value.clone() for name, value in model.named_parameters()}
         loss, _ = model.train().assess(maps)
         loss.backward()
         torch.optim.SGD(model.parameters(), 1e-4).step()
-        is_changed = any(
-            not torch.equal(before[name], value)
-            for name, value in model.named_parameters()
-        )
+        is_changed = False
+        for name, value in model.named_parameters():
+            is_changed |= not torch.equal(before[name], value)
         breaches.expect(
             is_changed,
-            "Expected weights that a step of training changes, got them as they were.",
+            "Expected a training step to change the weights, got the same weights.",
         )
         model.eval().zero_grad()
-        restored = type(model).from_tensors(
-            model.settings(), classes, model.state_dict()
-        )
+        settings = model.settings()
+        restored = type(model).from_tensors(settings, classes, model.state_dict())
         layers = layers_of(terrain.observe(), model.inputs)
-        device = terrain.rgb.device
         mean = model.to(device).predict_raw(layers).mean()
         restored_mean = restored.to(device).predict_raw(layers).mean()
         breaches.expect(
             same(restored_mean, mean, 1e-5),
-            "Expected the same prediction from settings and tensors, as a checkpoint "
-            "keeps them, got another.",
+            "Expected the same prediction from the settings and tensors of a "
+            "checkpoint, got another.",
         )
     except Exception as error:
         text = str(error) if isinstance(error, BenchnavError) else one_line(error)
@@ -129,8 +128,10 @@ def _maps(model: TrainableModel, terrain: Terrain) -> dict[str, Tensor]:
 def _scale(name: str) -> LayerScale:
     """Return an arbitrary scale of a layer."""
     if name == "rgb":
-        mean, std = torch.full((3,), 128.0), torch.full((3,), 64.0)
+        mean = torch.full((3,), 128.0)
+        std = torch.full((3,), 64.0)
     else:
         n_channels = 1 + is_azimuth(name)
-        mean, std = torch.zeros(n_channels), torch.ones(n_channels)
+        mean = torch.zeros(n_channels)
+        std = torch.ones(n_channels)
     return LayerScale(mean, std, torch.tensor(10.0))

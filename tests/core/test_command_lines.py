@@ -19,7 +19,8 @@ import benchnav.eval.cli
 import benchnav.models.cli
 from benchnav.core import command
 from benchnav.core.errors import ConfigError
-from benchnav.datagen.recipe.recipe import Recipe, load_recipe
+from benchnav.datagen.recipe.load import load_recipe
+from benchnav.datagen.recipe.recipe import Recipe
 from tests.commands import call
 
 CLIS = {

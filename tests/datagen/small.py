@@ -5,8 +5,9 @@ from typing import Any
 
 from benchnav.datagen.layers.vegetation import Growth, Vegetation
 from benchnav.datagen.recipe.classes import SoftSpots, TerrainClass
+from benchnav.datagen.recipe.load import load_recipe
 from benchnav.datagen.recipe.places import PlacesRule
-from benchnav.datagen.recipe.recipe import Recipe, Split, load_recipe
+from benchnav.datagen.recipe.recipe import Recipe, Split
 
 SOFT = SoftSpots(weight=0.1, mean=0.05, std=0.05)
 

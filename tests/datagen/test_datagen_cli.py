@@ -16,7 +16,8 @@ from benchnav.datagen.files import create
 from benchnav.datagen.files.hdf5 import ShardFile
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.classes import SoftSpots
-from benchnav.datagen.recipe.recipe import Recipe, load_recipe, shipped_recipes
+from benchnav.datagen.recipe.load import load_recipe, shipped_recipes
+from benchnav.datagen.recipe.recipe import Recipe
 from tests.commands import call
 from tests.factories import tiny_dataset
 
@@ -156,7 +157,7 @@ def test_shards_made_apart_are_one_dataset(datagen: Call, capsys) -> None:  # ty
     shard.unlink()
     assert datagen("validate", "big") == 1
     assert (
-        f"remove {shard.name} in big and run the command that made it again"
+        f"remove {shard.name} in big and repeat the command that made it"
         in capsys.readouterr().out
     )
     assert datagen("create", "tiny-v1", *SMALL, "--out", "big") == 0
@@ -437,7 +438,7 @@ def test_faults_of_consecutive_maps_are_one_line(datagen: Call, capsys) -> None:
         ("{preset: hs, relief", "{preset: hs, severity: .nan, relief", "severity"),
         ("height: 32", "height: many", "height"),
         ("id: mine", "id: my maps", "my maps"),
-        ("environments: 5", "environments: 4", "`id` of its own"),
+        ("environments: 5", "environments: 4", "unused `id`"),
         ("scenario: std", "scenario: dusk", "dusk"),
         ("splits:", "splits: []\nmore:", "splits"),
         (RECIPE, "[1, 2]", "mapping"),
@@ -447,7 +448,7 @@ def test_faults_of_consecutive_maps_are_one_line(datagen: Call, capsys) -> None:
 def test_a_bad_recipe_is_one_clear_line_and_status_2(
     datagen: Call, capsys, old: str, new: str, said: str
 ) -> None:  # type: ignore[no-untyped-def]
-    own = RECIPE if "of its own" in said else RECIPE.replace("id: tiny-v1", "id: mine")
+    own = RECIPE if "unused" in said else RECIPE.replace("id: tiny-v1", "id: mine")
     text = new if old == RECIPE else own.replace(old, new, 1)
     assert text != RECIPE
     Path("r.yaml").write_text(text)

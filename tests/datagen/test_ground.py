@@ -21,7 +21,8 @@ from benchnav.datagen.ground import (
     ground_file,
     look_alike_pairs,
 )
-from benchnav.datagen.recipe.recipe import Split, load_recipe, shipped_recipes
+from benchnav.datagen.recipe.load import load_recipe, shipped_recipes
+from benchnav.datagen.recipe.recipe import Split
 from benchnav.datagen.recipe.scenario import RECIPES
 from tests.commands import call
 from tests.datagen.small import small_stakes

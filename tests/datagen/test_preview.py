@@ -25,7 +25,8 @@ from benchnav.datagen.preview import (
     preview_figure,
     soft_ground,
 )
-from benchnav.datagen.recipe.recipe import Recipe, load_recipe
+from benchnav.datagen.recipe.load import load_recipe
+from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.viz.maps import hatching
 from benchnav.viz.sheet import layer_column
 from benchnav.viz.style import TWO_COLUMNS_IN, save

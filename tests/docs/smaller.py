@@ -10,7 +10,7 @@ import sys
 from importlib import import_module
 
 from benchnav.datagen import shipped_recipes
-from benchnav.datagen.recipe.recipe import shipped_sizes
+from benchnav.datagen.recipe.load import shipped_sizes
 from tests.commands import PACKAGES
 
 

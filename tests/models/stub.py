@@ -8,7 +8,7 @@ from torch import Tensor
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Observation
 from benchnav.datagen.recipe.classes import TerrainClass
-from benchnav.datagen.recipe.recipe import load_recipe
+from benchnav.datagen.recipe.load import load_recipe
 from benchnav.models.base import TraversabilityModel
 from benchnav.models.slope_gp.table import SlopeTable, table_slopes
 

@@ -11,7 +11,7 @@ from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Terrain
 from benchnav.datagen.files.create import create
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.datagen.recipe.recipe import load_recipe
+from benchnav.datagen.recipe.load import load_recipe
 from benchnav.models.config import ClassifierConfig, TrainingConfig
 from benchnav.models.nets.inputs import LayerScale
 from benchnav.models.slope_gp.cells import Cells, SlopeSums

@@ -16,7 +16,7 @@ from benchnav.core.store import seal, unseal
 from benchnav.core.terrain import Terrain
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.ground import fit_ground
-from benchnav.datagen.recipe.recipe import load_recipe
+from benchnav.datagen.recipe.load import load_recipe
 from benchnav.models import checkpoint as module
 from benchnav.models.base import predict
 from benchnav.models.checkpoint import (

@@ -198,8 +198,8 @@ BAD = {
     "PyTorch's seed": (meddling(lambda _: torch.manual_seed(54321)), "PyTorch's global generator"),
     "NumPy's generator": (meddling(lambda _: np.random.rand()), "NumPy's global generator"),  # noqa: NPY002
     "Python's generator": (meddling(lambda _: random.random()), "Python's global generator"),
-    "another answer": (Forgetful(), "Expected the same from `predict` when asked again"),
-    "an answer of the batch": (changed(of_batch), "Expected the same from `predict` for one alone"),
+    "another answer": (Forgetful(), "Expected the same result from `predict` when called again"),
+    "an answer of the batch": (changed(of_batch), "Expected the same result from `predict` for a single element"),
     "too many names": (Misnamed(), "each of 2 components, got 3"),
     "members without names": (Nameless(), "`class_names` with"),
     "members of another shape": (with_members(lambda weights: weights), "shape [M, 3, 2, 32, 32], got [3, 2, 32, 32]"),
@@ -377,16 +377,16 @@ BAD_DISTRIBUTIONS = {
     "under 0": (lambda d: replace(d, values=d.values - 0.3), "`quantile` to ascend within [0, 1]"),
     "with a hole": (
         lambda d: replace(d, values=d.values.where(d.values < d.values.max(), torch.nan)),
-        "finite what `quantile` of the distribution gives",
+        "finite results of `quantile` of the distribution",
     ),
     "elsewhere": (lambda d: d.to("meta"), "observation's device cpu, got meta"),
     "a row short": (lambda d: replace(d, values=d.values[..., 1:, :]), "got QuantileDistribution of shape [3, 31, 32]"),
     "of another inverse": (
         overriding(quantile=lambda d, u: 0.9 * QuantileDistribution.quantile(d, u)), "inverse of `cdf`",
     ),
-    "of another mean": (overriding(mean=lambda d: QuantileDistribution.mean(d) + 0.01), "`mean` to follow"),
-    "of another tail": (overriding(cvar=lambda d, level: d.var(level)), "`cvar` to follow"),
-    "of another time": (overriding(expected_time=lambda d, floor: 1 / d.mean()), "`expected_time` to follow"),
+    "of another mean": (overriding(mean=lambda d: QuantileDistribution.mean(d) + 0.01), "`mean` to follow from"),
+    "of another tail": (overriding(cvar=lambda d, level: d.var(level)), "`cvar` to follow from"),
+    "of another time": (overriding(expected_time=lambda d, floor: 1 / d.mean()), "`expected_time` to follow from"),
     "of other limits": (overriding(cdf_limits=lambda d, x: (0 * d.cdf(x), d.cdf(x)), cdf=lambda d, x: (
         QuantileDistribution.cdf_limits(d, x)[1])), "`cdf_limits` to be P(λ < value)"),
     "of another dtype": (

@@ -212,7 +212,7 @@ BAD: dict[str, tuple[Any, str]] = {
         "got another step.traversability.",
     ),
     "writes into the map": (acting(lambda _, s: s.problem.risk_map.mul_(0.5)), "got another problem.risk_map."),
-    "writes into the goal": (preparing(lambda p, _: p.goal_m.add_(1)), "`init` to leave its arguments as they were"),
+    "writes into the goal": (preparing(lambda p, _: p.goal_m.add_(1)), "`init` to leave its arguments unchanged"),
     "writes into the prediction": (preparing(lambda p, _: p.distribution.means.zero_()), "problem.distribution.means"),
     "writes into the image": (preparing(lambda p, _: p.observation.rgb.add_(1)), "problem.observation.rgb"),
     "writes into the plan state": (acting(lambda _, s: s.last.add_(0.1)), "got another plan_state.last."),
@@ -234,26 +234,26 @@ BAD: dict[str, tuple[Any, str]] = {
     "PyTorch's seed in init": (preparing(lambda *_: torch.manual_seed(20_261)), "PyTorch's global generator"),
     "NumPy's generator": (acting(lambda *_: np.random.rand()), "NumPy's global generator"),  # noqa: NPY002
     "Python's generator": (acting(lambda *_: random.random()), "Python's global generator"),
-    "evolves on self": (OnSelf(), "got another when asked again"),
+    "evolves on self": (OnSelf(), "got another when called again"),
     "keeps the problem on self": (ProblemOnSelf(), "same after other steps and problems"),
     "keeps what it saw on self": (LastSeen(), "same after other steps and problems"),
     "no seed": (Unseeded(), "from a generator of the same seed, got another"),
     "drives otherwise when drawn": (action_of(lambda a, step: 0.9 * a if step.draw else a), "whether it is drawn"),
-    "an action of the batch": (action_of(lambda a, _: a - 0.1 * a.mean(0)), "Expected for an episode alone"),
-    "noise of the batch": (NoiseOfBatch(), "Expected for an episode alone"),
-    "blind that is not": (having(blind=True), "the same action whatever `risk_map` holds, which is not in `uses`"),
+    "an action of the batch": (action_of(lambda a, _: a - 0.1 * a.mean(0)), "same action for a single episode"),
+    "noise of the batch": (NoiseOfBatch(), "same action for a single episode"),
+    "blind that is not": (having(blind=True), "the same action for any value of `risk_map`, which is not in `uses`"),
     "uses λ̂ later on and does not say so": (
         using({"distribution"}, lambda step, p: p.traversability_at(step.state) * (step.time_s > 0)),
-        "whatever `risk_map` holds",
+        "for any value of `risk_map`",
     ),
     "uses free space by risk and says the mean": (
-        using({"distribution"}, lambda step, p: p.free_at(step.state)), "whatever `risk_map` holds",
+        using({"distribution"}, lambda step, p: p.free_at(step.state)), "for any value of `risk_map`",
     ),
     "uses free space by the mean and says λ̂": (
-        using({"risk_map"}, lambda step, p: p.free_at(step.state)), "whatever `distribution` holds",
+        using({"risk_map"}, lambda step, p: p.free_at(step.state)), "for any value of `distribution`",
     ),
     "uses fields and does not say so": (
-        using({"risk_map"}, lambda step, p: p.sample_fields(1, 7)[:, 0, 8, 8]), "whatever `fields` holds",
+        using({"risk_map"}, lambda step, p: p.sample_fields(1, 7)[:, 0, 8, 8]), "for any value of `fields`",
     ),
     "uses what is no input": (
         using({"free"}, lambda step, p: p.goal_m[:, 0]), "frozenset of distribution, fields, risk_map, got frozenset",
@@ -261,11 +261,11 @@ BAD: dict[str, tuple[Any, str]] = {
     "blind that uses something": (
         type("Bad", (Straight,), {"uses": lambda self, task: INPUTS})(), "`uses` of a `blind` planner",
     ),
-    "follows no text": (having(follows=lambda self, task: 3), "Expected `follows` to give a single line"),
+    "follows no text": (having(follows=lambda self, task: 3), "Expected `follows` to return a single line"),
     "follows that is text": (having(follows="time"), "from `follows`, got TypeError"),
     "steers by one name": (having(steers=("speed_mps", "turn_rate_radps")), "`steers` as tuples of action names"),
-    "steers nothing": (having(steers=()), "Expected a robot among those tried that it steers, got none"),
-    "remarks that are no tuple": (having(remarks=lambda self, task: "slow"), "to give a tuple of single lines"),
+    "steers nothing": (having(steers=()), "Expected the planner to steer one of the tried robots, got no such robot"),
+    "remarks that are no tuple": (having(remarks=lambda self, task: "slow"), "to return a tuple of single lines"),
     "remarks that raise": (having(remarks=lambda self, task: task.wheels), "from `remarks`, got AttributeError"),
 }  # fmt: skip
 
@@ -367,7 +367,7 @@ def test_a_robot_that_it_does_not_steer_is_left_out() -> None:
 
     check_planner(Names(), shapes=((12, 12),))
     assert set(named) == {("speed_mps", "turn_rate_radps")}
-    with pytest.raises(ConfigError, match="that it steers"):
+    with pytest.raises(ConfigError, match="to steer one of the tried robots"):
         check_planner(Names(), robots=["bicycle"])
 
 
@@ -392,7 +392,7 @@ def test_parts_are_taken_by_name_mapping_or_as_objects() -> None:
 def test_the_tolerance_is_of_an_episode_alone() -> None:
     nearly = action_of(lambda action, _: action - 1e-2 * action.mean(0))
     check_planner(nearly, tolerance=0.02)
-    with pytest.raises(ConfigError, match="episode alone"):
+    with pytest.raises(ConfigError, match="a single episode"):
         check_planner(nearly)
 
 
@@ -484,5 +484,5 @@ def test_what_select_keeps_has_to_be_those_that_were_asked_for(order: str) -> No
     if order == "kept":
         check_planner(Leaving(), robots=[Unicycle()])
         return
-    with pytest.raises(ConfigError, match="of episodes that `select` keeps"):
+    with pytest.raises(ConfigError, match="for episodes that `select` keeps"):
         check_planner(Leaving(), robots=[Unicycle()])

@@ -41,13 +41,13 @@ BAD: dict[str, tuple[Any, str]] = {
     "below 0": (changed(lambda mean, _: -mean - 0.1), "λ̂ in [0, 1]"),
     "no number": (changed(lambda mean, _: mean * torch.nan), "λ̂ in [0, 1]"),
     "slip": (changed(lambda mean, m: (m.stds[:, 0] > 0) / mean.new_zeros(())), "λ̂ in [0, 1]"),
-    "λ̂ of the batch": (changed(lambda mean, _: mean / (1 + mean.mean())), "the same from `risk` for one alone"),
+    "λ̂ of the batch": (changed(lambda mean, _: mean / (1 + mean.mean())), "same result from `risk` for a single"),
     "λ̂ of the neighbours": (changed(lambda mean, _: (mean + mean.roll(1, -1)) / 2), "of selected cells as on the map"),
     "cannot take some cells": (
         changed(lambda mean, _: mean if mean.shape[-2] > 1 else mean[99]),
         "Expected an answer from `risk`, got IndexError",
     ),
-    "another λ̂": (Forgetful(), "Expected the same from `risk` when asked again"),
+    "another λ̂": (Forgetful(), "Expected the same result from `risk` when called again"),
     "writes into the mixture": (changed(lambda mean, m: [m.means.zero_()] and mean), "got another distribution"),
     "PyTorch's generator": (changed(lambda mean, _: mean + 0 * torch.rand(1)), "PyTorch's global generator"),
     "NumPy's generator": (changed(lambda mean, _: mean + 0 * np.random.rand()), "NumPy's global"),  # noqa: NPY002

@@ -99,15 +99,15 @@ BAD: dict[str, tuple[Any, str]] = {
     "a vector for all": (moving(lambda moved, *_: moved.reshape(-1, 3)[:1]), "of shape [6, 3] on cpu, got"),
     "knows [B, S] alone": (moving(lambda moved, *_: moved.reshape(-1, 3)), "[*B = [6, 5], torch.float32"),
     "single precision alone": (moving(lambda moved, *_: moved.float()), "[*B = [6], torch.float64"),
-    "no number": (moving(lambda moved, *_: moved * torch.nan), "Expected finite what `F` gives"),
+    "no number": (moving(lambda moved, *_: moved * torch.nan), "Expected finite results of `F`"),
     "writes into the state": (meddling(lambda state, *_: state.add_(0.1)), "got another state"),
     "writes into the action": (meddling(lambda s, action, _: action.zero_()), "got another action"),
     "writes into λ": (meddling(lambda s, a, ground: ground.zero_()), "got another traversability"),
     "PyTorch's generator": (meddling(lambda *_: torch.rand(1)), "PyTorch's global generator"),
     "NumPy's generator": (meddling(lambda *_: np.random.rand()), "NumPy's global generator"),  # noqa: NPY002
     "Python's generator": (meddling(lambda *_: random.random()), "Python's global generator"),
-    "another step": (Forgetful(), "Expected the same from `F` when asked again"),
-    "a step of the batch": (moving(lambda moved, *_: moved + 0.01 * moved.mean(0)), "alone and in a batch"),
+    "another step": (Forgetful(), "Expected the same result from `F` when called again"),
+    "a step of the batch": (moving(lambda moved, *_: moved + 0.01 * moved.mean(0)), "for a single element"),
     "faster than it says": (moving(lambda m, state, *_: state + 1.2 * (m - state)), "than `top_speed_mps` allows"),
     "faster than it says after a while": (Gathering(), "than `top_speed_mps` allows"),
     "drives on ground of 0": (

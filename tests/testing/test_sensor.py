@@ -161,14 +161,14 @@ def drawn(values: Tensor, *seed: int) -> Tensor:
     return torch.rand(values.shape, generator=torch.Generator().manual_seed(sum(seed)))
 
 
-ELSEWHERE = "Expected the same whatever λ, its distribution and its class are where λ is not sensed, got another."
-APPEARANCE = "Expected the same whatever colour, slope and layers are where nothing is sensed or seen, got another."
-ELEVATION = "Expected the same whatever the elevation is where nothing is sensed or seen, got another."
-ALONE = "Expected for episodes alone and in another order what they got in the batch, got another."
+ELSEWHERE = "the same measurement whatever λ, its distribution and its class are where λ is not sensed, got another."
+APPEARANCE = "the same measurement whatever colour, slope and layers are where nothing is sensed or seen, got another."
+ELEVATION = "the same measurement whatever the elevation is where nothing is sensed or seen, got another."
+ALONE = "Expected the same results for single episodes and in another order as in the batch, got others."
 BAD: dict[str, tuple[Any, str]] = {
     "senses nothing": (
         probing(lambda found, *_: torch.nan * found),
-        "to sense or see some cell, got none",
+        "to measure or see a cell, got no such cell",
     ),
     **{
         f"knows {name} of the map": (
@@ -365,7 +365,7 @@ BAD: dict[str, tuple[Any, str]] = {
     ),
     "noise of the count": (
         Forgetful(),
-        "Expected the same when asked again, got another.",
+        "Expected the same measurement when called again, got another.",
     ),
     "the same in each step": (
         moved(lambda noise_key: NoiseKey(noise_key.keys, 0)),

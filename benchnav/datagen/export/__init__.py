@@ -1,3 +1,1 @@
-"""Datasets in forms that are read without this package: Parquet with Croissant
-metadata.
-"""
+"""Export of datasets to Parquet with Croissant metadata, for other software."""

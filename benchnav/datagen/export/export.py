@@ -1,6 +1,7 @@
 """Atomic export of a dataset to a folder of Parquet files with metadata.
 
-Croissant 1.0 metadata (JSON-LD) describe the files for programs, a card for readers.
+Croissant 1.0 metadata (JSON-LD) describe the files to programs; a card describes them
+to people.
 
 Source: Croissant Format Specification 1.0, http://mlcommons.org/croissant/1.0.
 """
@@ -28,11 +29,7 @@ from benchnav.datagen.export.parquet import (
 )
 from benchnav.datagen.files.hdf5 import exclusive_output
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.datagen.recipe.recipe import (
-    load_recipe,
-    recipe_from_dict,
-    shipped_recipes,
-)
+from benchnav.datagen.recipe.load import load_recipe, recipe_from_dict, shipped_recipes
 
 METADATA = "croissant.json"
 CARD = "README.md"
@@ -47,6 +44,9 @@ PAPER = """@misc{endo2024benchnav,
   eprint = {2405.13318},
   archivePrefix = {arXiv},
 }"""
+
+_TAGS_OF_METADATA = ["robotics", "off-road navigation", "traversability", "terrain"]
+_TAGS_OF_CARD = ["robotics", "off-road-navigation", "traversability", "terrain"]
 
 Node = dict[str, Any]  # of JSON-LD
 
@@ -104,18 +104,15 @@ class Publication:
         advice = ""
         if listed not in ("", self.license):
             advice = f" Did you mean {listed!r}?"
-        is_listed = listed == self.license and re.fullmatch(
-            r"(?!LicenseRef-)[A-Za-z0-9.+-]+", listed
-        )
+        is_simple = re.fullmatch(r"(?!LicenseRef-)[A-Za-z0-9.+-]+", listed)
+        is_listed = listed == self.license and is_simple
         expect(
             self.is_url or is_listed,
             "`license` as a name of the SPDX list, such as CC-BY-4.0, or a URL, got "
             f"{self.license!r}.{advice}",
         )
-        expect(
-            _URL.fullmatch(self.url) or not self.url,
-            f"`url` to begin with https://, got {self.url!r}.",
-        )
+        is_url_valid = not self.url or _URL.fullmatch(self.url)
+        expect(is_url_valid, f"`url` to begin with https://, got {self.url!r}.")
         try:
             datetime.date.fromisoformat(self.date or "2024-05-21")
         except ValueError as error:
@@ -149,12 +146,12 @@ def export(
 
     Args:
         dataset: dataset to export.
-        out: the folder, which gets this name when it is complete.
+        out: folder to write; it appears under this name when it is complete.
         publication: licence, creator, address and date.
         splits: names of splits, in the dataset's order; None for all.
         fields: names of fields, in the dataset's order; None for all.
-        maps_per_file: maximum number of maps of a file; 0 limits files to a few hundred
-            MB.
+        maps_per_file: maximum number of maps of a file; if 0, files have up to a few
+            hundred MB.
         overwrite: whether to replace an exported dataset.
 
     Raises:
@@ -172,10 +169,11 @@ def export(
         data_folder.mkdir()
         yield done, total
         for split, name in names.items():
-            for maps in write_split(
+            steps = write_split(
                 data_folder, name, dataset, split, columns, maps_per_file
-            ):
-                done += maps
+            )
+            for n_maps in steps:
+                done += n_maps
                 yield done, total
         node = metadata(dataset, names, columns, publication, folder)
         text = json.dumps(node, indent=1, ensure_ascii=False)
@@ -185,7 +183,8 @@ def export(
 
 
 def _foreign(out: Path) -> str:
-    return "" if (out / METADATA).is_file() else "is not an exported dataset"
+    is_exported = (out / METADATA).is_file()
+    return "" if is_exported else "is not an exported dataset"
 
 
 def is_ours(dataset: TerrainDataset, splits: Iterable[str]) -> bool:
@@ -193,8 +192,7 @@ def is_ours(dataset: TerrainDataset, splits: Iterable[str]) -> bool:
 
     Only seed and splits may differ from the shipped recipes.
     """
-    parts = [part for split in splits for part in dataset.splits[split]["parts"]]
-    indices = {part.get("recipe") for part in parts}
+    indices = {part.get("recipe") for part in _parts_of(dataset, splits)}
     if None in indices:  # some maps were imported
         return False
     for index in indices:
@@ -212,6 +210,14 @@ def is_ours(dataset: TerrainDataset, splits: Iterable[str]) -> bool:
     return True
 
 
+def _parts_of(dataset: TerrainDataset, splits: Iterable[str]) -> list[Node]:
+    """Return the parts of some splits, from the manifest."""
+    parts = []
+    for split in splits:
+        parts += dataset.splits[split]["parts"]
+    return parts
+
+
 def describe(dataset: TerrainDataset, splits: Collection[str]) -> str:
     """Return one or two sentences on the maps and their origin."""
     grid = dataset.grid
@@ -219,7 +225,7 @@ def describe(dataset: TerrainDataset, splits: Collection[str]) -> str:
     generator = dataset.manifest["generator"]
     recipes: set[str] = set()
     files: set[str] = set()
-    for part in [part for split in splits for part in dataset.splits[split]["parts"]]:
+    for part in _parts_of(dataset, splits):
         if "recipe" in part:
             recipe = dataset.manifest["recipes"][part["recipe"]]
             recipes.add(f"recipe {recipe['id']}, seed {recipe['seed']}")
@@ -230,7 +236,9 @@ def describe(dataset: TerrainDataset, splits: Collection[str]) -> str:
     for name in dataset.layer_names:
         unit = dataset.fields[name].unit
         layers.append(name if unit == "1" else f"{name} [{unit}]")
-    with_layers = f"; layers {', '.join(layers)}, NaN where missing" if layers else ""
+    with_layers = ""
+    if layers:
+        with_layers = f"; layers {', '.join(layers)}, NaN where missing"
     return (
         f"{maps} maps of off-road terrain, {grid.height} × {grid.width} cells of "
         f"{grid.resolution_m:g} m: colour image, terrain class, elevation, slope, and "
@@ -251,15 +259,16 @@ def metadata(
 
     Args:
         dataset: exported dataset.
-        names: names of its splits in names of files, by their names in the dataset.
-        fields: exported fields.
+        names: names of splits as files contain them, by their names in the dataset.
+        fields: names of the exported fields.
         publication: licence, creator, address and date.
         folder: folder of the files.
     """
     digests = ",".join(dataset.splits[split]["digest"] for split in names)
     content = hashlib.sha256(digests.encode())
+    today = datetime.datetime.now(datetime.UTC).date().isoformat()
     version = re.search(r"-v(\d+)", dataset.id)
-    return {
+    node: Node = {
         "@context": _CONTEXT,
         "@type": "sc:Dataset",
         "conformsTo": "http://mlcommons.org/croissant/1.0",
@@ -268,19 +277,21 @@ def metadata(
         "license": publication.license_url,
         "creator": {"@type": "sc:Organization", "name": publication.creator},
         "url": publication.url or f"urn:sha256:{content.hexdigest()}",
-        "datePublished": publication.date
-        or datetime.datetime.now(datetime.UTC).date().isoformat(),
-        **({"version": f"{version[1]}.0.0"} if version else {}),
-        "keywords": ["robotics", "off-road navigation", "traversability", "terrain"],
-        **({"citeAs": PAPER} if is_ours(dataset, names) else {}),
-        "distribution": [
-            item for name in names.values() for item in _distribution(name, folder)
-        ],
-        "recordSet": [
-            _classes(dataset),
-            *(_maps(dataset, split, name, fields) for split, name in names.items()),
-        ],
+        "datePublished": publication.date or today,
     }
+    if version:
+        node["version"] = f"{version[1]}.0.0"
+    node["keywords"] = _TAGS_OF_METADATA
+    if is_ours(dataset, names):
+        node["citeAs"] = PAPER
+    files: list[Node] = []
+    record_sets = [_classes(dataset)]
+    for split, name in names.items():
+        files += _distribution(name, folder)
+        record_sets.append(_maps(dataset, split, name, fields))
+    node["distribution"] = files
+    node["recordSet"] = record_sets
+    return node
 
 
 def _node(kind: str, node_id: str, **properties: Any) -> Node:
@@ -321,13 +332,12 @@ def _maps(
             description += f"; in {field.unit}"
         if shape:
             description += f"; nested lists of shape {list(shape)}"
-        source = {"fileSet": {"@id": f"{name}-files"}, "extract": {"column": column}}
-        properties = {
-            "description": description,
-            "dataType": "sc:Float" if "f" in field.dtype else "sc:Integer",
-            **({"repeated": True} if shape else {}),
-            "source": source,
-        }
+        kind = "sc:Float" if "f" in field.dtype else "sc:Integer"
+        properties: Node = {"description": description, "dataType": kind}
+        if shape:
+            properties["repeated"] = True
+        files = {"@id": f"{name}-files"}
+        properties["source"] = {"fileSet": files, "extract": {"column": column}}
         columns.append(_node("Field", f"{name}/{column}", **properties))
     entry = dataset.splits[split]
     description = (
@@ -345,14 +355,15 @@ def _classes(dataset: TerrainDataset) -> Node:
         colour = f"#{bytes(item.colour).hex()}"
         row = {"id": class_id, **asdict(item), "colour": colour}
         soft = row.pop("soft") or {}
-        row |= {f"soft_{key}": soft.get(key, 0.0) for key in ("weight", "mean", "std")}
+        for key in ("weight", "mean", "std"):
+            row[f"soft_{key}"] = soft.get(key, 0.0)
         for layer in filter(None, layers):
             row |= layer.class_columns(item.name)
         rows.append({f"classes/{key}": value for key, value in row.items()})
-    kinds = {
-        key: "sc:Text" if isinstance(value, str) else "sc:Float"
-        for key, value in rows[0].items()
-    }
+    kinds = {}
+    for key, value in rows[0].items():
+        is_text = isinstance(value, str)
+        kinds[key] = "sc:Text" if is_text else "sc:Float"
     kinds["classes/id"] = "sc:Integer"
     fields = [_node("Field", key, dataType=kind) for key, kind in kinds.items()]
     meaning = (
@@ -379,7 +390,7 @@ def card(
 
     Args:
         dataset: exported dataset.
-        names: names of its splits in names of files, by their names in the dataset.
+        names: names of splits as files contain them, by their names in the dataset.
         publication: licence, creator, address and date.
     """
     ours = is_ours(dataset, names)
@@ -388,31 +399,29 @@ def card(
         {"split": name, "path": f"{FOLDER}/{name}-*-of-*.parquet"}
         for name in names.values()
     ]
-    head = {
-        "pretty_name": title,
-        "license": "other" if publication.is_url else publication.license.lower(),
-        **({"license_link": publication.license} if publication.is_url else {}),
-        "tags": ["robotics", "off-road-navigation", "traversability", "terrain"],
-        "configs": [{"config_name": "default", "data_files": files}],
-    }
-    rows = [
-        f"| `{name}` | `{split}` | {dataset.map_count(split)} | "
-        f"`{dataset.splits[split]['digest']}` |"
-        for split, name in names.items()
+    front: Node = {"pretty_name": title, "license": publication.license.lower()}
+    if publication.is_url:
+        front["license"] = "other"
+        front["license_link"] = publication.license
+    front["tags"] = _TAGS_OF_CARD
+    front["configs"] = [{"config_name": "default", "data_files": files}]
+    front_matter = yaml.safe_dump(front, sort_keys=False, allow_unicode=True)
+    lines = [
+        f"---\n{front_matter}---\n",
+        f"# {title}\n",
+        f"{describe(dataset, names)}\n",
+        f"A row is a map; arrays are nested lists. `{METADATA}` describes the "
+        "columns and contains the SHA-256 of",
+        "each file. The metadata of each Parquet file contain the recipes that "
+        "generate the maps.\n",
+        "| split here | split of the dataset | maps | digest of the dataset's "
+        "maps |\n|---|---|---|---|",
     ]
-    return "\n".join(
-        [
-            f"---\n{yaml.safe_dump(head, sort_keys=False, allow_unicode=True)}---\n",
-            f"# {title}\n",
-            f"{describe(dataset, names)}\n",
-            f"A row is a map; arrays are nested lists. `{METADATA}` describes the "
-            "columns and contains the SHA-256 of",
-            "each file. The metadata of each Parquet file contain the recipes that "
-            "generate the maps.\n",
-            "| split here | split of the dataset | maps | digest of the dataset's "
-            "maps |\n|---|---|---|---|",
-            *rows,
-            f"\nLicence: [{publication.license}]({publication.license_url}).\n",
-            *([f"```bibtex\n{PAPER}\n```\n"] if ours else []),
-        ]
-    )
+    for split, name in names.items():
+        n_maps = dataset.map_count(split)
+        digest = dataset.splits[split]["digest"]
+        lines.append(f"| `{name}` | `{split}` | {n_maps} | `{digest}` |")
+    lines.append(f"\nLicence: [{publication.license}]({publication.license_url}).\n")
+    if ours:
+        lines.append(f"```bibtex\n{PAPER}\n```\n")
+    return "\n".join(lines)

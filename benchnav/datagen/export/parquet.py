@@ -26,12 +26,14 @@ _CELLS_PER_ROW_GROUP = 2**20
 
 
 def split_names(splits: Iterable[str]) -> dict[str, str]:
-    """Return names of splits of letters, digits and `_`: `test/std` is `test_std`.
+    """Return names of splits in letters, digits and `_`, as `test_std` for `test/std`.
 
     Raises:
         DatasetError: If two splits have the same name.
     """
-    names = {split: re.sub(r"\W", "_", split, flags=re.ASCII) for split in splits}
+    names = {}
+    for split in splits:
+        names[split] = re.sub(r"\W", "_", split, flags=re.ASCII)
     for split, name in names.items():
         same = [candidate for candidate in names if names[candidate] == name]
         if len(same) > 1:
@@ -47,10 +49,11 @@ def columns_of(
     dataset: TerrainDataset, fields: Iterable[str]
 ) -> dict[str, schema.Field]:
     """Return the columns of a split: the index of the map, and some fields."""
-    columns = {
-        MAP: schema.Field("<i8", (), "1", 0, np.inf, "number of the map in its split")
-    }
-    return columns | {name: dataset.fields[name] for name in fields}
+    meaning = "number of the map in its split"
+    columns = {MAP: schema.Field("<i8", (), "1", 0, np.inf, meaning)}
+    for name in fields:
+        columns[name] = dataset.fields[name]
+    return columns
 
 
 def table_schema(
@@ -83,7 +86,8 @@ def table_schema(
         shape = field.entry_shape(*dataset.grid.shape)
         kind = pa.from_numpy_dtype(np.dtype(field.dtype))
         for size in reversed(shape):
-            kind = pa.list_(pa.field("element", kind, False), size)
+            element = pa.field("element", kind, False)
+            kind = pa.list_(element, size)
         column_metadata = {
             "shape": json.dumps(list(shape)),
             "unit": field.unit,
@@ -121,22 +125,26 @@ def write_split(
     columns = table_schema(dataset, split, fields)
     n_files = -(-n_maps // maximum)
     for number in range(n_files):
-        indices = range(n_maps)[number * maximum :][:maximum]
+        first = number * maximum
+        end = min(first + maximum, n_maps)
         path = folder / f"{name}-{number:05d}-of-{n_files:05d}.parquet"
         with pq.ParquetWriter(path, columns, compression="zstd") as writer:
-            for start in range(0, len(indices), step):
-                rows = indices[start : start + step]
-                maps = {MAP: np.array(rows), **dataset.read(split, rows, fields)}
+            for start in range(first, end, step):
+                indices = range(start, min(start + step, end))
+                maps = dataset.read(split, indices, fields)
+                maps[MAP] = np.array(indices)
                 arrays = [
                     _nested_array(maps[column.name], column.type) for column in columns
                 ]
-                writer.write_batch(pa.RecordBatch.from_arrays(arrays, schema=columns))
-                yield len(rows)
+                batch = pa.RecordBatch.from_arrays(arrays, schema=columns)
+                writer.write_batch(batch)
+                yield len(indices)
 
 
 def _nested_array(values: np.ndarray, kind: pa.DataType) -> pa.Array:
     """Return nested lists of values of shape [B, *entry shape]."""
     if not pa.types.is_fixed_size_list(kind):
         return pa.array(np.ascontiguousarray(values))
-    inner = _nested_array(values.reshape(-1, *values.shape[2:]), kind.value_type)
+    elements = values.reshape(-1, *values.shape[2:])
+    inner = _nested_array(elements, kind.value_type)
     return pa.FixedSizeListArray.from_arrays(inner, type=kind)

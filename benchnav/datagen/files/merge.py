@@ -28,7 +28,8 @@ from benchnav.datagen.files.hdf5 import (
 )
 from benchnav.datagen.files.manifest import is_dataset
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.datagen.recipe.recipe import Recipe, check_name, recipe_from_dict
+from benchnav.datagen.recipe.load import recipe_from_dict
+from benchnav.datagen.recipe.recipe import Recipe, check_name
 
 # Settings that determine the meaning of maps. They must be identical in all files.
 _SHARED = (

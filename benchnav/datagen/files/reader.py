@@ -27,7 +27,8 @@ from benchnav.datagen.files.manifest import (
     read_manifest,
 )
 from benchnav.datagen.layers.spec import shipped_fields
-from benchnav.datagen.recipe.recipe import Recipe, recipe_from_dict
+from benchnav.datagen.recipe.load import recipe_from_dict
+from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.datagen.schema import Maps
 
 if TYPE_CHECKING:

@@ -1,3 +1,1 @@
-"""Layers of recipes: maps that are drawn, change colours and change λ; one file a
-shipped layer.
-"""
+"""Layers of recipes: drawn maps that may change colours and λ; a file per layer."""

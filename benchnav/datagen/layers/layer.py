@@ -1,9 +1,9 @@
 """Base class of layers: stored map, drawing, appearance, and effect on λ.
 
-A layer is a frozen dataclass. Its fields are its settings. Its class attributes
-describe the stored map, float32 without NaN. Only `draw` is required: by default, a
-layer is invisible and does not change λ. All methods are pure functions of their
-arguments, for any batch of maps. Letters in shapes: B maps, H×W cells, C classes.
+A layer is a frozen dataclass whose fields are its settings. Its class attributes
+describe the stored map, which is float32 without NaN. Only `draw` is required: by
+default, a layer is invisible and does not change λ. All methods are pure functions of
+their arguments, for any batch of maps. Letters in shapes: B maps, H×W cells, C classes.
 """
 
 from collections.abc import Mapping
@@ -25,9 +25,9 @@ from benchnav.datagen.schema import Field
 class Streams:
     """Random streams of a layer.
 
-    The numbers of a map are the same in any batch, order or process. Draws of one kind
-    and one name return the same numbers, so a layer that draws several times must name
-    each draw.
+    The numbers of a map are the same in any batch, order or process. Two draws of the
+    same kind and name return the same numbers, so a layer that draws several times must
+    name each draw.
 
     Args:
         seed: root seed of the recipe.
@@ -147,8 +147,8 @@ class Layer:
         """Return the colours of the terrain with the layer, in full light.
 
         Args:
-            rgb: colours without it, after tints and earlier layers, 0–255, float64,
-                shape [B, 3, H, W].
+            rgb: colours without this layer, after tints and earlier layers, 0–255,
+                float64, shape [B, 3, H, W].
             values: values as stored, float64, shape [B, H, W].
             maps: the terrain below.
         """
@@ -159,12 +159,13 @@ class Layer:
     ) -> tuple[ndarray, ndarray]:
         """Return the distribution of λ with the layer.
 
-        Called once for the latent function of the class and once for its soft spots.
+        It is called once for the latent function of the class, and once for its soft
+        spots.
 
         Args:
             mean: mean of the normal distribution of λ before clipping, without the
                 layer, in [0, 1], shape [B, H, W].
-            std: its standard deviation, in (0, 1], shape [B, H, W].
+            std: standard deviation of that distribution, in (0, 1], shape [B, H, W].
             values: values as stored, float64, shape [B, H, W].
             maps: the terrain below.
 
@@ -192,8 +193,9 @@ class Layer:
     def describe(self) -> str:
         """Return a short description of the layer and its settings, for `show`."""
         settings = [f"{name} {value}" for name, value in self.settings().items()]
-        suffix = f" ({', '.join(settings)})" if settings else ""
-        return f"layer {self.name}{suffix}"
+        if not settings:
+            return f"layer {self.name}"
+        return f"layer {self.name} ({', '.join(settings)})"
 
     def describe_class(self, name: str) -> str:
         """Return a description of the layer on a class; by default, it is empty."""
@@ -217,21 +219,21 @@ class Layer:
 
     @classmethod
     def affects(cls) -> bool:
-        """Return whether it changes the distribution of λ."""
+        """Return whether the layer changes the distribution of λ."""
         return cls.affect is not Layer.affect
 
     @classmethod
     def hides(cls) -> bool:
-        """Return whether it changes the classes that an image shows."""
+        """Return whether the layer changes the classes that an image shows."""
         return cls.class_weights is not Layer.class_weights
 
     def settings(self) -> dict[str, Any]:
-        """Return the values of its dataclass fields by name."""
+        """Return the values of the layer's dataclass fields by name."""
         if not is_dataclass(self):
             return {}
         return {item.name: getattr(self, item.name) for item in fields(self)}
 
     @classmethod
     def field(cls) -> Field:
-        """Return the stored field."""
+        """Return the description of the stored field."""
         return Field("<f4", ("H", "W"), cls.unit, cls.minimum, cls.maximum, cls.meaning)

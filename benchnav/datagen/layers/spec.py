@@ -1,8 +1,8 @@
 """Record of a layer in a recipe: part, options, stored field, digest of its code.
 
-The layer can be rebuilt from it. A dataset with a custom layer can be read without the
-layer's code. The code is needed to generate maps, and to predict λ from colours if the
-layer changes λ.
+The layer can be rebuilt from its record. A dataset with a custom layer can be read
+without the layer's code. The code is needed to generate maps, and to predict λ from
+colours if the layer changes λ.
 """
 
 import sys
@@ -32,19 +32,19 @@ class LayerSpec:
     Args:
         part: shipped name, entry point, `package.module:Name` or
             `path/to/file.py:Name`.
-        options: all its settings, as plain data.
+        options: all settings of the layer, as plain data.
         name: name of the stored field.
         unit: unit of the stored field.
-        minimum: smallest valid value; None for any.
-        maximum: largest valid value; None for any.
+        minimum: smallest valid value; None without a lower limit.
+        maximum: largest valid value; None without an upper limit.
         meaning: one line for readers of the dataset.
         words: description of the layer and its settings, for `show`.
-        affects: whether it changes the distribution of λ.
-        hides: whether it changes the classes that an image shows.
-        source: origin of its code; empty if it is shipped.
-        digest: SHA-256 of its code and the code that it imports; empty if it is
-            shipped.
-        files: digests of the files that its options name.
+        affects: whether the layer changes the distribution of λ.
+        hides: whether the layer changes the classes that an image shows.
+        source: origin of the layer's code; empty if it is shipped.
+        digest: SHA-256 of the layer's code and the code that it imports; empty if it
+            is shipped.
+        files: digests of the files that options name, by path.
     """
 
     part: str
@@ -71,7 +71,7 @@ class LayerSpec:
 
     @property
     def stored_field(self) -> Field:
-        """Stored field, with its limits."""
+        """Description of the stored field, with its limits."""
         low = -np.inf if self.minimum is None else self.minimum
         high = np.inf if self.maximum is None else self.maximum
         return Field("<f4", ("H", "W"), self.unit, low, high, self.meaning)
@@ -83,7 +83,7 @@ class LayerSpec:
 
     @property
     def meaning_of_maps(self) -> dict[str, Any]:
-        """Entries that determine the maps, independent of the location of the code."""
+        """Entries that determine the maps, whatever the location of the code."""
         return {
             "name": self.name,
             "options": self.options,
@@ -118,13 +118,16 @@ class LayerSpec:
                 f"The code of layer {self.name!r} is needed to generate maps or to "
                 f"predict from colours: {error}"
             ) from error
+        expected = self.digest[:12] or "none"
+        got = digest[:12] or "none"
         expect(
             digest == self.digest,
             f"the code of layer {self.name!r} that the dataset records, of digest "
-            f"{self.digest[:12] or 'none'}, got {self.part} of digest "
-            f"{digest[:12] or 'none'}. Restore that code, or create a new dataset.",
+            f"{expected}, got {self.part} of digest {got}. Restore that code, or create "
+            "a new dataset.",
         )
-        changed = ", ".join(sorted(dict(files.items() ^ self.files.items())))
+        different = dict(files.items() ^ self.files.items())
+        changed = ", ".join(sorted(different))
         expect(
             files == self.files,
             f"the files that options of layer {self.name!r} name as the dataset "
@@ -140,8 +143,9 @@ class LayerSpec:
             ConfigError: If its class is registered in this process only.
         """
         entry = None if self.is_vegetation else registry.find(KIND, self.part)
+        is_everywhere = entry is None or entry.everywhere
         expect(
-            entry is None or entry.everywhere,
+            is_everywhere,
             f"one process with layer {self.name!r}, whose class is registered in this "
             "process only, got more. Pass `jobs` 1, or put the class in a file.",
         )
@@ -155,16 +159,19 @@ class LayerSpec:
 
     def scaled(self, factor: float, resolution_m: float) -> Self:
         """Return the record for maps of another size; see `Layer.scaled`."""
-        settings = plain(self.layer.scaled(factor, resolution_m).settings())
-        return self if settings == self.options else replace(self, options=settings)
+        scaled = self.layer.scaled(factor, resolution_m)
+        options = plain(scaled.settings())
+        if options == self.options:
+            return self
+        return replace(self, options=options)
 
 
 def read_layer(entry: Any) -> LayerSpec:
     """Return the record of a layer in a recipe.
 
     Args:
-        entry: `NAME`, `{part: NAME, options: {…}}`, a `LayerSpec`, also as plain data,
-            or a `Layer`.
+        entry: `NAME`, `{part: NAME, options: {…}}`, a `Layer`, or a `LayerSpec`, which
+            may be plain data.
 
     Raises:
         ConfigError: If it is of another type, or there is no such layer or option.
@@ -178,19 +185,20 @@ def read_layer(entry: Any) -> LayerSpec:
     is_mapping = isinstance(entry, Mapping)
     if is_mapping and "name" in entry:
         return read(LayerSpec, entry, of("a layer"))
+    is_part = isinstance(entry, str) or (is_mapping and "label" not in entry)
     expect(
-        isinstance(entry, str) or (is_mapping and "label" not in entry),
-        f"a layer as NAME or as {{part: NAME, options: {{…}}}}, got {entry!r}.",
+        is_part, f"a layer as NAME or as {{part: NAME, options: {{…}}}}, got {entry!r}."
     )
-    part = registry.complete(KIND, registry.read_part(KIND, entry))
+    part = registry.read_part(KIND, entry)
+    part = registry.complete(KIND, part)
     return _record(part, part.create())
 
 
 def read_layers(entries: Any) -> tuple[LayerSpec, ...]:
-    """Return the records of a recipe's layers, in the order of being drawn.
+    """Return the records of a recipe's layers, in the order in which they are drawn.
 
     Args:
-        entries: list of what `read_layer` reads.
+        entries: list of entries that `read_layer` accepts.
 
     Raises:
         ConfigError: If it is not a list, two layers have one name, or `read_layer`
@@ -209,7 +217,7 @@ def read_layers(entries: Any) -> tuple[LayerSpec, ...]:
 def overrides_of(
     before: Sequence[LayerSpec], after: Sequence[LayerSpec]
 ) -> dict[str, Any]:
-    """Return the changed options of a recipe's layers by the keys of overrides."""
+    """Return the changed options of a recipe's layers, by their keys in overrides."""
     changed: dict[str, Any] = {}
     number = 0
     for old, new in zip(before, after, strict=True):
@@ -229,14 +237,14 @@ def shipped_fields() -> dict[str, Field]:
 @cache
 def _shipped_fields(path: tuple[str, ...]) -> dict[str, Field]:
     """Return the fields of `shipped_fields`, cached for each search path."""
-    layers: Iterable[type[Layer]] = (Vegetation, *_shipped_classes().values())
+    shipped = _shipped_classes()
+    layers: Iterable[type[Layer]] = (Vegetation, *shipped.values())
     return {layer.name: layer.field() for layer in layers}
 
 
 def _shipped_classes() -> dict[str, type[Layer]]:
-    return {
-        name: registry.find(KIND, name).target for name in registry.shipped_names(KIND)
-    }
+    names = registry.shipped_names(KIND)
+    return {name: registry.find(KIND, name).target for name in names}
 
 
 def _part_of(layer: Layer) -> str:
@@ -258,22 +266,23 @@ def _record(part: registry.Part, layer: Layer) -> LayerSpec:
     kind = type(layer)
     is_vegetation = isinstance(layer, Vegetation)
     stored = kind.field()
-    entry = None if is_vegetation else part.found
-    is_custom = entry is not None and not entry.shipped
+    has_minimum = np.isfinite(stored.minimum)
+    has_maximum = np.isfinite(stored.maximum)
     spec = LayerSpec(
         part="vegetation" if is_vegetation else part.part,
         options=dict(part.options),
         name=kind.name,
         unit=stored.unit,
-        minimum=stored.minimum if np.isfinite(stored.minimum) else None,
-        maximum=stored.maximum if np.isfinite(stored.maximum) else None,
+        minimum=stored.minimum if has_minimum else None,
+        maximum=stored.maximum if has_maximum else None,
         meaning=stored.meaning,
         words=layer.describe(),
         affects=kind.affects(),
         hides=kind.hides(),
-        source=entry.origin if entry and is_custom else "",
-        digest=entry.digest if entry and is_custom else "",
-        files=registry.option_files(part) if is_custom else {},
     )
+    entry = None if is_vegetation else part.found
+    if entry is not None and not entry.shipped:
+        files = registry.option_files(part)
+        spec = replace(spec, source=entry.origin, digest=entry.digest, files=files)
     vars(spec)["layer"] = layer
     return spec

@@ -1,4 +1,4 @@
-"""Layers of maps, applied in order, with checks of what each returns.
+"""Application of the layers of maps in order, with checks of their results.
 
 Letters in shapes: B maps, H×W cells, C classes, K components.
 """
@@ -112,17 +112,19 @@ def affect_layers(
         return truth
     weights, means, stds = (array.copy() for array in truth)
     for component in range(weights.shape[1]):
-        cells = (weights[:, component] > 0) & ~np.isnan(means[:, component])
+        has_weight = weights[:, component] > 0
+        is_labelled = ~np.isnan(means[:, component])
+        cells = has_weight & is_labelled
         for layer in layers:
             mean = means[:, component]
             std = stds[:, component]
             arguments = mean, std, values[layer.name], maps
             result = _call(layer, "affect", layer.affect, *arguments)
             is_pair = isinstance(result, tuple) and len(result) == 2
+            kind = type(result).__name__
             expect(
                 is_pair,
-                f"mean and std of `affect` of layer {layer.name!r}, got "
-                f"{type(result).__name__}.",
+                f"mean and std of `affect` of layer {layer.name!r}, got {kind}.",
             )
             new_mean, new_std = result
             new_mean = _checked(
@@ -151,8 +153,8 @@ def weigh_layers(
         maps: the terrain below.
 
     Returns:
-        Weights, float64, shape [B, C, H, W]; with a layer that hides colours, they sum
-        to 1 over C.
+        Weights, float64, shape [B, C, H, W]. They sum to 1 over C if a layer hides
+        colours.
 
     Raises:
         ConfigError: If a layer raises, or returns another shape or a weight that is
@@ -167,22 +169,23 @@ def weigh_layers(
         )
     if not hiding:
         return weights
-    total = sum(weights[:, class_id] for class_id in range(weights.shape[1]))
-    return weights / np.maximum(total, np.finfo(np.float64).tiny)[:, None]
+    n_classes = weights.shape[1]
+    total = sum(weights[:, class_id] for class_id in range(n_classes))
+    divisor = np.maximum(total, np.finfo(np.float64).tiny)
+    return weights / divisor[:, None]
 
 
 def _call(
     layer: Layer, method: str, function: Callable[..., Any], *arguments: Any
 ) -> Any:
-    """Call a method of a layer; convert its exceptions to a message of one line."""
+    """Call a method of a layer; convert its exceptions to errors of one line."""
     try:
         return function(*arguments)
+    except BenchnavError:
+        raise
     except Exception as error:
-        if isinstance(error, BenchnavError):
-            raise
-        raise out_of_memory(error) or ConfigError(
-            f"`{method}` of layer {layer.name!r} failed: {one_line(error)}"
-        ) from error
+        text = f"`{method}` of layer {layer.name!r} failed: {one_line(error)}"
+        raise out_of_memory(error) or ConfigError(text) from error
 
 
 def _checked(
@@ -206,27 +209,28 @@ def _checked(
     Raises:
         ConfigError: If the result is invalid.
     """
+    subject = f"{what} of layer {layer.name!r}"
     try:
         array = np.asarray(result, dtype=np.float64)
     except (TypeError, ValueError) as error:
+        kind = type(result).__name__
         raise ConfigError(
-            f"Expected {what} of layer {layer.name!r} as an array of numbers, got "
-            f"{type(result).__name__}."
+            f"Expected {subject} as an array of numbers, got {kind}."
         ) from error
     expect(
         array.shape == shape,
-        f"{what} of layer {layer.name!r} of shape {list(shape)}, got "
-        f"{list(array.shape)}.",
+        f"{subject} of shape {list(shape)}, got {list(array.shape)}.",
     )
     low, high = limits
-    invalid = ~((array >= low) & (array <= high) & np.isfinite(array))
+    in_range = (array >= low) & (array <= high)
+    invalid = ~(in_range & np.isfinite(array))
     if cells is not None:
         invalid &= cells
     if invalid.any():
         is_unbounded = np.isinf(low) and np.isinf(high)
         valid_range = "finite" if is_unbounded else f"in [{low:g}, {high:g}]"
+        first = array[invalid][0]
         raise ConfigError(
-            f"Expected {what} of layer {layer.name!r} {valid_range}, got "
-            f"{array[invalid][0]:g} in {invalid.sum()} cells."
+            f"Expected {subject} {valid_range}, got {first:g} in {invalid.sum()} cells."
         )
     return array

@@ -81,7 +81,7 @@ class Vegetation(Layer):
     ) -> None:
         """Check that its colours neither create nor separate look-alike classes.
 
-        See `Layer.check`. Heights may separate them.
+        Heights may separate them. The arguments are those of `Layer.check`.
         """
         min_m = 2 * grid.resolution_m
         expect(
@@ -92,8 +92,10 @@ class Vegetation(Layer):
         names = [item.name for item in classes]
         for name in self.classes:
             check_known("classes of layer 'vegetation'", name, names)
-        growths = [self.classes.get(name) for name in names]
-        shown = [growth.appearance if growth else "none" for growth in growths]
+        shown = []
+        for name in names:
+            growth = self.classes.get(name)
+            shown.append(growth.appearance if growth else "none")
         for class_id, alike in enumerate(look_alike_classes(classes)):
             first = alike[0]
             if shown[first] != shown[class_id]:
@@ -106,7 +108,8 @@ class Vegetation(Layer):
         for scenario, class_colours in colours.items():
             for name, growth in self.classes.items():
                 is_same = (class_colours == growth.colour).all(axis=1)
-                same = [repr(names[class_id]) for class_id in np.flatnonzero(is_same)]
+                same_ids = np.flatnonzero(is_same)
+                same = [repr(names[class_id]) for class_id in same_ids]
                 expect(
                     not same,
                     f"vegetation on {name!r} of a `colour` that no terrain has in "
@@ -115,14 +118,15 @@ class Vegetation(Layer):
 
     def draw(self, streams: Streams, maps: DrawnMaps) -> ndarray:
         """Return drawn heights in steps of 2⁻¹⁰ m, 0 on bare terrain."""
-        return self.grow(streams.noise(self.period_m, self.period_m / 2), maps)
+        noise = streams.noise(self.period_m, self.period_m / 2)
+        return self.grow(noise, maps)
 
     def grow(self, noise: ndarray, maps: DrawnMaps) -> ndarray:
         """Return heights that increase with the noise, 0 on bare terrain.
 
         On each map, vegetation covers the fraction `cover` of each class's cells, to
-        within a cell, and its heights are uniform. Both follow ranks within the class,
-        so patches do not reveal the class among look-alikes.
+        within a cell, and its heights are uniform. Cover and heights follow the noise's
+        ranks within the class, so patches do not reveal the class among look-alikes.
 
         Args:
             noise: smooth noise, shape [B, H, W].
@@ -140,14 +144,18 @@ class Vegetation(Layer):
             if growth is None:
                 continue
             cells = flat_id == class_id
-            n_overgrown = np.rint(growth.cover * cells.sum(axis=1, keepdims=True))
-            order = np.argsort(np.where(cells, -flat, np.inf), axis=1, kind="stable")
+            n_cells = cells.sum(axis=1, keepdims=True)
+            n_overgrown = np.rint(growth.cover * n_cells)
+            descending = np.where(cells, -flat, np.inf)
+            order = np.argsort(descending, axis=1, kind="stable")
+            ranks = np.arange(flat.shape[1])[None]
             rank = np.empty_like(order)
-            np.put_along_axis(rank, order, np.arange(flat.shape[1])[None], axis=1)
+            np.put_along_axis(rank, order, ranks, axis=1)
             low, high = growth.height_m
             fraction = 1 - (rank + 0.5) / np.maximum(n_overgrown, 1)
             grown = low + (high - low) * fraction
-            heights[:] = np.where(cells & (rank < n_overgrown), grown, heights)
+            overgrown = cells & (rank < n_overgrown)
+            heights[:] = np.where(overgrown, grown, heights)
         return quantise(height_m, 10)
 
     def look(self, rgb: ndarray, values: ndarray, maps: DrawnMaps) -> ndarray:
@@ -163,19 +171,19 @@ class Vegetation(Layer):
     ) -> ndarray:
         """Return weights of the classes that may lie below vegetation of one colour.
 
-        An overgrown cell looks like the overgrown cells of all classes of its map with
-        vegetation of the same colour. Their weights are their covers. If these classes
-        also share their terrain colour, an image contains no more information. If they
-        do not, bare terrain next to a patch indicates the class within it, and a model
-        that uses the neighbourhood can predict better.
+        An overgrown cell looks like the overgrown cells of all classes on its map that
+        have vegetation of the same colour. The weight of a class is its cover. If these
+        classes also have one terrain colour, an image contains no more information. If
+        they do not, bare terrain next to a patch indicates the class within it, and a
+        model that uses the neighbourhood can predict better.
         """
         weights = weights.copy()
         overgrown = values > 0
         growths = [self.classes.get(item.name) for item in maps.classes]
-        is_shown = [
-            (maps.class_id == class_id).any(axis=(1, 2))[:, None, None]
-            for class_id in range(len(growths))
-        ]
+        is_shown = []
+        for class_id in range(len(growths)):
+            cells = maps.class_id == class_id
+            is_shown.append(cells.any(axis=(1, 2), keepdims=True))
         for class_id, growth in enumerate(growths):
             cells = overgrown & (maps.class_id == class_id)
             if not cells.any():
@@ -204,19 +212,25 @@ class Vegetation(Layer):
 
     def class_columns(self, name: str) -> dict[str, float | str]:
         """Return cover, heights and colour on a class; 0 and empty without vegetation."""
+        cover = low = high = 0.0
+        colour = ""
         growth = self.classes.get(name)
-        low, high = growth.height_m if growth else (0.0, 0.0)
+        if growth is not None:
+            cover = growth.cover
+            low, high = growth.height_m
+            colour = f"#{bytes(growth.colour).hex()}"
         return {
-            "vegetation_cover": growth.cover if growth else 0.0,
+            "vegetation_cover": cover,
             "vegetation_least_m": low,
             "vegetation_most_m": high,
-            "vegetation_colour": f"#{bytes(growth.colour).hex()}" if growth else "",
+            "vegetation_colour": colour,
         }
 
     def scaled(self, factor: float, resolution_m: float) -> Self:
-        """Return the layer with patches scaled with the map, of at least two cells."""
+        """Return the layer with its period scaled with the map, of at least two cells."""
         period_m = float(f"{self.period_m * factor:.6g}")
-        return replace(self, period_m=max(2 * resolution_m, period_m))
+        min_m = 2 * resolution_m
+        return replace(self, period_m=max(min_m, period_m))
 
 
 def read_keys(data: Mapping[str, Any]) -> tuple[Vegetation | None, dict[str, Any]]:
@@ -226,7 +240,8 @@ def read_keys(data: Mapping[str, Any]) -> tuple[Vegetation | None, dict[str, Any
         data: a recipe as plain data.
 
     Returns:
-        The layer, or None without vegetation; and the recipe without its keys.
+        The layer, or None without vegetation; and the recipe without the keys of
+        vegetation.
 
     Raises:
         ConfigError: If the keys are invalid.
@@ -237,15 +252,14 @@ def read_keys(data: Mapping[str, Any]) -> tuple[Vegetation | None, dict[str, Any
     growths = {}
     if isinstance(rows, list | tuple):
         items = [item for item in rows if isinstance(item, Mapping)]
-        growths = {
-            str(item.get("name")): item["vegetation"]
-            for item in items
-            if item.get("vegetation")
-        }
+        names = [str(item.get("name")) for item in items]
+        for name, item in zip(names, items, strict=True):
+            if item.get("vegetation"):
+                growths[name] = item["vegetation"]
         recipe["classes"] = [_without_vegetation(item) for item in rows]
-        names = {str(item.get("name")) for item in items}
+        is_distinct = len(set(names)) == len(names)
         expect(
-            not growths or len(names) == len(items),
+            is_distinct or not growths,
             "classes of different names where one has `vegetation`, got two of one "
             "name. Rename one.",
         )
@@ -267,8 +281,9 @@ def write_classes(
     growths = vegetation.classes if vegetation else {}
     written = []
     for row in rows:
-        if row["name"] in growths:
-            row = row | {"vegetation": plain(growths[row["name"]])}
+        growth = growths.get(row["name"])
+        if growth is not None:
+            row = row | {"vegetation": plain(growth)}
         written.append(row)
     return written
 
@@ -284,5 +299,6 @@ def _key_of(key: str) -> str:
     head, _, tail = key.partition(".")
     name, _, inner = tail.partition(".")
     if head == "classes" and name:
-        return f"`classes.{name}.vegetation{'.' * bool(inner)}{inner}`"
+        dot = "." if inner else ""
+        return f"`classes.{name}.vegetation{dot}{inner}`"
     return f"`vegetation_{key}`" if key else "vegetation"

@@ -1,1 +1,1 @@
-"""What is to be made: recipes, scenarios and the class table."""
+"""Recipes of datasets, with their scenarios and the class table."""

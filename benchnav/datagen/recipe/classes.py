@@ -1,7 +1,7 @@
 """Terrain classes: colours, and parameters of latent traversability (LT) functions.
 
 Beyond the paper, a class may have soft spots, a second mode of λ that neither colour
-nor slope shows, and classes may share a colour.
+nor slope shows, and several classes may have one colour.
 """
 
 from dataclasses import dataclass
@@ -17,8 +17,8 @@ class SoftSpots:
 
     Args:
         weight: fraction of the class's cells, in (0, 1).
-        mean: mean of λ there before clipping, at any slope, in [0, 1].
-        std: its standard deviation, in (0, 1].
+        mean: mean of λ in soft spots before clipping, at any slope, in [0, 1].
+        std: standard deviation of λ in soft spots before clipping, in (0, 1].
     """
 
     weight: float
@@ -27,8 +27,9 @@ class SoftSpots:
 
     def __post_init__(self) -> None:
         """Reject values out of range."""
+        in_range = 0 < self.weight < 1 and 0 <= self.mean <= 1 and 0 < self.std <= 1
         expect(
-            0 < self.weight < 1 and 0 <= self.mean <= 1 and 0 < self.std <= 1,
+            in_range,
             "soft spots of `weight` in (0, 1), `mean` in [0, 1] and `std` in (0, 1], "
             f"got {self.weight}, {self.mean} and {self.std}.",
         )
@@ -43,9 +44,9 @@ class TerrainClass:
         colour: RGB in full light, 0–255.
         scale: a_c, in [1, 9] in the shipped table.
         exponent: b_c, in [1.4, 2.0] in the shipped table.
-        offset: o_c, loss on flat ground, in [0, 0.1] in the shipped table.
+        offset: o_c, loss on flat terrain, in [0, 0.1] in the shipped table.
         noise: σ_c, in [0.1, 0.2] in the shipped table.
-        soft: its soft spots; None if it has no soft spots.
+        soft: soft spots of the class; None if it has no soft spots.
     """
 
     name: str
@@ -61,9 +62,10 @@ class TerrainClass:
         check_label("`name` of a class", self.name)
         check_colour(f"class {self.name!r}", self.colour)
         numbers = self.scale, self.exponent, self.offset, self.noise
+        is_finite = np.isfinite(numbers).all()
         in_range = self.scale >= 0 and self.exponent > 0 and self.noise > 0
         expect(
-            np.isfinite(numbers).all() and in_range,
+            is_finite and in_range,
             f"`scale` ≥ 0, `exponent` > 0 and `noise` > 0 of class {self.name!r}, "
             f"got {self.scale}, {self.exponent} and {self.noise}.",
         )
@@ -73,12 +75,14 @@ ClassTable = tuple[TerrainClass, ...]
 
 
 def look_alike_classes(classes: ClassTable) -> list[tuple[int, ...]]:
-    """Return, for each class, the indices of all classes of its colour with itself."""
-    colours = [item.colour for item in classes]
-    return [
-        tuple(i for i, other_colour in enumerate(colours) if other_colour == colour)
-        for colour in colours
-    ]
+    """Return, for each class, the indices of all classes of its colour.
+
+    The class itself is among them.
+    """
+    by_colour: dict[tuple[int, int, int], tuple[int, ...]] = {}
+    for class_id, item in enumerate(classes):
+        by_colour[item.colour] = (*by_colour.get(item.colour, ()), class_id)
+    return [by_colour[item.colour] for item in classes]
 
 
 def check_colour(of: str, colour: tuple[int, int, int]) -> None:

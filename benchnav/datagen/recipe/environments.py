@@ -14,21 +14,23 @@ def deal_classes(count: int, shown: int, environments: int) -> np.ndarray:
     """Return the classes of all environments, dealt consecutively from one pack.
 
     Each class is a unit. The pack is the class table read with a stride, so that the
-    classes of an environment differ in colour. The stride changes whenever the deals
-    have gone through a whole number of packs.
+    classes of an environment differ in colour. The stride changes each time that the
+    environments so far have used up a whole number of packs.
 
     Args:
         count: number of classes.
         shown: M, number of classes of an environment.
-        environments: E, number of environments; more do not change the first.
+        environments: E, number of environments; a larger E does not change the first.
 
     Returns:
         Class indices, distinct in each row, shape [E, M].
     """
     first = shown * np.arange(environments)[:, None]
+    position = first + np.arange(shown)
+    cycle = int(np.lcm(shown, count))
     steps = np.array(strides(count))
-    stride = steps[first // int(np.lcm(shown, count)) % len(steps)]
-    return stride * (first + np.arange(shown)) % count
+    stride = steps[first // cycle % len(steps)]
+    return stride * position % count
 
 
 def deal_units(
@@ -37,13 +39,13 @@ def deal_units(
     """Return the classes of all environments, dealt by units about equally often.
 
     Units that were dealt least often come first. Among them, the order is that of the
-    pack in `deal_classes`, with another stride for each time dealt. A unit that does
-    not fit in the remaining room is skipped.
+    pack in `deal_classes`; its stride depends on how often they were dealt. A unit that
+    does not fit in the remaining room is skipped.
 
     Args:
-        units: classes that are shown together, none of them in `never_shown`.
+        units: classes that are shown together; must exclude those of `never_shown`.
         shown: M, number of classes of an environment.
-        environments: E, number of environments; more do not change the first.
+        environments: E, number of environments; a larger E does not change the first.
 
     Returns:
         Class indices, distinct in each row, shape [E, M].
@@ -51,18 +53,20 @@ def deal_units(
     count = len(units)
     times_dealt = [0] * count
     # Positions of the units in the pack, for each stride.
-    positions = [
-        np.argsort(stride * np.arange(count) % count)
-        for stride in dict.fromkeys(strides(count))
-    ]
+    positions = []
+    for stride in dict.fromkeys(strides(count)):
+        pack = stride * np.arange(count) % count
+        positions.append(np.argsort(pack))
 
     def rank(unit: int) -> tuple[int, int]:
         times = times_dealt[unit]
-        return times, positions[times % len(positions)][unit]
+        position = positions[times % len(positions)]
+        return times, position[unit]
 
     table = []
     for _ in range(environments):
-        dealt = _fill(sorted(range(count), key=rank), units, shown)
+        order = sorted(range(count), key=rank)
+        dealt = _fill(order, units, shown)
         classes: list[int] = []
         for unit in dealt:
             times_dealt[unit] += 1
@@ -83,11 +87,12 @@ def never_shown(units: tuple[AlikeClasses, ...], shown: int) -> list[AlikeClasse
 
 
 def strides(count: int) -> list[int]:
-    """Return strides that visit all of a pack: 3 and 1 first, then all, 3 again.
+    """Return strides that visit all of a pack: 3 and 1, then all from 2 on.
 
-    Maps of synthesis 1 depend on this order.
+    3 comes twice, since maps of synthesis 1 depend on this order.
     """
-    return [s for s in (3, 1, *range(2, count)) if np.gcd(s, count) == 1]
+    candidates = (3, 1, *range(2, count))
+    return [stride for stride in candidates if np.gcd(stride, count) == 1]
 
 
 def _fill(order: list[int], units: tuple[AlikeClasses, ...], room: int) -> list[int]:

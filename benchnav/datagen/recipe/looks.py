@@ -29,7 +29,8 @@ def shown_colours(classes: ClassTable, scenario: Scenario) -> ndarray:
     colours = np.array([item.colour for item in classes], dtype=np.float64)
     for tint in scenario.tints:
         mask = [not tint.classes or item.name in tint.classes for item in classes]
-        colours[mask] += tint.share * (np.array(tint.colour) - colours[mask])
+        difference = np.array(tint.colour) - colours[mask]
+        colours[mask] += tint.share * difference
     return colours
 
 
@@ -47,7 +48,8 @@ def check_tints(classes: ClassTable, scenarios: Mapping[str, Scenario]) -> None:
             for tinted in tint.classes:
                 check_known(f"`classes` of a tint of scenario {name!r}", tinted, names)
         colours = np.rint(shown_colours(classes, scenario))
-        for a, b in np.argwhere(_alike(colours) != _alike(table)).tolist():
+        differs = _alike(colours) != _alike(table)
+        for a, b in np.argwhere(differs).tolist():
             is_alike = (colours[a] == colours[b]).all()
             problem = "one colour" if is_alike else "two colours"
             remedy = "Lower a `share`" if is_alike else "Tint both"
@@ -59,5 +61,5 @@ def check_tints(classes: ClassTable, scenarios: Mapping[str, Scenario]) -> None:
 
 
 def _alike(colours: ndarray) -> ndarray:
-    """Return which of N colours [N, 3] are equal in pairs, bool, shape [N, N]."""
+    """Return which pairs of N colours [N, 3] are equal, bool, shape [N, N]."""
     return (colours[:, None] == colours).all(axis=-1)

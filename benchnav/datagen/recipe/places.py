@@ -23,7 +23,7 @@ class PlacesRule:
 
     Args:
         least_distance_m: minimum distance between start and goal, in metres, > 0.
-        margin_m: minimum distance of each to the map's edges, in metres, ≥ 0.
+        margin_m: minimum distance of start and goal to the map's edges, in metres, ≥ 0.
     """
 
     least_distance_m: float
@@ -31,8 +31,9 @@ class PlacesRule:
 
     def __post_init__(self) -> None:
         """Reject values out of range."""
+        in_range = 0 < self.least_distance_m < np.inf and 0 <= self.margin_m < np.inf
         expect(
-            0 < self.least_distance_m < np.inf and 0 <= self.margin_m < np.inf,
+            in_range,
             "`places` of finite `least_distance_m` > 0 and `margin_m` ≥ 0, "
             f"got {self.least_distance_m} and {self.margin_m}.",
         )
@@ -46,12 +47,15 @@ def check_places(places: PlacesRule, grid: Grid) -> None:
             is less than a cell's diagonal. The message names the limit.
     """
     _, count = _inside(places, grid)
+    half_side_m = min(grid.extent_m) / 2
+    has_room = (count >= 1).all()
     expect(
-        (count >= 1).all(),
-        f"`margin_m` of `places` under {min(grid.extent_m) / 2:g} m, half of the "
-        f"map's shorter side, got {places.margin_m:g}.",
+        has_room,
+        f"`margin_m` of `places` under {half_side_m:g} m, half of the map's shorter "
+        f"side, got {places.margin_m:g}.",
     )
-    largest_m = float(np.hypot(*(count - 1))) / _STEPS_PER_M
+    largest_steps = np.hypot(*(count - 1))
+    largest_m = float(largest_steps) / _STEPS_PER_M
     shown_m = np.floor(100 * largest_m) / 100
     expect(
         places.least_distance_m <= largest_m,
@@ -73,8 +77,8 @@ def draw_places(
 ) -> tuple[ndarray, ndarray]:
     """Draw start and goal of some maps.
 
-    The first of a map's candidate pairs with the minimum distance is used. If no
-    candidate has it, start and goal lie in opposite corners.
+    The first candidate pair of a map that keeps the minimum distance is used. If no
+    candidate does, start and goal lie in opposite corners.
 
     Args:
         places: rule that passes `check_places`.
@@ -89,13 +93,15 @@ def draw_places(
     first, count = _inside(places, grid)
     draws = rng.uniform(key, indices, (_CANDIDATES, 2, 2))
     steps = np.floor(draws * count)
-    corners = np.broadcast_to([0 * count, count - 1], (len(steps), 1, 2, 2))
+    n_maps = len(steps)
+    corners = np.broadcast_to([0 * count, count - 1], (n_maps, 1, 2, 2))
     steps = np.concatenate([steps, corners], axis=1)
     pairs_m = (first + steps) / _STEPS_PER_M
     offset_m = pairs_m[:, :, 1] - pairs_m[:, :, 0]
     distance_m = np.hypot(*np.moveaxis(offset_m, -1, 0))
-    chosen = (distance_m >= places.least_distance_m).argmax(axis=1)
-    pair_m = pairs_m[np.arange(len(pairs_m)), chosen]
+    is_far = distance_m >= places.least_distance_m
+    chosen = is_far.argmax(axis=1)
+    pair_m = pairs_m[np.arange(n_maps), chosen]
     return pair_m[:, 0], pair_m[:, 1]
 
 

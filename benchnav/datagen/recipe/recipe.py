@@ -1,15 +1,12 @@
-"""Recipes: everything that determines a dataset, as data.
+"""Recipes: everything that determines a dataset, as data, with its checks.
 
-A recipe is a YAML file. Shipped recipes are loaded by id (`paper-v1`), custom ones by
-path.
+`benchnav.datagen.recipe.load` reads recipes from YAML files and plain data.
 """
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,9 +15,8 @@ from numpy import ndarray
 from benchnav.core.copula import LONGEST_CORRELATION
 from benchnav.core.errors import ConfigError, expect
 from benchnav.core.grid import Grid
-from benchnav.core.settings import changed, plain, read
+from benchnav.core.settings import plain
 from benchnav.core.short_repr import short_repr
-from benchnav.core.yaml_text import load_yaml, read_yaml
 from benchnav.datagen.layers import vegetation
 from benchnav.datagen.layers.spec import LayerSpec, read_layers
 from benchnav.datagen.layers.stack import check_layer
@@ -34,19 +30,12 @@ from benchnav.datagen.recipe.environments import (
 )
 from benchnav.datagen.recipe.looks import check_tints, shown_colours
 from benchnav.datagen.recipe.places import PlacesRule, check_places
-from benchnav.datagen.recipe.scenario import (
-    DEFAULTS,
-    PRESETS,
-    RECIPES,
-    Scenario,
-    load_presets,
-    resolve,
-)
+from benchnav.datagen.recipe.scenario import Scenario
 from benchnav.datagen.schema import FIELDS, UNLABELLED, Fields, truth_fields
 
 _MAX_CRATERED = 0.4  # fraction of a map; random sequential discs jam at 0.55
 _MIN_GAP = 0.3  # between classes of one colour, in E[λ] on flat terrain
-# In synthesis 2, relief and crater counts refer to a square of this side.
+# In synthesis 2, relief and crater counts refer to a square with this side.
 REFERENCE_M = 32.0
 
 # The name of a shard has eight digits for maps; no machine generates more.
@@ -79,9 +68,9 @@ class Split:
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """Everything that determines a dataset: the same recipe, the same maps.
+    """Everything that determines a dataset.
 
-    This is true on any machine.
+    The same recipe gives the same maps on any machine.
 
     Args:
         id: name and version of the dataset, for example `paper-v1`.
@@ -89,10 +78,10 @@ class Recipe:
         height: rows of a map.
         width: columns of a map.
         resolution_m: cell width in metres.
-        start_m: (x, y) of the start in metres; None with `places`.
-        goal_m: (x, y) of the goal in metres; None with `places`.
-        places: rule by which start and goal are drawn for each map, instead of
-            `start_m` and `goal_m`; synthesis 2 only.
+        start_m: (x, y) of the start in metres; None if `places` is given.
+        goal_m: (x, y) of the goal in metres; None if `places` is given.
+        places: rule that draws start and goal for each map, instead of `start_m` and
+            `goal_m`; synthesis 2 only.
         stuck_threshold: λ_stuck in [0, 1); a cell is truly free if E[λ] exceeds it.
         synthesis: version of the generator. 1 reproduces version 0.1 bit for bit. 2
             adds soft spots, look-alike classes, drawn start and goal, and correlated λ;
@@ -100,12 +89,12 @@ class Recipe:
         correlation_m: correlation length ℓ of stored λ, in metres: the noise of two
             cells at distance d has the correlation exp(−d²/2ℓ²). At 0, as in synthesis
             1, cells are independent.
-        layers: further layers, in the order of being drawn; objects of `Layer` become
-            their specs. Synthesis 2 only.
-        closed_corners: whether a diagonal step between two non-free cells is forbidden,
-            for solvable maps and reference times. False in the shipped recipes and in
-            files of versions before 1.2; by default true in custom recipes of synthesis
-            2. Synthesis 2 only.
+        layers: further layers, in the order in which they are drawn; objects of `Layer`
+            become their specs. Synthesis 2 only.
+        closed_corners: whether solvable maps and reference times exclude diagonal steps
+            between two non-free cells; synthesis 2 only. It is false in the shipped
+            recipes and in files of versions before 1.2, and by default true in custom
+            recipes of synthesis 2.
         environments: number of environments; each shows its own choice of classes.
         occupancy: fraction of the cells of each class of an environment, summing to 1.
         class_periods_m: lattice spacings of the class noise in metres, one per octave.
@@ -137,7 +126,7 @@ class Recipe:
     closed_corners: bool = False
 
     def __post_init__(self) -> None:
-        """Reject recipes that contradict themselves."""
+        """Reject values out of range, and values that contradict each other."""
         object.__setattr__(self, "layers", read_layers(self.layers))
         expect(self.synthesis in (1, 2), f"`synthesis` 1 or 2, got {self.synthesis}.")
         expect(0 <= self.seed < 2**63, f"`seed` in 0–2^63 − 1, got {self.seed}.")
@@ -173,13 +162,15 @@ class Recipe:
         fields = FIELDS | {spec.name: spec.stored_field for spec in self.layers}
         if not any(spec.affects for spec in self.layers):
             return fields
-        components = 2 if any(item.soft for item in self.classes) else 1
+        has_soft_spots = any(item.soft for item in self.classes)
+        components = 2 if has_soft_spots else 1
         return fields | truth_fields(components)
 
     @property
     def class_rows(self) -> list[dict[str, Any]]:
         """Class table as plain data, with the vegetation of each class."""
-        return vegetation.write_classes(plain(list(self.classes)), self._vegetation)
+        rows = plain(list(self.classes))
+        return vegetation.write_classes(rows, self._vegetation)
 
     @property
     def _vegetation(self) -> vegetation.Vegetation | None:
@@ -222,147 +213,50 @@ class Recipe:
         In synthesis 2, a scenario's counts refer to 32 m × 32 m.
         """
         extent_x, extent_y = self.grid.extent_m
-        scale = 1.0 if self.synthesis == 1 else extent_x * extent_y / REFERENCE_M**2
+        scale = 1.0
+        if self.synthesis == 2:
+            scale = extent_x * extent_y / REFERENCE_M**2
         low, high = (round(scale * count) for count in scenario.crater_count)
         return low, high
 
     def to_dict(self) -> dict[str, Any]:
         """Return the recipe as plain data for JSON, with presets resolved."""
         data: dict[str, Any] = {}
-        for name, value in (plain(self) | {"classes": self.class_rows}).items():
+        for name, value in plain(self).items():
             if name == "layers" and self._vegetation is not None:
                 data["vegetation_period_m"] = self._vegetation.period_m
             data[name] = value
+        data["classes"] = self.class_rows
         data["layers"] = plain([spec for spec in self.layers if not spec.is_vegetation])
         for scenario in data["scenarios"].values():
             if not scenario["tints"]:
                 del scenario["tints"]  # as versions without tints wrote it
         unused = ["places"] if self.places is None else ["start_m", "goal_m"]
-        unused += [] if data["layers"] else ["layers"]
-        unused += [] if self.closed_corners else ["closed_corners"]
+        if not data["layers"]:
+            unused.append("layers")
+        if not self.closed_corners:
+            unused.append("closed_corners")
         if self.synthesis == 1:
-            # As version 0.1 wrote it: its files and readers do not change.
+            # Version 0.1 wrote neither of them, and its files and readers do not change.
             unused += ["synthesis", "correlation_m"]
             for item in data["classes"]:
                 item.pop("soft")
         return {name: value for name, value in data.items() if name not in unused}
 
 
-def load_recipe(source: str | Path, overrides: Sequence[str] = ()) -> Recipe:
-    """Load a recipe by its shipped id or the path of a YAML file.
-
-    Args:
-        source: id or path.
-        overrides: changes `key.key=value`, the value in YAML, such as
-            `splits.train.maps=50`; an item of a list is named by its `name`, as in
-            `classes.dune_sand.soft.weight=0.2`. Changes must include `id=NAME`, since
-            other maps need another id.
-
-    Raises:
-        ConfigError: If there is no such recipe, it is invalid, or its id names other
-            maps.
-    """
-    path = RECIPES / f"{source}.yaml"
-    if not path.exists():
-        path = Path(source)
-    shipped = shipped_recipes()
-    expect(
-        path.is_file(),
-        f"a shipped recipe ({', '.join(shipped)}) or the path of a YAML file, got "
-        f"{str(source)!r}.",
-    )
-    data = read_yaml(path)
-    resolved = _with_class_table(data)
-    for text in overrides:
-        name, equals, value = text.partition("=")
-        keys = name.split(".")
-        expect(
-            equals and all(keys),
-            f"an override such as splits.train.maps=50, got {text!r}.",
-        )
-        resolved = changed(resolved, keys, load_yaml(value))
-    is_synthesis_2 = isinstance(resolved, dict) and resolved.get("synthesis") == 2
-    if is_synthesis_2 and resolved.get("id") not in shipped:
-        resolved = {"closed_corners": True, **resolved}
-    recipe = recipe_from_dict(resolved, str(source))
-    expect(
-        not overrides or recipe.id != data.get("id"),
-        f"`id=NAME` among the overrides, since {recipe.id!r} names the maps of the "
-        "recipe as it is.",
-    )
-    is_shipped = path == RECIPES / f"{recipe.id}.yaml" and not overrides
-    expect(
-        is_shipped or recipe.id not in shipped or recipe == load_recipe(recipe.id),
-        f"an `id` of its own in {source}, got {recipe.id!r}, which names other maps: "
-        "a recipe shipped with the package.",
-    )
-    return recipe
-
-
-def shipped_recipes() -> list[str]:
-    """Return the ids of the recipes in the package, sorted."""
-    return sorted(path.stem for path in RECIPES.glob("*.yaml") if path != PRESETS)
-
-
-def shipped_sizes(recipe: str) -> dict[str, int]:
-    """Return the number of maps of each split of a shipped recipe, without checks."""
-    splits = read_yaml(RECIPES / f"{recipe}.yaml")["splits"]
-    return {split: entry["maps"] for split, entry in splits.items()}
-
-
-def _with_class_table(data: Any) -> Any:
-    """Return the data with the shipped class table, if it is `default` or missing."""
-    if not isinstance(data, dict) or data.get("classes", "default") != "default":
-        return data
-    return {**data, "classes": load_presets(data.get("synthesis"))[0]}
-
-
-def recipe_from_dict(data: Any, origin: str) -> Recipe:
-    """Return a recipe from plain data, with presets resolved.
-
-    Args:
-        data: mapping as in a recipe file or a manifest.
-        origin: source of the data, for messages.
-
-    Raises:
-        ConfigError: If a key is unknown or missing, or a value is of the wrong type or
-            out of range.
-    """
-    expect(
-        isinstance(data, dict),
-        f"a mapping in recipe {origin}, got {type(data).__name__}.",
-    )
-    data = _with_class_table(data)
-    _, presets = load_presets(data.get("synthesis"))
-    scenarios = data.get("scenarios", {name: {"preset": name} for name in DEFAULTS})
-    if isinstance(scenarios, dict):
-        scenarios = {
-            name: resolve(entry, presets, name) for name, entry in scenarios.items()
-        }
-    try:
-        growth, data = vegetation.read_keys(data)
-        layers: Any = read_layers(data.get("layers", []))
-        if growth:
-            layers = (growth, *layers)
-        data["layers"] = read_layers(layers)
-        data["scenarios"] = scenarios
-        return read(Recipe, data, lambda key: f"`{key}`" if key else "a recipe")
-    except ConfigError as error:
-        raise ConfigError(f"Recipe {origin}: {error}") from error
-
-
 def check_name(kind: str, name: str) -> None:
     """Check that a name is valid for files and HDF5 groups.
 
     Args:
-        kind: what is named, for the message.
+        kind: description of the name, for the message.
         name: the name.
 
     Raises:
-        ConfigError: If it is not.
+        ConfigError: If the name is invalid.
     """
+    is_plain = re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name)
     expect(
-        re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name) and name != "manifest",
+        is_plain and name != "manifest",
         f"{kind} of letters, digits, '.', '_' and '-', got {name!r}.",
     )
 
@@ -370,18 +264,17 @@ def check_name(kind: str, name: str) -> None:
 def _check_ends(recipe: Recipe) -> None:
     keys = ("start_m", "goal_m", "places")
     names = [name for name in keys if getattr(recipe, name) is not None]
-    expect(
-        names in (["start_m", "goal_m"], ["places"]),
-        "either `start_m` and `goal_m`, or `places`, got "
-        f"{' and '.join(names) or 'neither'}.",
-    )
+    is_complete = names in (["start_m", "goal_m"], ["places"])
+    got = " and ".join(names) or "neither"
+    expect(is_complete, f"either `start_m` and `goal_m`, or `places`, got {got}.")
     if recipe.places is not None:
         return check_places(recipe.places, recipe.grid)
     extent_x, extent_y = recipe.grid.extent_m
     ends = np.array([recipe.start_m, recipe.goal_m])
     for name, (x, y) in zip(names, ends.tolist(), strict=True):
+        is_on_map = 0 <= x < extent_x and 0 <= y < extent_y
         expect(
-            0 <= x < extent_x and 0 <= y < extent_y,
+            is_on_map,
             f"`{name}` on the map of {extent_x:g} m × {extent_y:g} m, got ({x}, {y}).",
         )
     start, goal = np.transpose(recipe.cells_of(ends)).tolist()
@@ -413,16 +306,18 @@ def _check_scenarios(recipe: Recipe) -> None:
             continue
         _, max_craters = recipe.craters(scenario)
         _, max_radius_m = scenario.crater_radius_m
+        fits = 2 * max_radius_m <= min(extent_x, extent_y)
         expect(
-            max_craters == 0 or 2 * max_radius_m <= min(extent_x, extent_y),
+            fits or max_craters == 0,
             f"`crater_radius_m` of scenario {name!r} to fit a map of {extent_x:g} m × "
             f"{extent_y:g} m, got {scenario.crater_radius_m}.",
         )
-        covered = max_craters * scenario.mean_crater_area_m2 / (extent_x * extent_y)
+        area_m2 = extent_x * extent_y
+        covered = max_craters * scenario.mean_crater_area_m2 / area_m2
         expect(
             covered <= _MAX_CRATERED,
             f"the craters of scenario {name!r} to cover at most {_MAX_CRATERED:.0%} "
-            f"of a map, so that they fit side by side, got {covered:.0%}. Lower "
+            f"of a map, so that they fit without overlap, got {covered:.0%}. Lower "
             "`crater_count` or `crater_radius_m`.",
         )
 
@@ -435,8 +330,9 @@ def _check_environments(recipe: Recipe) -> None:
         1 <= len(classes) <= UNLABELLED,
         f"1–{UNLABELLED} classes in `classes`, got {len(classes)}.",
     )
+    sums_to_1 = np.isclose(sum(occupancy), 1, atol=1e-6)
     expect(
-        np.isclose(sum(occupancy), 1, atol=1e-6) and min(occupancy) > 0,
+        sums_to_1 and min(occupancy) > 0,
         f"`occupancy` as fractions > 0 summing to 1, got {list(occupancy)}.",
     )
     expect(
@@ -449,8 +345,9 @@ def _check_environments(recipe: Recipe) -> None:
         1 <= recipe.environments <= maximum,
         f"`environments` in 1–{maximum}, got {recipe.environments}.",
     )
+    are_valid = all(recipe.resolution_m <= period < np.inf for period in periods)
     expect(
-        periods and all(recipe.resolution_m <= period < np.inf for period in periods),
+        periods and are_valid,
         f"`class_periods_m` of at least a cell, {recipe.resolution_m} m, got "
         f"{list(periods)}.",
     )
@@ -468,10 +365,8 @@ def _check_splits(recipe: Recipe) -> None:
     for name, split in recipe.splits.items():
         for part in name.split("/"):
             check_name("split name", part)
-        expect(
-            not any(split_name.startswith(f"{name}/") for split_name in recipe.splits),
-            f"splits that are not nested, got one inside {name!r}.",
-        )
+        nested = [inner for inner in recipe.splits if inner.startswith(f"{name}/")]
+        expect(not nested, f"splits that are not nested, got one inside {name!r}.")
         expect(
             split.scenario in recipe.scenarios,
             f"`scenario` of split {name!r} to be one of {sorted(recipe.scenarios)}, "
@@ -484,11 +379,13 @@ def _check_look_alikes(recipe: Recipe) -> None:
     shown = len(recipe.occupancy)
     flat = np.zeros((len(names), 1, 1))
     class_id = np.arange(len(names)).reshape(flat.shape)
-    means = latent.expected_of(latent.truth(class_id, flat, recipe.classes)).ravel()
+    truth = latent.truth(class_id, flat, recipe.classes)
+    means = latent.expected_of(truth).ravel()
     for unit in recipe.units:
         for a, b in combinations(unit, 2):
+            gap = abs(means[a] - means[b])
             expect(
-                abs(means[a] - means[b]) >= _MIN_GAP,
+                gap >= _MIN_GAP,
                 f"classes of one colour to differ by at least {_MIN_GAP:g} in E[λ] on "
                 f"flat terrain, got {means[a]:.3f} for {names[a]!r} and {means[b]:.3f} "
                 f"for {names[b]!r}. Change an `offset` or a `colour`.",
@@ -503,11 +400,10 @@ def _check_look_alikes(recipe: Recipe) -> None:
 
 
 def _check_layers(recipe: Recipe) -> None:
-    colours = {
-        name: np.rint(shown_colours(recipe.classes, scenario))
-        for name, scenario in recipe.scenarios.items()
-    }
+    colours = {}
+    for name, scenario in recipe.scenarios.items():
+        colours[name] = np.rint(shown_colours(recipe.classes, scenario))
     for spec in recipe.layers:
-        # Other layers belong to a dataset, whose recipe was checked at its creation.
+        # Other layers belong to a dataset; its recipe was checked when it was created.
         if spec.is_vegetation or spec.is_built:
             check_layer(spec.layer, recipe.grid, recipe.classes, colours)

@@ -38,7 +38,7 @@ class Tint:
     Args:
         classes: names of the tinted classes; if empty, all.
         colour: RGB of the tint in full light, 0–255.
-        share: weight of the tint, in (0, 1); 1 − share is that of the class's colour.
+        share: weight of the tint, in (0, 1); the class's colour has weight 1 − share.
     """
 
     classes: tuple[str, ...] = ()
@@ -47,14 +47,15 @@ class Tint:
 
     def __post_init__(self) -> None:
         """Reject an invalid colour or weight."""
+        in_range = all(0 <= value <= 255 for value in self.colour)
         expect(
-            all(0 <= value <= 255 for value in self.colour),
+            in_range,
             f"`colour` of a tint in 0–255, got {self.colour}.",
         )
         expect(
             0 < self.share < 1,
-            f"`share` of a tint in (0, 1), got {self.share:g}. Lower the severity: at "
-            "1, a preset has its own share.",
+            f"`share` of a tint in (0, 1), got {self.share:g}. Lower the severity, "
+            "which multiplies the preset's `share`.",
         )
 
 
@@ -98,7 +99,8 @@ class Scenario:
         }
         for name, (minimum, maximum) in limits.items():
             value = getattr(self, name)
-            low, high = value if isinstance(value, tuple) else (value, value)
+            is_range = isinstance(value, tuple)
+            low, high = value if is_range else (value, value)
             expect(
                 minimum <= low <= high <= maximum,
                 f"scenario `{name}` finite, ordered and within [{minimum:g}, "
@@ -111,14 +113,15 @@ class Scenario:
         low, high = self.crater_radius_m
         if low == high:
             return float(np.pi * low**2)
-        return float(np.pi * (high**2 - low**2) / (2 * np.log(high / low)))
+        log_ratio = np.log(high / low)
+        return float(np.pi * (high**2 - low**2) / (2 * log_ratio))
 
 
 def blend(base: Scenario, full: Scenario, severity: float) -> Scenario:
     """Return a scenario between `base` (severity 0) and `full` (severity 1).
 
     All numbers are interpolated. The weights of the tints of `full` are multiplied by
-    the severity; `base` must have no tints, as `std`.
+    the severity; `base` must not have tints, and `std` has none.
     """
 
     def between(low: Any, high: Any) -> Any:
@@ -126,20 +129,22 @@ def blend(base: Scenario, full: Scenario, severity: float) -> Scenario:
             return tuple(map(between, low, high))
         return low + severity * (high - low)
 
-    numbers = {
-        item.name: between(getattr(base, item.name), getattr(full, item.name))
-        for item in fields(Scenario)
-        if item.name != "tints"
-    }
-    tints = full.tints if severity else ()
-    tints = tuple(replace(tint, share=severity * tint.share) for tint in tints)
-    return Scenario(**numbers, tints=tints)
+    names = [item.name for item in fields(Scenario) if item.name != "tints"]
+    numbers = {}
+    for name in names:
+        numbers[name] = between(getattr(base, name), getattr(full, name))
+    tints = []
+    if severity:
+        for tint in full.tints:
+            tints.append(replace(tint, share=severity * tint.share))
+    return Scenario(**numbers, tints=tuple(tints))
 
 
 def load_presets(synthesis: Any) -> tuple[list[Any], dict[str, Any]]:
     """Return the shipped class table and scenarios of a synthesis as plain data."""
     data = yaml.safe_load(PRESETS.read_text())
-    return data["classes"], data["scenarios-2" if synthesis == 2 else "scenarios"]
+    key = "scenarios-2" if synthesis == 2 else "scenarios"
+    return data["classes"], data[key]
 
 
 def resolve(entry: Any, presets: Mapping[str, Any], name: str) -> Any:
@@ -157,19 +162,20 @@ def resolve(entry: Any, presets: Mapping[str, Any], name: str) -> Any:
     if not isinstance(entry, dict) or "preset" not in entry:
         return entry
     preset = entry["preset"]
-    severity = entry.get("severity", 1.0)
+    is_listed = isinstance(preset, str) and preset in presets
     expect(
-        isinstance(preset, str) and preset in presets,
+        is_listed,
         f"`preset` of scenario {name!r} to be one of {sorted(presets)}, got "
         f"{preset!r}.",
     )
+    severity = entry.get("severity", 1.0)
+    is_finite = isinstance(severity, int | float) and np.isfinite(severity)
     expect(
-        isinstance(severity, int | float) and np.isfinite(severity),
+        is_finite,
         f"`severity` of scenario {name!r} to be a finite number, got {severity!r}.",
     )
-    base, full = (
-        read(Scenario, presets[key], of(f"preset {key!r}")) for key in ("std", preset)
-    )
+    base = read(Scenario, presets["std"], of("preset 'std'"))
+    full = read(Scenario, presets[preset], of(f"preset {preset!r}"))
     resolved = plain(blend(base, full, severity)) | entry
     del resolved["preset"]
     resolved.pop("severity", None)
@@ -180,28 +186,32 @@ def find_series(splits: Iterable[str]) -> SeriesOfShifts:
     """Return the series of shifts among splits, by their names.
 
     A split belongs to a series if its name ends in a severity: in hundredths after a
-    dash (`test/hg-050`), or as a number after an @ (`test/hg@0.5`). The name before it
-    is the scenario. The split `std` of the same folder has severity 0 in each series,
-    and a split named as the scenario (`test/hg`) severity 1. Other splits belong to no
-    series.
+    dash (`test/hg-050`), or as a number after an @ (`test/hg@0.5`). The name before the
+    severity is the scenario. The split `std` of the same folder has severity 0 in each
+    series, and a split named as the scenario (`test/hg`) has severity 1. Other splits
+    do not belong to a series.
 
     Args:
         splits: names of splits.
 
     Returns:
-        For each scenario, pairs (severity, split) in ascending order. They include
-        `std` and the scenario's split, if they exist. Scenarios with fewer than two
-        pairs are omitted.
+        Pairs (severity, split) in ascending order, by scenario. They include `std` and
+        the scenario's split, if they exist. Scenarios with fewer than two pairs are
+        omitted.
     """
     splits = list(splits)
     all_series: SeriesOfShifts = {}
     for split in splits:
-        if match := _NAMED.fullmatch(split):
-            hundredths = match["hundredths"]
-            severity = int(hundredths) / 100 if hundredths else float(match["severity"])
-            all_series.setdefault(match["scenario"], []).append((severity, split))
+        match = _NAMED.fullmatch(split)
+        if match is None:
+            continue
+        hundredths = match["hundredths"]
+        severity = int(hundredths) / 100 if hundredths else float(match["severity"])
+        pairs = all_series.setdefault(match["scenario"], [])
+        pairs.append((severity, split))
     for scenario, pairs in all_series.items():
-        std = f"{scenario[: scenario.rfind('/') + 1]}std"
+        folder, slash, _ = scenario.rpartition("/")
+        std = f"{folder}{slash}std"
         for severity, split in ((0.0, std), (1.0, scenario)):
             if split in splits and severity not in dict(pairs):
                 pairs.append((severity, split))

@@ -1,1 +1,1 @@
-"""From a recipe to maps, in NumPy."""
+"""Generation of maps from a recipe, in NumPy."""

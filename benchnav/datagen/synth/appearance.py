@@ -22,10 +22,12 @@ def class_bands(noise: ndarray, occupancy: ndarray) -> ndarray:
     """
     flat = noise.reshape(len(noise), -1)
     n_cells = flat.shape[1]
-    edges = np.round(np.cumsum(occupancy)[:-1] * n_cells).astype(int)
-    levels = np.sort(flat, axis=1)[:, edges[edges < n_cells]]
-    bands = (flat[:, None] >= levels[:, :, None]).sum(axis=1)
-    return bands.reshape(noise.shape)
+    cumulative = np.cumsum(occupancy)[:-1]
+    edges = np.round(cumulative * n_cells).astype(int)
+    edges = edges[edges < n_cells]
+    levels = np.sort(flat, axis=1)[:, edges]
+    reaches_level = flat[:, None] >= levels[:, :, None]
+    return reaches_level.sum(axis=1).reshape(noise.shape)
 
 
 def light_direction(azimuth_rad: ndarray, height: ndarray) -> ndarray:
@@ -58,10 +60,11 @@ def shade(
     Returns:
         Brightness in [0, 1], shape [B, H, W].
     """
-    x, y, z = (light[:, k, None, None] for k in range(3))
+    x, y, z = light.T[..., None, None]
     norm = np.sqrt(1 + along_x * along_x + along_y * along_y)
     cosine = (z - x * along_x - y * along_y) / norm
-    return np.maximum(cosine, 0) * (1 - ambient) + ambient
+    direct = np.maximum(cosine, 0)
+    return direct * (1 - ambient) + ambient
 
 
 def paint(colours: ndarray, brightness: ndarray) -> ndarray:
@@ -69,10 +72,11 @@ def paint(colours: ndarray, brightness: ndarray) -> ndarray:
 
     Args:
         colours: RGB in full light, 0–255, shape [B, 3, H, W].
-        brightness: in [0, 1], shape [B, H, W].
+        brightness: brightness of each cell, in [0, 1], shape [B, H, W].
 
     Returns:
         Image, uint8, shape [B, 3, H, W].
     """
     lit = np.moveaxis(colours, 1, 0) * brightness
-    return np.moveaxis(np.rint(lit, out=lit).astype(np.uint8), 0, 1)
+    image = np.rint(lit, out=lit).astype(np.uint8)
+    return np.moveaxis(image, 0, 1)

@@ -31,9 +31,12 @@ def fractal(key: int, indices: ndarray, shape: Shape, roughness: float) -> ndarr
     """
     frequency = _frequencies(shape)
     frequency[0, 0] = np.inf
-    surface = _filtered(rng.normal(key, indices, shape), frequency ** -(roughness + 1))
+    amplitude = frequency ** -(roughness + 1)
+    white = rng.normal(key, indices, shape)
+    surface = _filtered(white, amplitude)
     low = surface.min(axis=(1, 2), keepdims=True)
-    return (surface - low) / (surface.max(axis=(1, 2), keepdims=True) - low)
+    high = surface.max(axis=(1, 2), keepdims=True)
+    return (surface - low) / (high - low)
 
 
 def open_fractal(
@@ -55,7 +58,7 @@ def open_fractal(
         indices: elements of the stream, shape [B].
         shape: (H, W).
         roughness: Hurst exponent in (0, 1).
-        reference_cells: side of the square that relief is measured on, in cells.
+        reference_cells: side of the square on which relief is measured, in cells.
 
     Returns:
         Surfaces scaled to a mean relief of 1 over the reference squares that cover the
@@ -64,18 +67,23 @@ def open_fractal(
     Source: von Kármán (1948), "Progress in the statistical theory of turbulence", for
     the spectrum.
     """
-    tiles_y, tiles_x = (-(-cells // reference_cells) for cells in shape)
-    covered = tiles_y * reference_cells, tiles_x * reference_cells
-    twice = 2 * covered[0], 2 * covered[1]
-    amplitude = np.hypot(_frequencies(twice), 1 / reference_cells) ** -(roughness + 1)
-    surface = _filtered(rng.normal(key, indices, twice), amplitude)
-    surface = surface[:, : covered[0], : covered[1]]
+    height, width = shape
+    tiles_y = -(-height // reference_cells)
+    tiles_x = -(-width // reference_cells)
+    covered_y = tiles_y * reference_cells
+    covered_x = tiles_x * reference_cells
+    torus = (2 * covered_y, 2 * covered_x)
+    frequency = np.hypot(_frequencies(torus), 1 / reference_cells)
+    amplitude = frequency ** -(roughness + 1)
+    white = rng.normal(key, indices, torus)
+    surface = _filtered(white, amplitude)[:, :covered_y, :covered_x]
     tiles = surface.reshape(
         len(surface), tiles_y, reference_cells, tiles_x, reference_cells
     )
-    relief = (tiles.max(axis=(2, 4)) - tiles.min(axis=(2, 4))).mean(axis=(1, 2))
+    tile_relief = tiles.max(axis=(2, 4)) - tiles.min(axis=(2, 4))
+    relief = tile_relief.mean(axis=(1, 2))
     low = surface.min(axis=(1, 2))
-    heights = surface[:, : shape[0], : shape[1]] - low[:, None, None]
+    heights = surface[:, :height, :width] - low[:, None, None]
     return heights / relief[:, None, None]
 
 
@@ -88,7 +96,8 @@ def _frequencies(shape: Shape) -> ndarray:
 
 def _filtered(white: ndarray, amplitude: ndarray) -> ndarray:
     """Return white noise with another spectrum, shape of `white`, [B, H, W]."""
-    return np.fft.irfft2(np.fft.rfft2(white) * amplitude, s=white.shape[1:])
+    spectrum = np.fft.rfft2(white) * amplitude
+    return np.fft.irfft2(spectrum, s=white.shape[1:])
 
 
 def place_craters(
@@ -116,26 +125,33 @@ def place_craters(
         means no crater.
     """
     n_draws = 12 * max_count
-    draws = rng.uniform(key, indices, (max(n_draws, 1), 3))
+    shape = (max(n_draws, 1), 3)
+    draws = rng.uniform(key, indices, shape)
     centres = draws[..., :2] * np.asarray(extent_m)
     # Small craters are more frequent: log radii are uniform.
     low, high = np.log(radius_m)
-    radii = np.exp(low + (high - low) * draws[..., 2])
+    log_radii = low + (high - low) * draws[..., 2]
+    radii = np.exp(log_radii)
     accepted = np.zeros_like(radii)
     for i in range(n_draws):
-        is_short = (accepted > 0).sum(axis=1) < count
+        n_accepted = (accepted > 0).sum(axis=1)
+        is_short = n_accepted < count
         if not is_short.any():
             break
-        before = accepted[:, :i]
+        earlier = accepted[:, :i]
+        radius = radii[:, i : i + 1]
         offset = centres[:, :i] - centres[:, i : i + 1]
         distance = np.hypot(*np.moveaxis(offset, -1, 0))
-        is_apart = (before == 0) | (distance > before + radii[:, i : i + 1])
-        accepted[:, i] = np.where(is_apart.all(axis=1) & is_short, radii[:, i], 0)
-    # Accepted craters first, in their order.
+        is_apart = (earlier == 0) | (distance > earlier + radius)
+        is_accepted = is_apart.all(axis=1) & is_short
+        accepted[:, i] = np.where(is_accepted, radii[:, i], 0)
+    n_accepted = (accepted > 0).sum(axis=1)
+    # Accepted craters come first, in their order.
     order = np.argsort(accepted == 0, axis=1, kind="stable")
-    order = order[:, : (accepted > 0).sum(axis=1).max(initial=0)]
+    order = order[:, : n_accepted.max(initial=0)]
     centres = np.take_along_axis(centres, order[..., None], axis=1)
-    return centres, np.take_along_axis(accepted, order, axis=1)
+    radii = np.take_along_axis(accepted, order, axis=1)
+    return centres, radii
 
 
 def crater_elevation(
@@ -159,14 +175,17 @@ def crater_elevation(
     Returns:
         Elevation to be added, metres, shape [B, H, W].
     """
-    y, x = ((np.arange(n) + 0.5) * resolution_m for n in shape)
-    added = np.zeros((len(radii_m), *shape))
+    height, width = shape
+    y = (np.arange(height)[:, None] + 0.5) * resolution_m
+    x = (np.arange(width) + 0.5) * resolution_m
+    added = np.zeros((len(radii_m), height, width))
     for radius, centre_x, centre_y in zip(radii_m.T, *centres_m.T, strict=True):
         radius = radius[:, None, None]
         offset_x = x - centre_x[:, None, None]
-        offset_y = y[:, None] - centre_y[:, None, None]
+        offset_y = y - centre_y[:, None, None]
         distance = np.hypot(offset_x, offset_y)
-        ratio = distance / np.where(radius > 0, radius, 1)
+        scale = np.where(radius > 0, radius, 1)
+        ratio = distance / scale
         depth = 2 * radius * depth_ratio
         bowl = depth * (ratio**2 - 0.8)
         rim = 0.2 * depth * np.maximum(ratio, 1) ** -3.0
@@ -187,18 +206,22 @@ def horn_gradient(padded_m: ndarray, resolution_m: float) -> tuple[ndarray, ndar
         Two arrays of shape [B, H, W], dimensionless.
     """
     z = padded_m.copy()
+    columns = z.transpose(2, 0, 1)
+    rows = z.transpose(1, 0, 2)
     # Missing padding lies on the plane through the two cells next to it.
-    for lines in (z.transpose(2, 0, 1), z.transpose(1, 0, 2)):  # columns, then rows
+    for lines in (columns, rows):
         for edge, first, second in ((0, 1, 2), (-1, -2, -3)):
             plane = 2 * lines[first] - lines[second]
-            lines[edge] = np.where(np.isnan(lines[edge]), plane, lines[edge])
+            padding = lines[edge]
+            lines[edge] = np.where(np.isnan(padding), plane, padding)
     pairs_y = z[:, 1:] + z[:, :-1]
     pairs_x = z[:, :, 1:] + z[:, :, :-1]
     smooth_y = pairs_y[:, 1:] + pairs_y[:, :-1]
     smooth_x = pairs_x[:, :, 1:] + pairs_x[:, :, :-1]
-    along_x = smooth_y[:, :, 2:] - smooth_y[:, :, :-2]
-    along_y = smooth_x[:, 2:] - smooth_x[:, :-2]
-    return along_x / (8 * resolution_m), along_y / (8 * resolution_m)
+    rise_x = smooth_y[:, :, 2:] - smooth_y[:, :, :-2]
+    rise_y = smooth_x[:, 2:] - smooth_x[:, :-2]
+    run_m = 8 * resolution_m
+    return rise_x / run_m, rise_y / run_m
 
 
 def inclination_deg(along_x: ndarray, along_y: ndarray) -> ndarray:
@@ -211,7 +234,8 @@ def inclination_deg(along_x: ndarray, along_y: ndarray) -> ndarray:
     Returns:
         Degrees in [0, 90), shape of `along_x`.
     """
-    return np.arctan(np.sqrt(along_x * along_x + along_y * along_y)) * (180 / np.pi)
+    steepness = np.sqrt(along_x * along_x + along_y * along_y)
+    return np.arctan(steepness) * (180 / np.pi)
 
 
 def slopes_deg(elevation_m: ndarray, resolution_m: float) -> ndarray:
@@ -225,7 +249,8 @@ def slopes_deg(elevation_m: ndarray, resolution_m: float) -> ndarray:
         Degrees, float64, shape [B, H, W].
     """
     padded_m = pad_missing(elevation_m.astype(np.float64))
-    return inclination_deg(*horn_gradient(padded_m, resolution_m))
+    gradient = horn_gradient(padded_m, resolution_m)
+    return inclination_deg(*gradient)
 
 
 def pad_missing(elevation_m: ndarray) -> ndarray:

@@ -1,6 +1,6 @@
 """Generation of maps: each map is a pure function of (recipe, split, index).
 
-Elevation is quantised first; slope, shading and λ are derived from stored elevation.
+Elevation is quantised first; slope, shading and λ are derived from quantised elevation.
 Batched NumPy in float64. Letters in shapes: B maps, H×W cells.
 """
 
@@ -47,9 +47,11 @@ def generate(recipe: Recipe, split: str, indices: ndarray) -> Maps:
     """
     indices = np.asarray(indices, dtype=np.int64)
     size = min(_CHUNK, recipe.grid.maps_in(_CHUNK_CELLS))
-    starts = range(0, max(len(indices), 1), size)
-    chunks = [indices[start : start + size] for start in starts]
-    maps = join_maps([_generate_chunk(recipe, split, chunk) for chunk in chunks])
+    chunks = []
+    for start in range(0, max(len(indices), 1), size):
+        chunk = indices[start : start + size]
+        chunks.append(_generate_chunk(recipe, split, chunk))
+    maps = join_maps(chunks)
     return {
         name: maps[name].astype(field.dtype, copy=False)
         for name, field in recipe.fields.items()
@@ -62,39 +64,46 @@ def _generate_chunk(recipe: Recipe, split: str, indices: ndarray) -> Maps:
     for attempt in range(MAX_ATTEMPTS):
         drawn = _draw(recipe, split, indices[pending], attempt)
         if not recipe.splits[split].solvable:
-            return {**drawn, "reference_time_s": np.full(len(indices), np.nan)}
+            drawn["reference_time_s"] = np.full(len(indices), np.nan)
+            return drawn
         drawn["reference_time_s"] = reference_time_s(recipe, drawn)
         maps = maps or drawn
         for name, values in drawn.items():
             maps[name][pending] = values
-        pending = pending[~np.isfinite(drawn["reference_time_s"])]
+        is_solvable = np.isfinite(drawn["reference_time_s"])
+        pending = pending[~is_solvable]
         if len(pending) == 0:
             return maps
+    unsolvable = int(indices[pending[0]])
     raise ConfigError(
-        f"Expected split {split!r} to have maps whose goal can be reached; "
-        f"{MAX_ATTEMPTS} draws gave none for map {int(indices[pending[0]])}. Ease its "
-        "scenario or lower `stuck_threshold`."
+        f"Expected maps of split {split!r} whose goal can be reached, got none for map "
+        f"{unsolvable} in {MAX_ATTEMPTS} draws. Ease its scenario or lower "
+        "`stuck_threshold`."
     )
 
 
 def reference_time_s(recipe: Recipe, maps: Maps) -> ndarray:
     """Return grid reference times: minimum times over truly free cells at 1 m/s.
 
-    A reference, not a bound: the grid has eight headings, and λ is its expectation.
+    They are a reference, not a bound, since the grid has only eight headings and λ is
+    replaced by its expectation.
 
     Returns:
         Seconds from start to goal, infinite without a free path, shape [B].
     """
-    expected = latent.expected_of(latent.stored_truth(maps, recipe.classes))
+    truth = latent.stored_truth(maps, recipe.classes)
+    expected = latent.expected_of(truth)
     free = expected > recipe.stuck_threshold
     costs = gridgraph.travel_time_costs(
         expected, free, recipe.resolution_m, recipe.closed_corners
     )
     map_index = np.arange(len(expected))
+    start_row, start_column = recipe.cells_of(maps["start_m"])
+    goal_row, goal_column = recipe.cells_of(maps["goal_m"])
     goals = np.zeros(expected.shape, dtype=bool)
-    goals[(map_index, *recipe.cells_of(maps["goal_m"]))] = True
+    goals[map_index, goal_row, goal_column] = True
     cost, _ = gridgraph.cost_to_go(costs, goals, recipe.grid.shape)
-    return cost[(map_index, *recipe.cells_of(maps["start_m"]))]
+    return cost[map_index, start_row, start_column]
 
 
 def class_map(
@@ -108,9 +117,8 @@ def class_map(
         Class indices, shape [B, H, W].
     """
     periods = [period / recipe.resolution_m for period in recipe.class_periods_m]
-    noise = fractal_perlin(
-        recipe.seed, (split, "class", attempt), indices, recipe.grid.shape, periods
-    )
+    names = (split, "class", attempt)
+    noise = fractal_perlin(recipe.seed, names, indices, recipe.grid.shape, periods)
     # The order of classes over the bands is random, so that neighbours vary.
     order_key = rng.stream_key(recipe.seed, split, "class order", attempt)
     order = rng.permutation(order_key, indices, len(recipe.occupancy))
@@ -118,7 +126,8 @@ def class_map(
     shown = np.take_along_axis(table, order, axis=1)
     bands = appearance.class_bands(noise, np.asarray(recipe.occupancy))
     flat_bands = bands.reshape(len(indices), -1)
-    return np.take_along_axis(shown, flat_bands, axis=1).reshape(bands.shape)
+    class_id = np.take_along_axis(shown, flat_bands, axis=1)
+    return class_id.reshape(bands.shape)
 
 
 def complete(
@@ -132,12 +141,12 @@ def complete(
 ) -> Maps:
     """Return maps with all fields that follow from classes and elevation.
 
-    These are slope, layers, colour under a random light, and λ.
+    These fields are slope, layers, colour under a random light, and λ.
 
     Args:
         recipe: class table, seed, start and goal.
-        split: name of the maps' split, for the light of its scenario and its random
-            streams.
+        split: name of the maps' split, which determines the scenario's light and the
+            random streams.
         indices: indices of the maps in the split, shape [B].
         class_id: class indices, shape [B, H, W].
         padded_m: elevation in metres, padded by one cell of the surrounding terrain,
@@ -155,16 +164,17 @@ def complete(
     padded_m = quantise(padded_m, 13)
     gradient = elevation.horn_gradient(padded_m, recipe.resolution_m)
     slope = quantise(elevation.inclination_deg(*gradient), 10)
-    azimuth, height = rng.uniform(key("light", attempt), indices, (2,)).T
-    height = _within(scenario.light_height, height)
-    light = appearance.light_direction(2 * np.pi * azimuth, height)
+    light_key = key("light", attempt)
+    turn, height_fraction = rng.uniform(light_key, indices, (2,)).T
+    height = _within(scenario.light_height, height_fraction)
+    light = appearance.light_direction(2 * np.pi * turn, height)
     noise_key = key("traversability", attempt)
     shape = recipe.grid.shape
     if recipe.synthesis == 1:
         noise = rng.normal(noise_key, indices, shape)
     else:
-        cells = recipe.correlation_m / recipe.resolution_m
-        noise = copula.correlated_normal(noise_key, indices, shape, cells)
+        length_cells = recipe.correlation_m / recipe.resolution_m
+        noise = copula.correlated_normal(noise_key, indices, shape, length_cells)
     elevation_m = padded_m[:, 1:-1, 1:-1]
     below = DrawnMaps(class_id, elevation_m, slope, recipe.grid, recipe.classes)
     stack = [spec.layer for spec in layers]
@@ -176,9 +186,8 @@ def complete(
         ends = np.array([recipe.start_m, recipe.goal_m], dtype=np.float64)
         start_m, goal_m = np.tile(ends[:, None], (1, len(indices), 1))
     else:
-        start_m, goal_m = draw_places(
-            recipe.places, recipe.grid, key("places", attempt), indices
-        )
+        places_key = key("places", attempt)
+        start_m, goal_m = draw_places(recipe.places, recipe.grid, places_key, indices)
     return {
         "rgb": appearance.paint(colours, brightness),
         "class_id": class_id,
@@ -204,8 +213,10 @@ def _realise(
     truth = affect_layers(layers, truth, values, below)
     stored: Maps = {}
     if any(layer.affects() for layer in layers):
-        stored = dict(zip(TRUTH, truth[1:], strict=True))
-    return latent.quantile_of(truth, noise), stored
+        _, means, stds = truth
+        stored = dict(zip(TRUTH, (means, stds), strict=True))
+    realised = latent.quantile_of(truth, noise)
+    return realised, stored
 
 
 def _colour(
@@ -213,7 +224,8 @@ def _colour(
 ) -> ndarray:
     """Return the colours of maps in full light, with their layers, shape [B, 3, H, W]."""
     by_class = shown_colours(below.classes, scenario)
-    colours = np.moveaxis(np.take(by_class.T, below.class_id, axis=1), 0, 1)
+    colours = np.take(by_class.T, below.class_id, axis=1)
+    colours = np.moveaxis(colours, 0, 1)
     return colour_layers(layers, colours, values, below)
 
 
@@ -228,11 +240,14 @@ def _draw(recipe: Recipe, split: str, indices: ndarray, attempt: int) -> Maps:
     else:
         reference_cells = max(3, round(REFERENCE_M / recipe.resolution_m))
         elevation_m = elevation.open_fractal(*arguments, reference_cells)
-    relief, crater_draw = rng.uniform(key("relief", attempt), indices, (2,)).T
-    elevation_m *= _within(scenario.relief_m, relief)[:, None, None]
+    relief_key = key("relief", attempt)
+    relief_fraction, crater_draw = rng.uniform(relief_key, indices, (2,)).T
+    relief_m = _within(scenario.relief_m, relief_fraction)
+    elevation_m *= relief_m[:, None, None]
     low, high = recipe.craters(scenario)
     if high > 0:
-        count = low + np.floor((high - low + 1) * crater_draw)
+        n_choices = high - low + 1
+        count = low + np.floor(n_choices * crater_draw)
         craters = elevation.place_craters(
             key("craters", attempt),
             indices,
@@ -250,4 +265,5 @@ def _draw(recipe: Recipe, split: str, indices: ndarray, attempt: int) -> Maps:
 
 
 def _within(limits: tuple[float, float], fraction: ndarray) -> ndarray:
-    return limits[0] + (limits[1] - limits[0]) * fraction
+    low, high = limits
+    return low + (high - low) * fraction

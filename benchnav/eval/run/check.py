@@ -18,7 +18,7 @@ from benchnav.core.quantity import Quantity
 from benchnav.core.settings import hint
 from benchnav.core.store import text_digest
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.datagen.recipe.recipe import shipped_recipes, shipped_sizes
+from benchnav.datagen.recipe.load import shipped_recipes, shipped_sizes
 from benchnav.eval.experiment.condition import (
     KNOWLEDGE,
     Condition,

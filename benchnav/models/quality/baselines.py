@@ -1,5 +1,4 @@
-"""Baselines without a model: the class of the nearest colour, and one distribution of λ
-for all cells.
+"""Baselines without a model: nearest colour, and one distribution of λ for all cells.
 
 A model that scores worse than these is of no use. Letters in shapes: B maps, H×W cells,
 C classes.
@@ -16,7 +15,7 @@ _BINS = 2**12
 
 
 def nearest_colour(rgb: Tensor, colours: Tensor) -> Tensor:
-    """Return for each cell the class whose fully lit colour is nearest (Euclidean).
+    """Return the class with the nearest fully lit colour (Euclidean) for each cell.
 
     Args:
         rgb: 0–255, shape [B, 3, H, W].
@@ -26,7 +25,8 @@ def nearest_colour(rgb: Tensor, colours: Tensor) -> Tensor:
         Class indices, int64, shape [B, H, W]; the first among equally near classes.
     """
     pixels = rgb.movedim(1, -1).float().flatten(1, 2)
-    distance = torch.cdist(pixels, colours.float().expand(len(rgb), -1, -1))
+    palette = colours.float().expand(len(rgb), -1, -1)
+    distance = torch.cdist(pixels, palette)
     return distance.argmin(-1).view_as(rgb[:, 0])
 
 
@@ -36,10 +36,12 @@ def nearest_colour_accuracy(dataset: TerrainDataset, split: str) -> float:
     n_correct = 0
     n_labelled = 0
     for _, maps in dataset.chunks(split, ("rgb", "class_id")):
-        predicted = nearest_colour(torch.from_numpy(maps["rgb"]), colours)
+        rgb = torch.from_numpy(maps["rgb"])
         class_id = torch.from_numpy(maps["class_id"])
-        n_correct += int((predicted == class_id).sum())
-        n_labelled += int((class_id != UNLABELLED).sum())
+        is_correct = nearest_colour(rgb, colours) == class_id
+        is_labelled = class_id != UNLABELLED
+        n_correct += int(is_correct.sum())
+        n_labelled += int(is_labelled.sum())
     return n_correct / max(1, n_labelled)
 
 
@@ -55,7 +57,8 @@ def climatology_crps(dataset: TerrainDataset, split: str) -> float:
     for _, maps in dataset.chunks(split, ("traversability",)):
         layer = maps["traversability"]
         observed = layer[np.isfinite(layer)]
-        counts += np.histogram(observed, _BINS, (0.0, 1.0))[0]
+        chunk_counts, _ = np.histogram(observed, _BINS, (0.0, 1.0))
+        counts += chunk_counts
     if not counts.any():
         return float("nan")
     cdf = np.cumsum(counts) / counts.sum()

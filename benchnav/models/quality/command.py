@@ -1,6 +1,4 @@
-"""The commands `benchnav-train evaluate` and `benchnav-train compare`: quality of models'
-predictions.
-"""
+"""Commands `benchnav-train evaluate` and `compare`: quality of models' predictions."""
 
 from pathlib import Path
 
@@ -47,8 +45,9 @@ def evaluate_command(
     expect(maps >= 0, f"`maps` ≥ 0, got {maps}. 0 leaves the map sheets out.")
     if json:
         target = Path(json)
+        is_file_path = target.parent.is_dir() and not target.is_dir()
         expect(
-            target.parent.is_dir() and not target.is_dir(),
+            is_file_path,
             f"`json` to be a file in an existing folder, got {target}. Create "
             f"{target.parent} first.",
         )
@@ -71,7 +70,7 @@ def compare(
     overwrite: bool = False,
     device: Device = "auto",
 ) -> None:
-    """Compare models on the test splits of a dataset: scores and paired differences per map.
+    """Compare models on a dataset's test splits: scores and paired differences per map.
 
     Args:
         models: Checkpoint folders, or models by NAME, package.module:Name,

@@ -25,7 +25,7 @@ class QualityData:
         title: names of model and dataset, for the map sheets.
         model: the measured model.
         dataset: the maps.
-        qualities: by split.
+        qualities: quality of the model, by split.
         maps: number of maps of each split in the map sheets.
     """
 
@@ -84,9 +84,8 @@ class QualityData:
 
 def series_table(splits: Iterable[str]) -> pd.DataFrame:
     """Return the series of shifts, a row per `split` with `scenario` and `severity`."""
-    rows = [
-        (scenario, severity, split)
-        for scenario, pairs in find_series(splits).items()
-        for severity, split in pairs
-    ]
+    rows = []
+    for scenario, pairs in find_series(splits).items():
+        for severity, split in pairs:
+            rows.append((scenario, severity, split))
     return pd.DataFrame(rows, columns=["scenario", "severity", "split"])

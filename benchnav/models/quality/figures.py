@@ -25,10 +25,10 @@ from benchnav.viz.figure import Figure, applicable
 from benchnav.viz.panels import Curves, Looks, draw_baseline, line_looks, ticks_of
 from benchnav.viz.style import legend_outside, page_width
 
-_NEAR = 0.01  # to the ideal; finer differences do not fill a panel
+_MARGIN = 0.01  # of an axis around the ideal, so that small differences look small
 
 # Title and field of ClassQuality or TraversabilityQuality.
-_SEVERITY = (
+_SEVERITY: tuple[tuple[str, str], ...] = (
     ("Accuracy", "accuracy"),
     ("Calibration error (ECE)", "ece"),
     ("Mean entropy [nats]", "entropy"),
@@ -45,7 +45,8 @@ _N_OF_CLASSES = 4  # the first measures
 class Severity(Figure):
     """Quality over the severity of a shift."""
 
-    name, title = "severity", "Quality over the severity of a shift"
+    name = "severity"
+    title = "Quality over the severity of a shift"
     text = (
         "Measures of the table over the severity of each scenario: 0 is the training "
         "maps, 1 the scenario itself."
@@ -63,7 +64,9 @@ class Severity(Figure):
         ]
         table = series_table(data.qualities).merge(pd.DataFrame(rows), on="split")
         measured = table.dropna(axis=1)
-        quantities = _SEVERITY if "accuracy" in measured else _SEVERITY[_N_OF_CLASSES:]
+        quantities = _SEVERITY
+        if "accuracy" not in measured:
+            quantities = _SEVERITY[_N_OF_CLASSES:]
         table = table.assign(panel="")
         table = table.rename(columns={"severity": "x", "scenario": "line"})
         looks = line_looks(table["line"].tolist())
@@ -83,7 +86,9 @@ class Severity(Figure):
                 ideal = _IDEALS[name]
                 draw_baseline(panel, ideal, "calibrated")
                 low, high = panel.get_ylim()
-                panel.set_ylim(min(low, ideal - _NEAR), max(high, ideal + _NEAR))
+                low = min(low, ideal - _MARGIN)
+                high = max(high, ideal + _MARGIN)
+                panel.set_ylim(low, high)
             ticks_of(panel, "y")
         legend_outside(figure, side="upper center")
         return figure
@@ -104,7 +109,8 @@ class MapSheets(Figure):
         split: name of the split.
     """
 
-    name, split = "maps", ""
+    name = "maps"
+    split = ""
     text = (
         "Each row is a map: observation, truth, prediction, error and uncertainty. "
         "Observed λ is shown instead of the truth if the true distribution is unknown. "
@@ -123,8 +129,10 @@ class MapSheets(Figure):
     def draw(self, data: QualityData) -> Drawing:
         """Draw a row per map."""
         classes = data.dataset.recipe.classes
-        scales = shared_scales(list(data.sheets.values()), classes)
-        return map_sheet_figure(data.sheets[self.split], scales, classes, data.title)
+        sheets = list(data.sheets.values())
+        scales = shared_scales(sheets, classes)
+        sheet = data.sheets[self.split]
+        return map_sheet_figure(sheet, scales, classes, data.title)
 
 
 def quality_figures(data: QualityData) -> list[Figure]:

@@ -24,7 +24,8 @@ _MIN_FRACTION = 1e-3  # of the cells; rarer bins have no mark
 class Confusion(Figure):
     """Confusion matrix of the classes."""
 
-    name, title = "confusion", "Confusion of classes"
+    name = "confusion"
+    title = "Confusion of classes"
     text = (
         "Rows are true classes, columns the most likely ones, numbers percentages of "
         "the row. A perfect model has 100 along the diagonal; no model can distinguish "
@@ -61,8 +62,8 @@ class Confusion(Figure):
             frame_map(panel)
         figure.supxlabel("most likely class")
         figure.supylabel("true class")
-        # Next to the upper right panel and as high as its square, which is smaller than
-        # the space of the panel.
+        # The bar is next to the upper right panel and as high as the panel's square,
+        # which is smaller than the space of the panel.
         right_panel = panels[min(n_panels, n_columns) - 1]
         colour_bar = right_panel.inset_axes((1.04, 0, 0.05, 1))
         figure.colorbar(image, cax=colour_bar, label="fraction of the true class [%]")
@@ -72,19 +73,21 @@ class Confusion(Figure):
         """Draw a confusion matrix in per cent of its rows, with numbers if they fit."""
         counts = confusion.astype(np.float64)
         with np.errstate(invalid="ignore"):
-            percentages = 100 * counts / counts.sum(1, keepdims=True)
+            totals = counts.sum(1, keepdims=True)
+            percentages = 100 * counts / totals
         palette = matplotlib.colormaps["Blues"].with_extremes(bad="0.85")
         image = panel.imshow(percentages, cmap=palette, vmin=0, vmax=100)
         if len(counts) > _MAX_NUMBERED:
             return image
         for row, column in np.argwhere(percentages >= 0.5):
             value = percentages[row, column]
+            is_dark = value > 55
             panel.text(
                 column,
                 row,
                 f"{value:.0f}",
                 size=_SMALL,
-                color="white" if value > 55 else "black",
+                color="white" if is_dark else "black",
                 ha="center",
                 va="center",
             )
@@ -94,7 +97,8 @@ class Confusion(Figure):
 class Reliability(Figure):
     """Accuracy over the probability of the most likely class."""
 
-    name, title = "reliability", "Calibration of the class probabilities"
+    name = "reliability"
+    title = "Calibration of the class probabilities"
     text = (
         "Above: accuracy of the most likely class over its probability. A calibrated "
         "model is on the dashed line; below it the model is overconfident. ECE is the "

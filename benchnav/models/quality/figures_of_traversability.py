@@ -1,5 +1,4 @@
-"""Figures of the quality of predicted traversability: PIT histograms and latent
-functions.
+"""Figures of predicted traversability: PIT histograms and latent functions.
 
 Letters in shapes: C classes, G nodes.
 """
@@ -30,13 +29,15 @@ _RARE = 1e-3
 def _slope_quantile(cells: Sequence[int], fraction: float) -> float:
     """Return the whole degree of slope exceeded by at most a fraction of the cells."""
     n_steeper = np.cumsum(cells[::-1])[::-1]
-    return float(np.sum(n_steeper > fraction * n_steeper[0]))
+    threshold = fraction * n_steeper[0]
+    return float(np.sum(n_steeper > threshold))
 
 
 class PIT(Figure):
     """Histograms of the probability integral transform of λ."""
 
-    name, title = "pit", "Calibration of the predicted distribution of λ"
+    name = "pit"
+    title = "Calibration of the predicted distribution of λ"
     text = (
         "The probability integral transform (PIT) is the predicted CDF at observed λ, "
         "from 0 (lower end) to 1 (upper end). A calibrated model is flat at 1. High at "
@@ -76,17 +77,12 @@ class PIT(Figure):
         )
         for bound in (0.05, 0.95):
             panel.axvline(bound, color="black", lw=0.7, ls=":", label="central 90 %")
-        panel.text(
-            0.5,
-            0.97,
+        note = (
             f"in 5–95 %: {quality.coverage:.3f} (ideally 0.9)\nunder VaR: "
-            f"{quality.tail_rate:.3f} (ideally 0.1)",
-            size=TEXT,
-            ha="center",
-            va="top",
-            transform=panel.transAxes,
-            linespacing=1.3,
+            f"{quality.tail_rate:.3f} (ideally 0.1)"
         )
+        aligned: dict[str, Any] = {"ha": "center", "va": "top", "linespacing": 1.3}
+        panel.text(0.5, 0.97, note, size=TEXT, transform=panel.transAxes, **aligned)
         bottom = min(0.95, *density)
         top = max(1.05, *density)
         span = top - bottom
@@ -113,23 +109,24 @@ class PIT(Figure):
 class Latent(Figure):
     """The Gaussian process over slope of each class."""
 
-    name, title = "latent", "Latent functions of the Gaussian processes"
+    name = "latent"
+    title = "Latent functions of the Gaussian processes"
     text = (
         "Predicted traversability over slope for each class, with the truth in black "
         "if it is available. Few or no measured cells are as steep as the grey part."
     )
 
     def needs(self, data: QualityData) -> bool:
-        """Return whether the model has Gaussian processes and its classes were measured."""
+        """Return whether the model has Gaussian processes, and classes were measured."""
         return data.table is not None and bool(data.by_class)
 
     def draw(self, data: QualityData) -> Drawing:
         """Draw a panel per class."""
         assert data.table is not None
-        cells = np.sum([quality.slope_cells for quality in data.by_class.values()], 0)
-        has_truth = all(
-            data.dataset.truth_of(split) == "generated" for split in data.qualities
-        )
+        slope_cells = [quality.slope_cells for quality in data.by_class.values()]
+        cells = np.sum(slope_cells, 0)
+        truths = {data.dataset.truth_of(split) for split in data.qualities}
+        has_truth = truths <= {"generated"}
         classes = data.dataset.recipe.classes
         titles = [item.name.replace("_", " ") for item in classes]
         margin = 0.5 if len(titles) > 4 else 1.0
@@ -139,7 +136,8 @@ class Latent(Figure):
         )
         steepest = max(_slope_quantile(class_cells, 0) for class_cells in cells)
         x = table_slopes().numpy()
-        x = x[x <= max(10.0, 1.15 * steepest)]
+        x_max = max(10.0, 1.15 * steepest)
+        x = x[x <= x_max]
         class_ids = np.arange(len(classes))[:, None, None]
         class_id, slopes = np.broadcast_arrays(class_ids, x)
         mixture = data.table.own(torch.tensor(class_id), torch.tensor(slopes))
@@ -149,12 +147,14 @@ class Latent(Figure):
             mixture.stds.numpy(),
         )
         true = true_distribution(class_id, slopes, tuple(classes))
+        _, true_means, _ = true
         expected = expected_of(predicted)
         true_expected = expected_of(true)
         noise = data.table.noise_std.double().cpu().numpy()
         for index, (panel,) in enumerate(panels):
             weight, mean, std = (values[index, :, 0] for values in predicted)
-            latent_std = np.sqrt(np.maximum(std[0] ** 2 - noise[index] ** 2, 0))
+            latent_variance = std[0] ** 2 - noise[index] ** 2
+            latent_std = np.sqrt(np.maximum(latent_variance, 0))
             self._draw_prediction(panel, x, mean[0], expected[index, 0])
             self._draw_band(panel, x, mean[0], std[0], "± 2σ with noise")
             self._draw_band(
@@ -162,9 +162,8 @@ class Latent(Figure):
             )
             note = f"σ {noise[index]:.3f}"
             if has_truth:
-                self._draw_truth(
-                    panel, x, true[1][index, 0, 0], true_expected[index, 0]
-                )
+                true_mean = true_means[index, 0, 0]
+                self._draw_truth(panel, x, true_mean, true_expected[index, 0])
                 note += f" ({classes[index].noise:.3f})"
             if weight[0, 0] < 1:
                 label = "mean of soft spots"

@@ -1,4 +1,4 @@
-"""Files of an evaluation and of a comparison, and checks of arguments before any work."""
+"""Files of an evaluation and of a comparison, and checks before any measurement."""
 
 import tempfile
 from collections.abc import Collection
@@ -26,13 +26,13 @@ def open_maps(
     """Check the arguments of a measurement and open its dataset.
 
     Args:
-        data: its path or id.
-        splits: names of its splits; None for all test splits.
+        data: path or id of the dataset.
+        splits: names of splits; None for all test splits.
         seed: root seed.
         out: output folder; if empty, nothing is written.
         overwrite: whether an existing measurement may be replaced.
-        files: names of the files of such a folder, in addition to `FIGURES`.
-        content: description of such a folder, such as "an evaluation".
+        files: names of the files in an output folder, in addition to `FIGURES`.
+        content: description of an output folder, such as "an evaluation".
 
     Raises:
         ConfigError: If `splits` is empty, or the folder contains other files.
@@ -55,9 +55,11 @@ def open_maps(
 
 
 def _foreign(folder: Path, files: set[str], content: str) -> str:
-    """Return why a path is not such a folder, empty if it is; for `refuse_taken`."""
-    if folder.is_dir() and {item.name for item in folder.iterdir()} <= files:
-        return ""
+    """Return the reason for which a path may not be replaced; empty if it may."""
+    if folder.is_dir():
+        names = {item.name for item in folder.iterdir()}
+        if names <= files:
+            return ""
     return f"is something else than {content}"
 
 
@@ -65,7 +67,7 @@ def check_writable(path: Path) -> None:
     """Check that a file can be written.
 
     Raises:
-        OSError: If it cannot; the error names the file.
+        OSError: If the file cannot be written; the error names it.
     """
     nearest = next(parent for parent in path.absolute().parents if parent.exists())
     try:

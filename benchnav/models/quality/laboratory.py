@@ -107,18 +107,18 @@ def compare(
     measurement = Measurement(
         dataset=dataset, splits=chosen, seed=seed, device=find_device(device)
     )
-    # The class table is not the truth of imported terrain.
-    pairs = [
-        (split, candidate)
-        for split in chosen
-        for candidate in candidates
-        if not (candidate.needs_truth and split in measurement.unknown)
-    ]
+    unknown = measurement.unknown
+    pairs = []
+    for split in chosen:
+        for candidate in candidates:
+            # The class table is not the truth of imported terrain.
+            if split in unknown and candidate.needs_truth:
+                continue
+            pairs.append((split, candidate))
     measurement.measure(pairs, "models and splits", by_map=True)
     comparison = _compare(measurement, candidates)
-    labels = [
-        candidate.label for candidate in candidates if candidate.source in sources
-    ]
+    requested = [candidate for candidate in candidates if candidate.source in sources]
+    labels = [candidate.label for candidate in requested]
     title = f"{', '.join(labels)} on {dataset.id}"
     print_table(comparison_table(title, comparison))
     notes = _notes(measurement, candidates, comparison)
@@ -147,29 +147,24 @@ def compare(
 def _compare(measurement: Measurement, candidates: Sequence[Candidate]) -> Comparison:
     """Compare the measured models, and measure their costs."""
     dataset = measurement.dataset
-    tallies = {
-        key: quality.by_map
-        for key, quality in measurement.qualities.items()
-        if quality.by_map
-    }
-    sums: dict[str, dict[str, Any]] = {}
-    for split in measurement.splits:
-        groups = _groups(dataset, split)
-        sums[split] = {
-            model: by_group(tally.sums(), groups)
-            for (tally_split, model), tally in tallies.items()
-            if tally_split == split
-        }
-    competing = [
-        candidate.label for candidate in candidates if not candidate.privileged
-    ]
+    groups = {split: _groups(dataset, split) for split in measurement.splits}
+    sums: dict[str, dict[str, Any]] = {split: {} for split in measurement.splits}
+    tallies = {}
+    for (split, model), quality in measurement.qualities.items():
+        tally = quality.by_map
+        if tally is not None:
+            tallies[split, model] = tally
+            sums[split][model] = by_group(tally.sums(), groups[split])
+    rivals = [candidate for candidate in candidates if not candidate.privileged]
+    competing = [candidate.label for candidate in rivals]
     summary, pairs, best = compare_sums(sums, competing)
-    terrain = dataset.terrain(measurement.splits[0], [0]).to(measurement.device)
-    models = {
-        candidate.label: _cost(candidate, terrain)
-        for candidate in candidates
-        if (summary["model"] == candidate.label).any()
-    }
+    first_map = dataset.terrain(measurement.splits[0], [0])
+    terrain = first_map.to(measurement.device)
+    models = {}
+    for candidate in candidates:
+        is_measured = (summary["model"] == candidate.label).any()
+        if is_measured:
+            models[candidate.label] = _cost(candidate, terrain)
     return Comparison(
         models=models, summary=summary, pairs=pairs, best=best, tallies=tallies
     )
@@ -179,18 +174,22 @@ def _groups(dataset: TerrainDataset, split: str) -> np.ndarray:
     """Return the group id of each map, shape [M]."""
     if "group" not in dataset.field_names:
         return np.arange(dataset.map_count(split))
-    groups: np.ndarray = dataset.read(split, fields=("group",))["group"].reshape(-1)
-    return groups
+    groups: np.ndarray = dataset.read(split, fields=("group",))["group"]
+    return groups.reshape(-1)
 
 
 def _cost(candidate: Candidate, terrain: Terrain) -> dict[str, Any]:
     """Return source and cost of a model; privileged models have no cost."""
-    is_timed = not candidate.privileged
+    parameters = None
+    milliseconds = None
+    if not candidate.privileged:
+        parameters = count_parameters(candidate.model)
+        milliseconds = prediction_ms(candidate.model, terrain)
     return {
         "source": candidate.source,
         "privileged": candidate.privileged,
-        "parameters": count_parameters(candidate.model) if is_timed else None,
-        "prediction_ms": prediction_ms(candidate.model, terrain) if is_timed else None,
+        "parameters": parameters,
+        "prediction_ms": milliseconds,
     }
 
 
@@ -199,9 +198,8 @@ def _notes(
 ) -> list[str]:
     """Return notes for readers of the numbers of a comparison."""
     dataset = measurement.dataset
-    n_units = dict(
-        zip(comparison.summary["split"], comparison.summary["units"], strict=True)
-    )
+    summary = comparison.summary
+    n_units = dict(zip(summary["split"], summary["units"], strict=True))
     counts = []
     for split in measurement.splits:
         n_maps = dataset.map_count(split)
@@ -212,19 +210,20 @@ def _notes(
     n_competing = sum(not candidate.privileged for candidate in candidates)
     n_tests = n_competing * (n_competing - 1) // 2
     # Of n units, the smallest p-value of a sign-flip permutation test is 2^(1 − n).
-    too_few = [
-        split for split, n in n_units.items() if n_tests * 2.0 ** (1 - n) >= ALPHA
-    ]
+    too_few = []
+    for split, n in n_units.items():
+        min_p = 2.0 ** (1 - n)
+        if n_tests * min_p >= ALPHA:
+            too_few.append(split)
     if too_few:
         lines.append(
             f"no difference can be significant with so few maps: {', '.join(too_few)}"
         )
     left_out = [candidate.label for candidate in candidates if candidate.needs_truth]
     if left_out and measurement.unknown:
-        lines.append(
-            f"{' and '.join(left_out)} are left out on "
-            f"{', '.join(measurement.unknown)}: the truth is unknown there"
-        )
+        models = " and ".join(left_out)
+        splits = ", ".join(measurement.unknown)
+        lines.append(f"{models} are left out on {splits}: the truth is unknown there")
     for candidate in candidates:
         if class_mismatch(candidate.model, dataset.recipe):
             lines.append(
@@ -232,9 +231,8 @@ def _notes(
                 "these maps"
             )
         if not candidate.privileged:
-            lines += [
-                f"{candidate.label}: {line}" for line in measurement.notes_of(candidate)
-            ]
+            notes = measurement.notes_of(candidate)
+            lines += [f"{candidate.label}: {note}" for note in notes]
     height, width = dataset.grid.shape
     threads = torch.get_num_threads()
     plural = "s" if threads > 1 else ""

@@ -47,7 +47,7 @@ class MapSheet(NamedTuple):
         split: split of the maps.
         indices: indices of the maps.
         extent_m: size of a map along x and y in metres.
-        layers: by the keys of `_LAYERS`, as far as the model has them, each of shape [B, H,
+        layers: layers that the model has, by the keys of `_LAYERS`, each of shape [B, H,
             W]; `rgb` is of shape [B, H, W, 3].
     """
 
@@ -86,9 +86,10 @@ def read_sheet(
             layers["entropy"] = predictive_entropy(classes)
         layers["expected"] = predicted.mean()
         if has_truth:
-            true = Oracle().predict_terrain(terrain).mean()
-            layers["expected_true"] = true
-            layers["error"] = layers["expected"] - true
+            truth = Oracle().predict_terrain(terrain)
+            true_mean = truth.mean()
+            layers["expected_true"] = true_mean
+            layers["error"] = layers["expected"] - true_mean
         else:
             layers["observed"] = terrain.traversability
             layers["error_observed"] = layers["expected"] - terrain.traversability
@@ -108,7 +109,7 @@ def shared_scales(
     Scales without a fixed range cover 99.5 % of the cells.
 
     Args:
-        sheets: at least one.
+        sheets: all sheets of an evaluation, at least one.
         classes: classes of the dataset.
     """
     class_keywords = class_scale(class_colours(classes))
@@ -120,15 +121,16 @@ def shared_scales(
     for name, (_, unit, palette) in _LAYERS.items():
         if name in scales:
             continue
-        values = [
-            sheet.layers[name].ravel() for sheet in sheets if name in sheet.layers
-        ]
+        with_layer = [sheet for sheet in sheets if name in sheet.layers]
+        values = [sheet.layers[name].ravel() for sheet in with_layer]
         if unit == "λ":
             scales[name] = LAMBDA
         elif values:
             sizes = np.abs(np.concatenate(values))
             sizes = sizes[np.isfinite(sizes)]
-            quantile = np.quantile(sizes, _SCALE_LEVEL) if len(sizes) else 0.0
+            quantile = 0.0
+            if len(sizes):
+                quantile = np.quantile(sizes, _SCALE_LEVEL)
             vmax = _round_up(float(quantile))
             vmin = -vmax if name.startswith("error") else 0
             scales[name] = {"cmap": palette, "vmin": vmin, "vmax": vmax}
@@ -147,24 +149,24 @@ def map_sheet_figure(
 
     Args:
         sheet: the maps.
-        scales: from `shared_scales`.
+        scales: keywords of `imshow` by layer, from `shared_scales`.
         classes: classes of the dataset.
         title: names of model and dataset, followed by the split.
     """
     names = [name for name in _LAYERS if name in sheet.layers]
     columns = [_column(name, sheet.layers[name], scales[name]) for name in names]
-    class_layers = [
-        sheet.layers[name] for name in ("class_true", "class_found") if name in names
-    ]
+    class_names = [name for name in ("class_true", "class_found") if name in names]
+    class_layers = [sheet.layers[name] for name in class_names]
     class_ids = np.setdiff1d(class_layers, UNLABELLED).astype(int)
     labels = [classes[class_id].name.replace("_", " ") for class_id in class_ids]
-    patches = class_patches(labels, class_colours(classes)[class_ids])
-    if patches and any(bool(np.isnan(layer).any()) for layer in sheet.layers.values()):
+    colours = class_colours(classes)
+    patches = class_patches(labels, colours[class_ids])
+    has_gaps = any(bool(np.isnan(layer).any()) for layer in sheet.layers.values())
+    if patches and has_gaps:
         patches.append(missing_handle())
     rows = [f"map {index}" for index in sheet.indices]
-    return sheet_of_maps(
-        columns, rows, sheet.extent_m, f"{title}, split {sheet.split}", patches
-    )
+    full_title = f"{title}, split {sheet.split}"
+    return sheet_of_maps(columns, rows, sheet.extent_m, full_title, patches)
 
 
 def _column(name: str, layers: np.ndarray, shades: dict[str, Any]) -> SheetColumn:
@@ -191,5 +193,7 @@ def _round_up(value: float) -> float:
     """Round up to 1, 1.5, 2, 3, 4, 5, 6, 8 or 10 times a power of ten; 1 for 0."""
     if value <= 0:
         return 1.0
-    candidates = 10.0 ** np.floor(np.log10(value)) * _STEPS
-    return float(candidates[candidates >= 0.999 * value][0])
+    power = 10.0 ** np.floor(np.log10(value))
+    candidates = power * _STEPS
+    is_enough = candidates >= 0.999 * value
+    return float(candidates[is_enough][0])

@@ -1,5 +1,4 @@
-"""Quality by map: sums, over one map or several, from which `scores_of_maps` computes all
-scores.
+"""Quality by map: sums over maps, from which `scores_of_maps` computes all scores.
 
 Letters in shapes: B maps of a chunk, M maps of a split, C classes, N cells.
 """
@@ -23,7 +22,7 @@ from benchnav.models.quality.scores import (
 )
 from benchnav.stats.scores import Sums
 
-STEPS = 50  # of a sparsification curve, from no cell left out on
+STEPS = 50  # of a sparsification curve, beginning with all cells
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,8 +37,8 @@ class CellScores:
         maps: index of each cell's map, int64, shape [N].
         scores: `squares` of E[λ] − λ, `nll`, and `crps`, float64, each of shape [1, N].
         labelled: mask of cells with a class, bool, shape [N].
-        expected_squares: squared errors of E[λ] relative to the true E[λ], of the labelled
-            cells, float64.
+        expected_squares: squared errors of E[λ] relative to the true E[λ], in the
+            labelled cells only, float64.
     """
 
     predicted: TraversabilityDistribution
@@ -73,7 +72,7 @@ class MapTally:
         self.ranked = np.zeros((2, STEPS))
 
     def add(self, cells: CellScores | None, count: int) -> None:
-        """Add `count` maps by their observed cells, None if there are no such cells."""
+        """Add `count` maps by their observed cells; None if there are no such cells."""
         sums = {name: torch.zeros(count, dtype=torch.float64) for name in self.names}
         if cells is not None:
             sums |= self._sums_of(cells, count)
@@ -93,15 +92,14 @@ class MapTally:
             scores["pinball"] = loss
             scores["width"] = width
             scores["areas"] = self._rank(cells, width[0], count)
-        sums = {
-            name: _by_map(values, cells.maps, count) for name, values in scores.items()
-        }
+        sums = {}
+        for name, values in scores.items():
+            sums[name] = _by_map(values, cells.maps, count)
         if self.truth:
             labelled_maps = cells.maps[cells.labelled]
+            squares = cells.expected_squares
             sums["labelled"] = _by_map(cells.labelled, cells.maps, count)
-            sums["expected_squares"] = _by_map(
-                cells.expected_squares, labelled_maps, count
-            )
+            sums["expected_squares"] = _by_map(squares, labelled_maps, count)
         return sums
 
     def add_classes(self, probabilities: Tensor, class_id: Tensor) -> None:
@@ -112,14 +110,15 @@ class MapTally:
         offset = offsets[:, None, None].expand_as(class_id)[labelled]
         predicted = probabilities.argmax(1)[labelled]
         true = class_id[labelled]
-        hits = true[predicted == true] + offset[predicted == true]
+        is_hit = predicted == true
+        hits = true[is_hit] + offset[is_hit]
         indices = {"true": offset + true, "found": offset + predicted, "hits": hits}
         for name, index in indices.items():
             counts = torch.bincount(index, minlength=n_maps * self.classes)
             self._append(name, counts.view(n_maps, self.classes))
 
     def sums(self) -> dict[str, np.ndarray]:
-        """Return the sums by name, of shape [M], those of classes of shape [M, C]."""
+        """Return the sums by name, of shape [M]; sums by class have shape [M, C]."""
         return {name: np.concatenate(parts) for name, parts in self.parts.items()}
 
     def curves(self) -> np.ndarray:
@@ -129,10 +128,12 @@ class MapTally:
         cells, ranked by width and by error.
         """
         n_cells = sum(float(counts.sum()) for counts in self.parts["cells"])
-        return np.vstack([np.arange(STEPS) / STEPS, self.ranked / n_cells])
+        removed = np.arange(STEPS) / STEPS
+        return np.vstack([removed, self.ranked / n_cells])
 
     def _append(self, name: str, values: Tensor) -> None:
-        self.parts.setdefault(name, []).append(values.double().cpu().numpy())
+        array = values.double().cpu().numpy()
+        self.parts.setdefault(name, []).append(array)
 
     def _rank(self, cells: CellScores, width: Tensor, count: int) -> Tensor:
         """Return the AUSE of each cell's map, [N]; also add to the curves of all maps."""
@@ -145,7 +146,8 @@ class MapTally:
             if not n_cells:
                 continue
             curves = sparsification(error[mask], width[mask])
-            areas[mask] = (curves[0] - curves[1]).mean()
+            by_width, by_error = curves
+            areas[mask] = (by_width - by_error).mean()
             last_cell = n_cells - 1 - steps * n_cells // STEPS
             self.ranked += n_cells * curves[:, last_cell].cpu().numpy()
         return areas
@@ -170,7 +172,7 @@ def by_group(sums: Sums, groups: np.ndarray) -> dict[str, np.ndarray]:
     Units without cells are left out.
 
     Args:
-        sums: of shape [M], those of classes of shape [M, C].
+        sums: sums by name, of shape [M]; sums by class have shape [M, C].
         groups: group id of each map, shape [M].
 
     Returns:
@@ -179,7 +181,8 @@ def by_group(sums: Sums, groups: np.ndarray) -> dict[str, np.ndarray]:
     group_ids, index = np.unique(groups, return_inverse=True)
     totals = {}
     for name, values in sums.items():
-        totals[name] = np.zeros((len(group_ids), *values.shape[1:]))
-        np.add.at(totals[name], index, values)
+        total = np.zeros((len(group_ids), *values.shape[1:]))
+        np.add.at(total, index, values)
+        totals[name] = total
     has_cells = totals["cells"] > 0
     return {name: values[has_cells] for name, values in totals.items()}

@@ -1,5 +1,4 @@
-"""Quality of a model's predictions per split: of class probabilities and of
-traversability.
+"""Quality of a model's class probabilities and predicted λ, per split.
 
 One pass over the maps updates sums and counts only, so memory does not grow with the
 maps. The scores themselves are in `scores`. Letters in shapes: M members, B maps, H×W
@@ -60,7 +59,7 @@ class ClassQuality:
             model without several members.
         entropy_auroc: probability that a misclassified cell has a higher entropy than a
             correct one; NaN if all cells or no cells are misclassified.
-        mutual_information_auroc: the same for mutual information.
+        mutual_information_auroc: the same probability for mutual information.
         confusion: cells by true class (row) and most likely class (column), [C][C].
         reliability: the curve that the ECE summarises: number of `cells`, mean
             `confidence` and `accuracy` in 15 equal bins of the probability of the most
@@ -153,7 +152,7 @@ def choose_splits(
 
 
 def known_splits(dataset: TerrainDataset, splits: Iterable[str] = ()) -> list[str]:
-    """Return the splits to measure: those named, or all test splits if none is named.
+    """Return the splits to measure: the named ones, or by default all test splits.
 
     Raises:
         DatasetError: If a split does not exist or there is no test split.
@@ -185,7 +184,7 @@ def evaluate(
         dataset: the maps.
         splits: names of splits; if empty, all test splits.
         seed: root seed of the draws within atoms.
-        device: where to compute.
+        device: device of the computation.
 
     Yields:
         Name of a split and the quality on it.
@@ -206,14 +205,16 @@ def measure_split(
     device: torch.device = CPU,
     by_map: bool = False,
 ) -> Quality:
-    """Measure a model on one split; only its λ if its class table is not that of the maps.
+    """Measure a model on one split.
+
+    Only λ is measured if the model's class table differs from that of the maps.
 
     Args:
         model: any model.
         dataset: the maps.
         split: name of the split.
         seed: root seed of the draws within atoms, the same for all models.
-        device: where to compute.
+        device: device of the computation.
         by_map: whether to return sums for a comparison, which need quantiles of all
             cells.
     """
@@ -239,7 +240,7 @@ def measure(
     Args:
         model: any model.
         chunks: chunks of maps; at least one map.
-        generator: of the draws within atoms, on the CPU.
+        generator: generator of the draws within atoms, on the CPU.
         alike: for each class, itself and its look-alikes; empty if there are no
             look-alikes.
         truth: whether the true distribution of λ is available.
@@ -248,7 +249,8 @@ def measure(
         classes: whether to measure the model's classes, if it predicts any.
     """
     n_maps = 0
-    class_tally = _ClassTally(len(model.class_names) if classes else 0, alike)
+    n_classes = len(model.class_names) if classes else 0
+    class_tally = _ClassTally(n_classes, alike)
     map_tally = MapTally(class_tally.count, truth, quantiles=by_map)
     is_privileged = isinstance(model, PrivilegedModel)
     for terrain in chunks:
@@ -273,10 +275,13 @@ def measure(
         tail_rate=SCORES["tail_rate_90"].value(sums),
         pit=tuple(map_tally.pit.tolist()),
     )
+    class_qualities = []
+    if class_tally.confusion.any():
+        class_qualities.append(class_tally.quality())
     return Quality(
         maps=n_maps,
         traversability=traversability,
-        classes=(class_tally.quality(),) if class_tally.confusion.any() else (),
+        classes=tuple(class_qualities),
         by_map=map_tally if by_map else None,
     )
 
@@ -327,7 +332,7 @@ class _ClassTally:
         """Add maps.
 
         Args:
-            probabilities: of the classes, shape [B, C, H, W].
+            probabilities: class probabilities of the model, shape [B, C, H, W].
             members: class probabilities of the members, shape [M, B, C, H, W].
             class_id: true classes, shape [B, H, W].
             slope_deg: slopes in degrees, shape [B, H, W].
@@ -346,7 +351,8 @@ class _ClassTally:
         is_wrong = predicted != class_id
         confusion = multiclass_confusion_matrix(predicted, class_id, self.count)
         self.confusion += confusion.cpu()
-        self.brier += float(brier_score(probabilities, class_id).double().sum())
+        brier = brier_score(probabilities, class_id).double()
+        self.brier += float(brier.sum())
         self.reliability.update(probabilities, class_id)
         self.entropy.update(predictive_entropy(probabilities), is_wrong)
         if has_members:
@@ -369,7 +375,9 @@ class _ClassTally:
             "confidence": tuple(confidence),
             "accuracy": tuple(bin_accuracy),
         }
-        look_alikes = self.look_alikes.quality() if self.look_alikes.groups else None
+        look_alikes = None
+        if self.look_alikes.groups:
+            look_alikes = self.look_alikes.quality()
         return ClassQuality(
             accuracy=accuracy,
             miou=miou,
@@ -389,7 +397,8 @@ class _ClassTally:
 
 def _in_a_row(layers: Tensor, mask: Tensor) -> Tensor:
     """Select N cells of maps, from [M, B, C, H, W] to [M, 1, C, 1, N]."""
-    return layers.movedim(2, -1)[:, mask].movedim(-1, 1)[:, None, :, None]
+    selected = layers.movedim(2, -1)[:, mask]
+    return selected.movedim(-1, 1)[:, None, :, None]
 
 
 def _score_cells(
@@ -413,9 +422,11 @@ def _score_cells(
     observed = terrain.traversability[mask].unsqueeze(0)
     expected = predicted.mean()
     transformed = pit(predicted, observed, generator)
-    expected_error = (expected - terrain.truth.at(mask).mean())[0, labelled]
+    true_expected = terrain.truth.at(mask).mean()
+    expected_error = (expected - true_expected)[0, labelled]
+    error = expected - observed
     scores = {
-        "squares": (expected - observed).double().square(),
+        "squares": error.double().square(),
         "nll": -predicted.log_prob(observed).double(),
         "crps": predicted.crps(observed).double(),
     }

@@ -1,4 +1,4 @@
-"""Measurements of models on splits of a dataset, with notes on how to read the numbers."""
+"""Measurements of models on splits of a dataset, with notes for their readers."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -22,10 +22,10 @@ class Measurement:
 
     Args:
         dataset: the maps.
-        splits: names of its splits.
+        splits: names of the dataset's splits to measure.
         seed: root seed of the draws within atoms, the same for all models.
-        device: where models are measured.
-        qualities: by split and label of the model.
+        device: device on which models are measured.
+        qualities: quality by split and label of the model.
     """
 
     dataset: TerrainDataset
@@ -40,7 +40,7 @@ class Measurement:
         """Measure models on splits, with a progress line.
 
         Args:
-            pairs: split and model.
+            pairs: pairs of a split and a model.
             unit: name of the pairs in the progress line.
             by_map: whether to store sums for a comparison.
         """
@@ -73,16 +73,17 @@ class Measurement:
     def nearest_colour_accuracy(self) -> dict[str, float]:
         """Fraction of cells that the nearest colour classifies correctly, by split.
 
-        Only splits on which classes were measured.
+        Splits on which no classes were measured are left out.
         """
         has_classes = {
             split for (split, _), quality in self.qualities.items() if quality.classes
         }
-        return {
-            split: baselines.nearest_colour_accuracy(self.dataset, split)
-            for split in self.splits
-            if split in has_classes
-        }
+        accuracies = {}
+        for split in self.splits:
+            if split in has_classes:
+                accuracy = baselines.nearest_colour_accuracy(self.dataset, split)
+                accuracies[split] = accuracy
+        return accuracies
 
     @cached_property
     def climatology_crps(self) -> dict[str, float]:
@@ -117,8 +118,9 @@ class Measurement:
             parts = []
             for split in self.unknown:
                 parts += self.dataset.splits[split]["parts"]
+            sources = [part.get("source", {}) for part in parts]
             observed = "λ drawn at least in part from the class table, not measured λ"
-            if all(part.get("source", {}).get("traversability") for part in parts):
+            if all(source.get("traversability") for source in sources):
                 observed = "measured λ"
             lines.append(
                 f"the true distribution of λ is unknown on {', '.join(self.unknown)}: "
@@ -131,23 +133,19 @@ class Measurement:
         """Return warnings if a model's numbers are poor or not meaningful."""
         qualities = self.of(candidate)
         warnings = []
-        less_accurate = [
-            split
-            for split, quality in qualities.items()
-            for classes in quality.classes
-            if classes.accuracy < self.nearest_colour_accuracy[split]
-        ]
+        less_accurate = []
+        worse = []
+        for split, quality in qualities.items():
+            for classes in quality.classes:
+                if classes.accuracy < self.nearest_colour_accuracy[split]:
+                    less_accurate.append(split)
+            if quality.traversability.crps > self.climatology_crps[split]:
+                worse.append(split)
         if less_accurate:
             splits = ", ".join(less_accurate)
             warnings.append(
                 f"the model's accuracy is below that of the nearest colour on {splits}"
             )
-        climatology = self.climatology_crps
-        worse = [
-            split
-            for split, quality in qualities.items()
-            if quality.traversability.crps > climatology[split]
-        ]
         if worse:
             splits = ", ".join(worse)
             warnings.append(
@@ -175,8 +173,9 @@ class Measurement:
             # Checkpoints of earlier versions contain the digest of the arrays only.
             array_digest = self.dataset.splits[split]["digest"]
             for digest in (self.dataset.split_digest(split), array_digest):
-                if digest in candidate.trained_on:
-                    seen.append(f"{split} (its {candidate.trained_on[digest]})")
+                name = candidate.trained_on.get(digest)
+                if name is not None:
+                    seen.append(f"{split} (its {name})")
         return seen
 
     def header(self, notes: Sequence[str]) -> dict[str, Any]:

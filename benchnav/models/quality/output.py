@@ -1,6 +1,4 @@
-"""Output files of model measurements: texts, figures, and a page that shows and explains
-them.
-"""
+"""Output files of measurements: texts, figures, and a page that explains them."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -24,9 +22,10 @@ class Page:
     """A page of tables, notes and figures.
 
     Args:
-        title: of the page.
-        tables: the first follows the title, before the notes; the others have headings.
-        notes: lines.
+        title: title of the page.
+        tables: tables of the page; the first follows the title, before the notes, and
+            the others have headings.
+        notes: notes, one line each.
     """
 
     title: str
@@ -94,10 +93,10 @@ def json_text(header: Mapping[str, Any], splits: Mapping[str, Any]) -> str:
         header: information on models and data.
         splits: results by split.
     """
-    all_series = {
-        scenario: [{"severity": severity, "split": split} for severity, split in pairs]
-        for scenario, pairs in find_series(splits).items()
-    }
+    all_series = {}
+    for scenario, pairs in find_series(splits).items():
+        rows = [{"severity": severity, "split": split} for severity, split in pairs]
+        all_series[scenario] = rows
     content = {**header, "splits": splits, "series": all_series}
     text = json.dumps(content, default=int)
     without_nan = json.loads(text, parse_constant=lambda _: None)

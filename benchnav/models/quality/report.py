@@ -23,22 +23,22 @@ def quality_table(
 
     Args:
         title: title of the table.
-        qualities: by split.
+        qualities: quality of the model, by split.
         all_columns: whether to include columns for which a terminal is too narrow.
     """
     rows = [numbers(quality) for quality in qualities.values()]
     table = pd.DataFrame(rows, index=list(qualities))
     has_values = np.isfinite(table).any()
-    # These may be missing in every split, and are shown nevertheless.
+    # These two may be missing in every split, and are shown nevertheless.
     is_optional = table.columns.isin(["rmse_expected", "nll"])
     available = set(table.columns[has_values | is_optional])
     if not all_columns:
         available -= set(FILES_ONLY)
     names = [name for name in COLUMNS if name in available]
-    cells = [
-        {"split": split, "maps": qualities[split].maps, **row}
-        for split, row in table[names].to_dict("index").items()
-    ]
+    cells = []
+    for split, row in table[names].to_dict("index").items():
+        n_maps = qualities[split].maps
+        cells.append({"split": split, "maps": n_maps, **row})
     split_meaning = "split of the dataset; maps: the number of its maps."
     columns = [
         Column("split\n", cell_of("split"), split_meaning),
@@ -46,7 +46,8 @@ def quality_table(
     ]
     for name in names:
         heading, meaning = COLUMNS[name]
-        columns.append(Column(heading, cell_of(name, _number), meaning))
+        cell = cell_of(name, _number)
+        columns.append(Column(heading, cell, meaning))
     return table_of(cells, columns, title=title, numbers=True)
 
 
@@ -59,7 +60,7 @@ def quality_json(header: Mapping[str, Any], qualities: Mapping[str, Quality]) ->
 
     Args:
         header: information on model and data.
-        qualities: by split.
+        qualities: quality of the model, by split.
     """
     splits = {
         split: {"maps": quality.maps, **_everything(quality)}
@@ -96,7 +97,7 @@ def numbers(quality: Quality) -> dict[str, float]:
 
 
 def _everything(quality: Quality) -> dict[str, Any]:
-    """Return all results of a split by name; those of look-alikes only if there are any."""
+    """Return all results of a split by name; look-alikes are optional."""
     values: dict[str, Any] = {}
     for item in quality.classes:
         values |= asdict(item)

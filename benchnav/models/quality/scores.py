@@ -1,5 +1,4 @@
-"""Scores of predictions: distributions of traversability, class probabilities and their
-uncertainty.
+"""Scores of predictions: distributions of λ, class probabilities, and uncertainty.
 
 Calibration of λ is measured by the probability integral transform (PIT) of the
 observations, which is uniform if the predicted distributions are correct. At an atom of
@@ -55,7 +54,7 @@ def pit(
     Args:
         distribution: predictions, of shape [*B, H, W].
         observed: λ in [0, 1], shape [*B, H, W].
-        generator: of the draws within atoms, on the CPU.
+        generator: generator of the draws within atoms, on the CPU.
 
     Returns:
         Shape [*B, H, W]; uniform on [0, 1] if the predictions are correct.
@@ -69,9 +68,10 @@ def coverage(transformed: Tensor) -> float:
     """Return the fraction of observations in the central 90 % interval.
 
     Args:
-        transformed: from `pit`, any shape.
+        transformed: PIT of the observations from `pit`, any shape.
     """
-    return float(((transformed - 0.5).abs() <= LEVEL / 2).double().mean())
+    is_inside = (transformed - 0.5).abs() <= LEVEL / 2
+    return float(is_inside.double().mean())
 
 
 def tail_rate(transformed: Tensor, level: float = LEVEL) -> float:
@@ -80,10 +80,11 @@ def tail_rate(transformed: Tensor, level: float = LEVEL) -> float:
     If the VaR lies on an atom at 0 or 1, the draw within the atom decides.
 
     Args:
-        transformed: from `pit`, any shape.
+        transformed: PIT of the observations from `pit`, any shape.
         level: α.
     """
-    return float((transformed < 1 - level).double().mean())
+    is_below = transformed < 1 - level
+    return float(is_below.double().mean())
 
 
 def lower_fifth_and_width(
@@ -107,11 +108,12 @@ def lower_fifth_and_width(
     for level in LOWER_FIFTH:
         quantile = distribution.quantile(level).double()
         error = observed - quantile
-        pinball = torch.maximum(level * error, (level - 1) * error)
+        pinball = torch.maximum(level * error, (level - 1) * error)  # u·e or (u − 1)·e
         loss = loss + pinball / len(LOWER_FIFTH)
         if level == 0.05:
             lower = quantile
-    return loss, distribution.quantile(0.95).double() - lower
+    upper = distribution.quantile(0.95).double()
+    return loss, upper - lower
 
 
 def sparsification(error: Tensor, uncertainty: Tensor) -> Tensor:
@@ -134,7 +136,9 @@ def sparsification(error: Tensor, uncertainty: Tensor) -> Tensor:
     _, group = torch.unique(_score_step(uncertainty), return_inverse=True)
     n_tied = torch.bincount(group)
     tied_error = torch.bincount(group, error) / n_tied
-    ranked = torch.stack([tied_error.repeat_interleave(n_tied), error.sort().values])
+    by_uncertainty = tied_error.repeat_interleave(n_tied)
+    by_error = error.sort().values
+    ranked = torch.stack([by_uncertainty, by_error])
     n_cells = torch.arange(1, len(error) + 1, device=error.device)
     return ranked.cumsum(1) / n_cells
 
@@ -143,7 +147,7 @@ def pit_counts(transformed: Tensor) -> Tensor:
     """Count observations in 20 equal bins of the PIT.
 
     Args:
-        transformed: from `pit`, any shape.
+        transformed: PIT of the observations from `pit`, any shape.
 
     Returns:
         int64 on the CPU, shape [20].
@@ -181,11 +185,13 @@ def class_scores(confusion: Tensor) -> tuple[float, float, float]:
     """
     hits = confusion.diagonal().float()
     true = confusion.float().sum(1)
-    union = true + confusion.float().sum(0) - hits
+    predicted = confusion.float().sum(0)
+    union = true + predicted - hits
     overlap = torch.where(union > 0, hits / union, 0.0)
     accuracy = float(confusion.diagonal().sum() / confusion.sum())
     miou = float(overlap[true > 0].mean())
-    miou_predicted = float((overlap / (union > 0).sum()).sum())
+    n_classes = (union > 0).sum()
+    miou_predicted = float((overlap / n_classes).sum())
     return accuracy, miou, miou_predicted
 
 
@@ -213,15 +219,15 @@ class ReliabilityCurve:
         Confidence and accuracy are 0 in empty bins.
         """
         cells, confidence, correct = self.sums
-        n_cells = cells.clamp(min=1)
-        return torch.stack([cells, confidence / n_cells, correct / n_cells])
+        divisor = cells.clamp(min=1)
+        return torch.stack([cells, confidence / divisor, correct / divisor])
 
 
 def calibration_error(curve: Tensor) -> float:
     """Return the expected calibration error: |accuracy − confidence| over cells.
 
     Args:
-        curve: of `ReliabilityCurve`, shape [3, 15].
+        curve: result of `ReliabilityCurve.compute`, shape [3, 15].
     """
     cells, confidence, accuracy = curve
     gaps = (accuracy - confidence).abs()
@@ -230,7 +236,8 @@ def calibration_error(curve: Tensor) -> float:
 
 def _bin(values: Tensor, count: int) -> Tensor:
     """Return the bin of each value among equal bins of [0, 1], int64, shape [N]."""
-    return (values * count).floor().long().clamp(0, count - 1).flatten()
+    bins = (values * count).floor().long()
+    return bins.clamp(0, count - 1).flatten()
 
 
 def _score_step(score: Tensor) -> Tensor:
@@ -244,7 +251,7 @@ def predictive_entropy(probabilities: Tensor) -> Tensor:
     """Return the entropy −Σ_c p_c ln p_c of the class in each cell.
 
     Args:
-        probabilities: summing to 1 over C, shape [*B, C, H, W].
+        probabilities: class probabilities, summing to 1 over C, shape [*B, C, H, W].
 
     Returns:
         Nats in [0, ln C], shape [*B, H, W].
@@ -258,24 +265,27 @@ def mutual_information(member_probabilities: Tensor) -> Tensor:
     It is the entropy of the mean minus the mean of the entropies.
 
     Args:
-        member_probabilities: of M members with equal weights, shape [M, B, C, H, W].
+        member_probabilities: class probabilities of M members with equal weights, shape
+            [M, B, C, H, W].
 
     Returns:
         Nats in [0, ln min(M, C)], 0 if all members agree, shape [B, H, W].
     """
     members = member_probabilities.double()
     mean_entropy = predictive_entropy(members).mean(0)
-    information = predictive_entropy(members.mean(0)) - mean_entropy
+    total_entropy = predictive_entropy(members.mean(0))
+    information = total_entropy - mean_entropy
     return information.clamp(min=0).to(member_probabilities.dtype)
 
 
 class ErrorRanking:
-    """A measure of uncertainty over cells: its mean, and its AUROC as an indicator of errors.
+    """Measure of uncertainty over cells: its mean, and its AUROC in ranking errors.
 
-    The AUROC is the probability that a misclassified cell has a higher value than a correct
-    one; a tie counts half. Values are counted in relative steps of 0.1 %, so memory does
-    not grow with the number of cells. torchmetrics' AUROC would need 262 144 thresholds for
-    this resolution, and would loop over all of them for each batch.
+    The AUROC is the probability that a misclassified cell has a higher value than a
+    correct one; a tie counts half. Values are counted in relative steps of 0.1 %, so
+    memory does not grow with the number of cells. torchmetrics' AUROC would need
+    262 144 thresholds for this resolution, and would loop over all of them for each
+    batch.
     """
 
     def __init__(self) -> None:
@@ -298,7 +308,9 @@ class ErrorRanking:
         """
         correct, wrong = self.counts.double()
         n_lower = correct.cumsum(0) - correct / 2
-        auroc = (wrong * n_lower).sum() / (correct.sum() * wrong.sum())
+        n_ordered_pairs = (wrong * n_lower).sum()
+        n_pairs = correct.sum() * wrong.sum()
+        auroc = n_ordered_pairs / n_pairs
         n_cells = int(self.counts.sum())
         mean = self.total / n_cells if n_cells else math.nan
         return mean, float(auroc)
@@ -313,11 +325,11 @@ class LookAlikeQuality:
             look-alikes merged into one class.
         look_alike_miou: intersection over union with look-alikes merged, averaged over
             the classes that occur in the truth.
-        look_alike_share_error: mean distance, over the cells of look-alike classes, of the
-            true class's fraction of the group's probability from that of a perfect
-            classifier: 1/2 for two.
-        look_alike_share_ece: expected calibration error of the largest of these fractions,
-            15 bins.
+        look_alike_share_error: error of the true class's fraction of the probability of
+            its group of look-alikes: the mean distance from the fraction that a perfect
+            classifier predicts, 1/2 in a group of two.
+        look_alike_share_ece: expected calibration error of the largest fraction within
+            a group, 15 bins.
     """
 
     look_alike_accuracy: float
@@ -351,9 +363,9 @@ class LookAlikeTally:
         merged_id = self.merged.to(class_id.device)
         merged = torch.zeros_like(probabilities[:, :1]).repeat(1, self.size, 1, 1)
         merged.index_add_(1, merged_id, probabilities)
-        confusion = multiclass_confusion_matrix(
-            merged.argmax(1), merged_id[class_id], self.size
-        )
+        predicted = merged.argmax(1)
+        true = merged_id[class_id]
+        confusion = multiclass_confusion_matrix(predicted, true, self.size)
         self.confusion += confusion.cpu()
         for group in self.groups:
             members = torch.tensor(group, device=class_id.device)
@@ -362,10 +374,12 @@ class LookAlikeTally:
             group_probabilities = probabilities[:, list(group)].movedim(1, -1)
             joint = group_probabilities[mask].double()  # [N, G]
             total = joint.sum(1, keepdim=True)
-            fractions = torch.where(total > 0, joint / total, 1 / len(group))
+            equal_fraction = 1 / len(group)
+            fractions = torch.where(total > 0, joint / total, equal_fraction)
             true_index = is_member[mask].int().argmax(1)
             true_fraction = fractions.gather(1, true_index.unsqueeze(1))
-            self.distance += float((true_fraction - 1 / len(group)).abs().sum())
+            distance = (true_fraction - equal_fraction).abs()
+            self.distance += float(distance.sum())
             self.cells += len(fractions)
             self.curve.update(fractions.T[None, :, None], true_index[None, None])
 

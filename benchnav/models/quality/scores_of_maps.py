@@ -1,5 +1,4 @@
-"""Scores of models as functions of sums over maps (`map_sums`), and the direction that is
-better.
+"""Scores of models as functions of sums over maps (`map_sums`), with their direction.
 
 Headings and meanings are those of `columns`, shared with the tables of a single model.
 """
@@ -53,17 +52,19 @@ def _root(squares: np.ndarray, cells: np.ndarray) -> np.ndarray:
 def _miou(hits: np.ndarray, true: np.ndarray, predicted: np.ndarray) -> np.ndarray:
     """Return the intersection over union, averaged over classes that occur in truth."""
     union = true + predicted - hits
-    overlap: np.ndarray = np.where(true > 0, hits / np.where(union > 0, union, 1), 0.0)
-    mean: np.ndarray = overlap.sum(-1) / (true > 0).sum(-1)
+    divisor = np.where(union > 0, union, 1)
+    overlap: np.ndarray = np.where(true > 0, hits / divisor, 0.0)
+    n_classes = (true > 0).sum(-1)
+    mean: np.ndarray = overlap.sum(-1) / n_classes
     return mean
 
 
 def _tail_error(cells: np.ndarray, *under: np.ndarray) -> np.ndarray:
     """Return the mean distance of the fractions of λ below each VaR from 1 − level."""
-    gaps = [
-        abs(_ratio(count, cells) - (1 - level))
-        for count, level in zip(under, TAIL_LEVELS, strict=True)
-    ]
+    gaps = []
+    for count, level in zip(under, TAIL_LEVELS, strict=True):
+        fraction = _ratio(count, cells)
+        gaps.append(abs(fraction - (1 - level)))
     return np.mean(gaps, axis=0)
 
 

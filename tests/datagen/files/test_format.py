@@ -18,7 +18,7 @@ from benchnav.datagen import schema
 from benchnav.datagen.files.check import find_faults
 from benchnav.datagen.files.create import create
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.datagen.recipe.recipe import load_recipe
+from benchnav.datagen.recipe.load import load_recipe
 from benchnav.datagen.synth.generate import generate
 
 DATA = Path(__file__).parent.parent.parent / "data"
@@ -130,7 +130,7 @@ def test_digests_are_the_same_on_other_processors(
 ) -> None:
     sources = [str(DATA / "golden.yaml"), str(SECOND.with_suffix(".yaml"))]
     code = (
-        "from pathlib import Path; from benchnav.datagen.recipe.recipe import load_recipe; "
+        "from pathlib import Path; from benchnav.datagen.recipe.load import load_recipe; "
         "from benchnav.datagen.files.create import create\n"
         f"for number, source in enumerate({sources!r}):\n"
         "    for _ in create(load_recipe(source), Path(f'{number}.h5')): pass"

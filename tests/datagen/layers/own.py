@@ -9,7 +9,8 @@ from numpy import ndarray
 
 from benchnav.core import registry
 from benchnav.datagen.layers.layer import DrawnMaps, Layer, Streams
-from benchnav.datagen.recipe.recipe import Recipe, recipe_from_dict
+from benchnav.datagen.recipe.load import recipe_from_dict
+from benchnav.datagen.recipe.recipe import Recipe
 from tests.datagen.small import small_stakes
 from tests.docs.pages import DOCS, blocks
 

@@ -20,7 +20,8 @@ from benchnav.datagen.layers.layer import DrawnMaps, Layer
 from benchnav.datagen.layers.spec import overrides_of, read_layer, shipped_fields
 from benchnav.datagen.layers.vegetation import Growth, Vegetation
 from benchnav.datagen.recipe import latent
-from benchnav.datagen.recipe.recipe import Recipe, Split, recipe_from_dict
+from benchnav.datagen.recipe.load import recipe_from_dict
+from benchnav.datagen.recipe.recipe import Recipe, Split
 from benchnav.datagen.schema import FIELDS, TRUTH
 from benchnav.datagen.synth.generate import generate
 from tests.datagen.layers.own import Plain, wet, wetness

@@ -14,7 +14,8 @@ from benchnav.datagen.layers.layer import DrawnMaps
 from benchnav.datagen.layers.spec import shipped_fields
 from benchnav.datagen.layers.stack import draw_layers
 from benchnav.datagen.layers.vegetation import Growth, Vegetation
-from benchnav.datagen.recipe.recipe import Recipe, load_recipe, recipe_from_dict
+from benchnav.datagen.recipe.load import load_recipe, recipe_from_dict
+from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.datagen.schema import FIELDS, entry_digests
 from benchnav.datagen.synth.generate import class_map, generate
 from tests.datagen.small import grown, small_stakes, terrain_class

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from benchnav.core.errors import ConfigError
 from benchnav.datagen.recipe.environments import AlikeClasses, deal_units, never_shown
-from benchnav.datagen.recipe.recipe import load_recipe
+from benchnav.datagen.recipe.load import load_recipe
 from benchnav.datagen.synth.generate import class_map
 from tests.datagen.small import small_stakes, terrain_class
 

@@ -13,8 +13,9 @@ from benchnav.datagen.files.stored_terrain import terrain_of
 from benchnav.datagen.layers.layer import DrawnMaps
 from benchnav.datagen.layers.vegetation import Growth, Vegetation
 from benchnav.datagen.recipe import latent
+from benchnav.datagen.recipe.load import load_recipe, recipe_from_dict
 from benchnav.datagen.recipe.looks import shown_colours
-from benchnav.datagen.recipe.recipe import Recipe, Split, load_recipe, recipe_from_dict
+from benchnav.datagen.recipe.recipe import Recipe, Split
 from benchnav.datagen.recipe.scenario import PRESETS, Scenario, Tint, blend
 from benchnav.datagen.synth.generate import generate
 from tests.datagen.small import grown, small_stakes

@@ -9,8 +9,9 @@ from scipy import stats
 from benchnav.core import rng
 from benchnav.core.errors import ConfigError
 from benchnav.core.grid import Grid
+from benchnav.datagen.recipe.load import load_recipe, recipe_from_dict
 from benchnav.datagen.recipe.places import PlacesRule, check_places, draw_places
-from benchnav.datagen.recipe.recipe import Split, load_recipe, recipe_from_dict
+from benchnav.datagen.recipe.recipe import Split
 from benchnav.datagen.synth.generate import generate
 from tests.datagen.small import small_stakes
 

@@ -8,7 +8,7 @@ import yaml
 
 from benchnav.core.errors import ConfigError
 from benchnav.datagen.recipe import latent
-from benchnav.datagen.recipe.recipe import (
+from benchnav.datagen.recipe.load import (
     load_recipe,
     recipe_from_dict,
     shipped_recipes,

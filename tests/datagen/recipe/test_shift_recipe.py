@@ -4,7 +4,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from benchnav.datagen.recipe.recipe import Split, load_recipe, recipe_from_dict
+from benchnav.datagen.recipe.load import load_recipe, recipe_from_dict
+from benchnav.datagen.recipe.recipe import Split
 from benchnav.datagen.recipe.scenario import Scenario
 from benchnav.datagen.schema import FIELDS
 from benchnav.datagen.synth.generate import generate

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from benchnav.datagen.noise import fractal_perlin
 from benchnav.datagen.recipe.latent import latent_mean, latent_std
-from benchnav.datagen.recipe.recipe import load_recipe
+from benchnav.datagen.recipe.load import load_recipe
 from benchnav.datagen.synth import appearance
 from benchnav.datagen.synth.elevation import horn_gradient, pad_missing
 

@@ -12,7 +12,7 @@ from benchnav.datagen.recipe.latent import (
     latent_mean,
     latent_std,
 )
-from benchnav.datagen.recipe.recipe import load_recipe
+from benchnav.datagen.recipe.load import load_recipe
 from benchnav.datagen.schema import FIELDS
 from benchnav.datagen.synth.generate import generate
 from tests.factories import tiny_recipe

@@ -15,7 +15,8 @@ from benchnav.core import rng
 from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.datagen.recipe import latent
-from benchnav.datagen.recipe.recipe import Recipe, Split, load_recipe, recipe_from_dict
+from benchnav.datagen.recipe.load import load_recipe, recipe_from_dict
+from benchnav.datagen.recipe.recipe import Recipe, Split
 from benchnav.datagen.recipe.scenario import blend
 from benchnav.datagen.schema import FIELDS, entry_digests
 from benchnav.datagen.synth import elevation

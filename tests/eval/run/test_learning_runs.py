@@ -16,7 +16,7 @@ from torch import Tensor
 from benchnav.core.errors import ConfigError
 from benchnav.datagen.files.find import find_dataset
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.datagen.recipe.recipe import load_recipe
+from benchnav.datagen.recipe.load import load_recipe
 from benchnav.eval.experiment.condition import KNOWLEDGE
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import Unit

@@ -19,7 +19,7 @@ import torch
 from benchnav.core import registry
 from benchnav.core.errors import BenchnavError, ConfigError
 from benchnav.core.settings import plain
-from benchnav.datagen.recipe.recipe import load_recipe
+from benchnav.datagen.recipe.load import load_recipe
 from benchnav.eval.compare import compare_runs
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import Unit

@@ -14,7 +14,7 @@ from scipy.stats import binom
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.classes import SoftSpots
 from benchnav.datagen.recipe.latent import expected_traversability
-from benchnav.datagen.recipe.recipe import load_recipe
+from benchnav.datagen.recipe.load import load_recipe
 from benchnav.models.predictor import Oracle
 from benchnav.models.quality.figures import Severity
 from benchnav.models.quality.figures_of_classes import Confusion, Reliability

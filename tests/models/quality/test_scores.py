@@ -19,7 +19,7 @@ from benchnav.core.quantiles import LEVELS, QuantileDistribution
 from benchnav.core.tables import to_markdown
 from benchnav.datagen.files.create import create
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.datagen.recipe.recipe import load_recipe
+from benchnav.datagen.recipe.load import load_recipe
 from benchnav.models.quality.measure import evaluate
 from benchnav.models.quality.report import (
     LOOK_ALIKES,

@@ -10,7 +10,7 @@ from torch import Tensor
 from benchnav.core.grid import Grid
 from benchnav.core.terrain import Observation, Terrain
 from benchnav.datagen.files.stored_terrain import terrain_of
-from benchnav.datagen.recipe.recipe import load_recipe
+from benchnav.datagen.recipe.load import load_recipe
 from benchnav.datagen.synth import elevation
 from benchnav.datagen.synth.generate import generate
 from benchnav.planning.sensing.appearance import Memory, masked, remember

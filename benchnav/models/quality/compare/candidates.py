@@ -32,10 +32,10 @@ class Candidate:
     """A model of a comparison.
 
     Args:
-        label: its name in tables.
-        source: its name in the request.
+        label: name of the model in tables.
+        source: name of the model in the request.
         model: the model.
-        trained_on: names of the splits on which it was trained, by digest.
+        trained_on: names of the splits on which the model was trained, by digest.
     """
 
     label: str
@@ -45,12 +45,12 @@ class Candidate:
 
     @property
     def privileged(self) -> bool:
-        """Whether it receives part of the truth: a reference that does not compete."""
+        """Whether it is a reference that receives part of the truth, out of competition."""
         return isinstance(self.model, PrivilegedModel)
 
     @property
     def needs_truth(self) -> bool:
-        """Whether it predicts by the class table, which is not the truth of imported terrain."""
+        """Whether it predicts by the class table, which fits generated terrain only."""
         return isinstance(self.model, Oracle | Ideal)
 
 
@@ -70,7 +70,7 @@ def find_candidates(sources: Sequence[str]) -> list[Candidate]:
     """Load the models to compare: those requested in order, then the privileged ones.
 
     Args:
-        sources: each as an argument of `load_model`; at least one.
+        sources: arguments of `load_model`, at least one.
 
     Raises:
         ConfigError: If `sources` is empty or names a model twice, or if a model does
@@ -87,9 +87,9 @@ def find_candidates(sources: Sequence[str]) -> list[Candidate]:
         by_location.setdefault(location, []).append(source)
     for same in by_location.values():
         if len(same) > 1:
+            listed = " and ".join(same)
             raise ConfigError(
-                f"Expected models that differ, got {' and '.join(same)}. Name each "
-                "model once."
+                f"Expected models that differ, got {listed}. Name each model once."
             )
     models = {source: load_model(source) for source in sources}
     for name in PRIVILEGED:
@@ -115,9 +115,11 @@ def _labels(sources: Sequence[str]) -> dict[str, str]:
     """Return short names of models, or the whole source if short names coincide."""
     short = {source: _short_name(source) for source in sources}
     counts = Counter(short.values())
-    return {
-        source: name if counts[name] == 1 else source for source, name in short.items()
-    }
+    labels = {}
+    for source, name in short.items():
+        is_unique = counts[name] == 1
+        labels[source] = name if is_unique else source
+    return labels
 
 
 def _short_name(source: str) -> str:
@@ -159,7 +161,8 @@ def prediction_ms(model: TraversabilityModel, terrain: Terrain) -> float:
         start = time.perf_counter()
         predict(model, terrain)
         _wait(terrain)
-        times_ms.append(1000 * (time.perf_counter() - start))
+        elapsed_s = time.perf_counter() - start
+        times_ms.append(1000 * elapsed_s)
     return statistics.median(times_ms[1:])
 
 

@@ -1,5 +1,4 @@
-"""Figures of a comparison: measures with intervals, calibration, sparsification, and
-quality by severity.
+"""Figures of a comparison: intervals, calibration, sparsification, and severity.
 
 A model has the same colour, marker and dash in all figures; privileged models are grey.
 Each panel shows a measure or a split.
@@ -50,7 +49,8 @@ def model_looks(models: Sequence[str], privileged: Sequence[str]) -> Looks:
 
     Privileged models are grey.
     """
-    looks = line_looks([model for model in models if model not in privileged])
+    competing = [model for model in models if model not in privileged]
+    looks = line_looks(competing)
     for index, model in enumerate(privileged):
         looks[model] = {
             "color": _GREYS[index % len(_GREYS)],
@@ -80,15 +80,17 @@ def _draw_tallies(
         panels[split] = panel
     lines = []
     for model in data.models:
+        look = looks[model]
         for split in splits:
             tally = data.tallies.get((split, model))
             if tally is not None:
-                lines.append((panels[split], model, tally, looks[model]))
+                lines.append((panels[split], model, tally, look))
     return figure, lines
 
 
 class _Measures(Figure):
-    name, title = "measures", "Measures with their intervals"
+    name = "measures"
+    title = "Measures with their intervals"
     text = (
         "Each row is a model, each mark a split; lines are 95 % intervals over maps. "
         "↑: higher is better, ↓: lower is better. Grey: privileged models, which "
@@ -101,7 +103,8 @@ class _Measures(Figure):
         has_values = data.summary.notna().any()
         scores = [score for score in COMPARED if has_values.get(score.name, False)]
         n_columns = 4 if len(scores) > 6 else 3
-        row_height = max(_MIN_ROW_HEIGHT_IN, _MARK_HEIGHT_IN * (len(splits) + 1.5))
+        marks_height = _MARK_HEIGHT_IN * (len(splits) + 1.5)
+        row_height = max(_MIN_ROW_HEIGHT_IN, marks_height)
         height = len(models) * row_height + 0.45
         titles = [score.title + _ARROWS[score.better] for score in scores]
         figure, axes = panel_grid(
@@ -110,9 +113,10 @@ class _Measures(Figure):
         panels = [panel for (panel,) in axes]
         for panel, score in zip(panels, scores, strict=True):
             for index, split in enumerate(splits):
-                rows = data.summary[data.summary["split"] == split]
-                rows = rows.set_index("model").reindex(models)
-                offset = 0.7 * ((index + 0.5) / len(splits) - 0.5)
+                is_of_split = data.summary["split"] == split
+                rows = data.summary[is_of_split].set_index("model").reindex(models)
+                position = (index + 0.5) / len(splits)
+                offset = 0.7 * (position - 0.5)
                 y = np.arange(len(models)) + offset
                 value = rows[score.name].to_numpy(float)
                 low = rows[f"{score.name}_low"].to_numpy(float)
@@ -137,7 +141,8 @@ class _Measures(Figure):
 
 
 class _Calibration(Figure):
-    name, title = "calibration", "Calibration of the predicted distributions of λ"
+    name = "calibration"
+    title = "Calibration of the predicted distributions of λ"
     text = (
         "Fraction of observed λ below a predicted quantile, minus the level of the "
         "quantile, over that level. 0 is calibrated. Above 0 at the left: low λ is "
@@ -150,7 +155,8 @@ class _Calibration(Figure):
             panel.axhline(0, color="0.4", lw=0.8, label="calibrated")
         for panel, model, tally, look in lines:
             levels = np.linspace(0, 1, len(tally.pit) + 1)
-            fractions = np.concatenate([[0], np.cumsum(tally.pit) / tally.pit.sum()])
+            cumulative = np.cumsum(tally.pit) / tally.pit.sum()
+            fractions = np.concatenate([[0], cumulative])
             excess = fractions - levels
             panel.plot(levels, excess, label=model, markevery=_MARKED_EVERY, **look)
         figure.supxlabel("level of the quantile")
@@ -160,7 +166,8 @@ class _Calibration(Figure):
 
 
 class _Sparsification(Figure):
-    name, title = "sparsification", "Sparsification: uncertainty against error"
+    name = "sparsification"
+    title = "Sparsification: uncertainty against error"
     text = (
         "Mean error |λ − E[λ]| of the remaining cells over the fraction of cells "
         "removed: the most uncertain first (lines), or those with the largest error "
@@ -170,12 +177,12 @@ class _Sparsification(Figure):
     def draw(self, data: Comparison) -> Drawing:
         figure, lines = _draw_tallies(data)
         for panel, model, tally, look in lines:
-            left_out, by_width, by_error = tally.curves()
+            removed, by_width, by_error = tally.curves()
             panel.plot(
-                left_out, by_width, label=model, markevery=2 * _MARKED_EVERY, **look
+                removed, by_width, label=model, markevery=2 * _MARKED_EVERY, **look
             )
-            panel.plot(left_out, by_error, color=look["color"], lw=0.8, ls=":")
-        panel.set_ylim(bottom=0)  # all panels share it
+            panel.plot(removed, by_error, color=look["color"], lw=0.8, ls=":")
+        panel.set_ylim(bottom=0)  # of all panels, whose axes are linked
         figure.supxlabel(
             "fraction of cells removed, those with the widest intervals first"
         )
@@ -187,7 +194,8 @@ class _Sparsification(Figure):
 
 
 class _Severity(Figure):
-    name, title = "severity", "Quality over the severity of a shift"
+    name = "severity"
+    title = "Quality over the severity of a shift"
     text = (
         "CRPS and pinball loss of the lower fifth over the severity of each scenario: "
         "0 is the training maps, 1 the scenario itself. Lines are 95 % intervals over "
@@ -223,10 +231,10 @@ class _Severity(Figure):
 
 def comparison_figures(comparison: Comparison) -> list[Figure]:
     """List the figures of a comparison that apply."""
-    return applicable(
-        (_Measures(), _Calibration(), _Sparsification(), _Severity()), comparison
-    )
+    figures = (_Measures(), _Calibration(), _Sparsification(), _Severity())
+    return applicable(figures, comparison)
 
 
 def _looks(comparison: Comparison) -> Looks:
-    return model_looks(list(comparison.models), comparison.privileged)
+    models = list(comparison.models)
+    return model_looks(models, comparison.privileged)

@@ -48,9 +48,9 @@ class Comparison:
             `prediction_ms`; competing models first.
         summary: a row per split and model, with `split`, `model` and the columns of
             `scores.summarise`.
-        pairs: for each split, `split` and the columns of `scores.compare_pairs`.
-        best: for each split, `split`, `model` and the columns of `scores.against_best`.
-        tallies: by split and model.
+        pairs: `split` and the columns of `scores.compare_pairs`, for all splits.
+        best: `split`, `model` and the columns of `scores.against_best`, for all splits.
+        tallies: sums over maps, by split and model.
     """
 
     models: Mapping[str, Mapping[str, Any]]
@@ -82,7 +82,7 @@ def compare_sums(
     """Compare models by their sums over maps, separately for each split.
 
     Args:
-        sums: by split and model, from `map_sums.by_group`.
+        sums: sums from `map_sums.by_group`, by split and model.
         competing: labels of the competing models.
 
     Returns:
@@ -95,13 +95,15 @@ def compare_sums(
         summary = summarise((*COMPARED, *TAIL_RATES), by_model)
         summaries[split] = summary
         pairs[split] = compare_pairs(COMPARED, by_model, competing, "cells")
-        rivals = summary[summary.index.isin(competing)]
-        best[split] = against_best(COMPARED, rivals, pairs[split])
+        is_competing = summary.index.isin(competing)
+        best[split] = against_best(COMPARED, summary[is_competing], pairs[split])
     all_pairs = pd.concat(pairs, names=["split"]).reset_index("split")
+    all_summaries = pd.concat(summaries, names=["split", "model"])
+    all_best = pd.concat(best, names=["split", "model"])
     return (
-        pd.concat(summaries, names=["split", "model"]).reset_index(),
+        all_summaries.reset_index(),
         all_pairs.reset_index(drop=True),
-        pd.concat(best, names=["split", "model"]).reset_index(),
+        all_best.reset_index(),
     )
 
 
@@ -121,21 +123,21 @@ def comparison_table(
     expected_rmse = numbers.get("rmse_expected", pd.Series([math.nan]))
     if not all_columns and expected_rmse.notna().all():
         hidden.add("rmse_observed")
-    shown = [
-        name
-        for name in (*SCORES, *COSTS)
-        if name in numbers and name not in hidden and numbers[name].notna().any()
-    ]
+    names = [name for name in (*SCORES, *COSTS) if name in numbers]
+    shown = []
+    for name in names:
+        has_values = numbers[name].notna().any()
+        if has_values and name not in hidden:
+            shown.append(name)
     best = comparison.best[comparison.best["marked"]]
     marked = set(zip(best["split"], best["model"], best["measure"], strict=True))
+    model_meaning = (
+        "† marks privileged models: references that receive part of the truth and do "
+        "not compete."
+    )
     columns = [
         Column("split\n", cell_of("split"), "split of the dataset."),
-        Column(
-            "model\n",
-            lambda row: row["model"] + PRIVILEGED_MARK * row["privileged"],
-            "† marks privileged models: references that receive part of the truth and "
-            "do not compete.",
-        ),
+        Column("model\n", _model_cell, model_meaning),
     ]
     for name in shown:
         if name in COSTS:
@@ -143,7 +145,8 @@ def comparison_table(
         else:
             heading = SCORES[name].heading
             meaning = SCORES[name].meaning
-        columns.append(Column(heading, partial(_cell, name, marked), meaning))
+        cell = partial(_cell, name, marked)
+        columns.append(Column(heading, cell, meaning))
     note = (
         "best of its split by this measure, and all without a significant difference "
         f"from it (permutation test by map, Holm, p ≥ {ALPHA}). Privileged models (†) "
@@ -159,6 +162,11 @@ def comparison_table(
     )
 
 
+def _model_cell(row: Row) -> str:
+    label: str = row["model"]
+    return label + PRIVILEGED_MARK if row["privileged"] else label
+
+
 def _cell(name: str, marked: set[tuple[str, str, str]], row: Row) -> str:
     value = row[name]
     if value is None or math.isnan(value):
@@ -170,7 +178,8 @@ def _cell(name: str, marked: set[tuple[str, str, str]], row: Row) -> str:
         size, digits, letter = next(fitting, _UNITS[-1])
         return f"{value / size:.{digits}f}{letter}"
     text = f"{value:.4f}"
-    return Bold(text) if (row["split"], row["model"], name) in marked else text
+    is_marked = (row["split"], row["model"], name) in marked
+    return Bold(text) if is_marked else text
 
 
 def difference_table(comparison: Comparison) -> Table:
@@ -223,12 +232,13 @@ def comparison_json(header: Mapping[str, Any], comparison: Comparison) -> str:
         if split not in splits:
             splits[split] = {"units": units, "models": {}, "pairs": []}
         tally = comparison.tallies[split, model]
-        left_out, by_width, by_error = tally.curves().tolist()
-        curves = {"left_out": left_out, "by_width": by_width, "by_error": by_error}
+        removed, by_width, by_error = tally.curves().tolist()
+        curves = {"left_out": removed, "by_width": by_width, "by_error": by_error}
         result = {**row, "pit": list(tally.pit), "sparsification": curves}
         splits[split]["models"][model] = result
     for row in comparison.pairs.to_dict("records"):
-        splits[row.pop("split")]["pairs"].append(row)
+        split = row.pop("split")
+        splits[split]["pairs"].append(row)
     return json_text({**header, "models": comparison.models}, splits)
 
 
@@ -238,6 +248,7 @@ def comparison_csv(comparison: Comparison) -> str:
     columns = ["split", "model", "privileged", "units"]
     for score in COMPARED:
         columns += [score.name, f"{score.name}_low", f"{score.name}_high"]
-    columns += [*COSTS, *(score.name for score in TAIL_RATES)]
+    columns += COSTS
+    columns += [score.name for score in TAIL_RATES]
     available = [name for name in columns if name in numbers]
     return numbers.to_csv(columns=available, index=False, float_format="%.6g")
