@@ -137,7 +137,7 @@ class Picture:
         # In the image, ahead is up, and the robot's left is left.
         image = image.transpose(1, 0, 2)[:, ::-1]
         maps.show_map(panel, image, (cells, cells))
-        ahead = maps.robot_marker(np.pi / 2)
+        ahead = drives.robot_marker(np.pi / 2)
         robot = (cells / 2, scene.behind * cells)
         drives.mark(panel, "robot", robot, _MARKS, marker=ahead)
         panel.set_title(title, fontsize=_TEXT, loc="left", pad=4)
