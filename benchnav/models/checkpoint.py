@@ -108,12 +108,12 @@ class Checkpoint:
         parts: its parts by name; `gp`, `classifier`, `classifier-2`, … of a fused model.
         model: registered name of the family that rebuilds the model; for a custom class
             from a file or module, its class name.
-        pool_temperature: of the average of several members (see
+        pool_temperature: temperature of the average of several members (see
             `models.nets.calibration`); 1 changes nothing.
         code: digest of the code of a custom class; empty for models of this package.
         conformal: a `models.conformal.ConformalTable` as plain data, which recalibrates
-            the model; empty if there is none.
-        ground: statistics of the most recent training maps; None without training maps.
+            the model; empty without one.
+        ground: statistics of the latest training maps; None without training maps.
     """
 
     __repr__ = short_repr
