@@ -88,8 +88,8 @@ def test_its_parts_are_driven_with_by_name(
     capsys.readouterr()
     assert not call("eval", "list", "planner", "model")
     said = capsys.readouterr().out
-    assert "\nplanner rays: Turns to the ray" in said
-    assert "\nmodel slope: λ falls with slope" in said
+    assert "\nplanner rays: Planner that turns to the ray" in said
+    assert "\nmodel slope: Model in which λ falls" in said
 
 
 def test_its_own_tests_pass_where_it_is_installed(site: Path, tmp_path: Path) -> None:

@@ -11,8 +11,8 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack, contextmanager
-from functools import cache
+from contextlib import ExitStack, chdir, contextmanager
+from functools import cache, partial
 from itertools import islice
 from multiprocessing import resource_tracker
 from queue import Empty, SimpleQueue
@@ -38,8 +38,8 @@ def run_calls(
     """Run calls in parallel and yield their results in order of completion.
 
     The first error ends the iteration. Worker processes remain for some minutes, so
-    that later calls start quickly. Calls must therefore contain all state of this
-    process that they need, such as its working directory.
+    that later calls start quickly. Those of this machine run a call in the current
+    working directory; calls contain all other state of this process that they need.
 
     Args:
         calls: functions without arguments, such as `functools.partial`; sent to other
@@ -93,7 +93,7 @@ def _run_in_processes(
         "ignore", message="A worker stopped while some jobs were given"
     )
     # `concurrent.futures.wait` would leave a future locked after an interruption.
-    remaining = iter(calls)
+    remaining = (partial(_call_in, os.getcwd(), call) for call in calls)
     pending = set[Future[Result]]()
     done = SimpleQueue[Future[Result]]()
     try:
@@ -118,6 +118,12 @@ def _run_in_processes(
             for process in list(executor._processes.values()):
                 kill_process_tree(process)
             executor.shutdown()
+
+
+def _call_in(folder: str, call: Callable[[], Result]) -> Result:
+    """Return the result of a call in a working directory."""
+    with chdir(folder):
+        return call()
 
 
 def _wait_for_one(executor: Any, done: SimpleQueue[Future[Result]]) -> Future[Result]:

@@ -69,6 +69,15 @@ def test_calls_give_the_same_here_and_in_processes() -> None:
     assert list(run_calls([], jobs=2)) == []
 
 
+def test_workers_that_remain_follow_the_working_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = [os.getcwd] * 2
+    assert set(run_calls(calls, jobs=2)) == {os.getcwd()}
+    monkeypatch.chdir(tmp_path)
+    assert set(run_calls(calls, jobs=2)) == {str(tmp_path)}
+
+
 def test_the_error_of_a_call_is_raised_and_ends_the_others(tmp_path: Path) -> None:
     def write(number: int) -> None:
         if number == 0:

@@ -7,7 +7,6 @@ number of workers, the order of units, or interruptions.
 
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
-from contextlib import chdir
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -127,8 +126,7 @@ def run_work(
     missing = _missing(named, origins, folder, work.reuse_code, say, is_here)
     if not shard_units:
         say(f"shard {work.shard} holds none of the {len(all_units)} units")
-    # Workers may have started in another folder, so they receive the working folder.
-    run: Any = partial(_run_in, Path.cwd(), folder.resolve())
+    run: Any = partial(_run_into, folder.resolve())
     if scheduler:
         run = partial(run_on_worker, Path.cwd())
     calls: list[Any] = []
@@ -245,12 +243,11 @@ class _Steps:
         )
 
 
-def _run_in(
-    working_folder: Path, folder: Path, unit: Unit, origin: Origin, settings: Settings
+def _run_into(
+    folder: Path, unit: Unit, origin: Origin, settings: Settings
 ) -> tuple[Unit, dict[str, bytes]]:
     """Run a unit in a process of this machine, which writes the files itself."""
-    with chdir(working_folder):
-        run_unit(unit, folder, origin, settings)
+    run_unit(unit, folder, origin, settings)
     return unit, {}
 
 

@@ -159,8 +159,8 @@ class World:
                 `MAX_STEPS`.
         """
         steps = (budget_s / dt_s).round()
-        has_step = steps >= 1  # false for NaN
-        if not bool(has_step.all()):
+        is_too_short = ~(steps >= 1)  # true for NaN
+        if bool(is_too_short.any()):
             raise ConfigError(
                 f"Expected a time budget of at least one time step of {dt_s:g} s, got "
                 f"{float(budget_s.min()):g} s."

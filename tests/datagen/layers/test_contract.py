@@ -320,7 +320,7 @@ def test_an_import_draws_no_layer_that_changes_lambda(tmp_path: Path) -> None:
     recipe = replace(small_stakes(), layers=(Plain(),))
     with pytest.raises(
         ConfigError,
-        match="`layers` leave λ as it is, since an import draws none, got plain",
+        match="`layers` do not change λ, since an import draws no layers, got plain",
     ):
         next(import_dem("none.tif", tmp_path / "d.h5", recipe))
 

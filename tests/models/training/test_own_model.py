@@ -448,7 +448,7 @@ def test_a_class_that_keeps_the_contract_passes_and_one_that_does_not_is_told(
             return lambda outputs, observed: (outputs[:, 0] - observed).square().mean()
 
     with pytest.raises(
-        ConfigError, match="finite loss where λ is not observed in part"
+        ConfigError, match="finite loss if λ of some cells is unobserved"
     ):
         check_model(Deaf)
 
@@ -463,7 +463,9 @@ def test_a_class_that_keeps_the_contract_passes_and_one_that_does_not_is_told(
         def to_distribution(self, outputs):  # type: ignore[no-untyped-def]
             return super().to_distribution(outputs + self.shift[0])
 
-    with pytest.raises(ConfigError, match="same prediction from settings and tensors"):
+    with pytest.raises(
+        ConfigError, match="same prediction from the settings and tensors"
+    ):
         check_model(Forgetful)
 
 
