@@ -41,7 +41,7 @@ test: $(STAMP)
 # A page that is not well-formed, or a link that leads nowhere, fails the build.
 docs: $(STAMP)
 	$(INSTALL) docs
-	$(BIN)/python tools/reference.py docs/reference/commands
+	$(BIN)/python tools/reference.py commands docs/reference/commands
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build
 
 # Every block of every page and every cell of every notebook, on so many maps where these have many.

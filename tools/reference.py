@@ -1,13 +1,17 @@
-"""Write the reference pages of the three commands and of the metrics.
+"""Write the reference pages of commands, metrics and public names.
 
-    python tools/reference.py docs/reference/commands
+    python tools/reference.py commands docs/reference/commands
+    python tools/reference.py names docs/reference/api
 
 Each command has a page, each subcommand a section, and each option a row, with the
-contents of `--help`. The page of metrics has a row per metric, from its object.
+contents of `--help`. The page of metrics has a row per metric, from its object. Each
+package with public names has a page with a row per name, from its docstring; the site
+adds parameters, returned values and errors there.
 """
 
 import inspect
 import sys
+from enum import Enum
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -33,6 +37,35 @@ PROGRAMS = {
     "train": "benchnav.models.cli",
     "eval": "benchnav.eval.cli",
 }
+
+# Packages with public names, and those that a page has in addition.
+PACKAGES = (
+    "benchnav",
+    *(
+        f"benchnav.{name}"
+        for name in (
+            "datagen",
+            "models",
+            "planning",
+            "env",
+            "metrics",
+            "eval",
+            "viz",
+            "testing",
+        )
+    ),
+)
+EXTRA = {"benchnav.viz": ("benchnav.eval.figures",)}
+MAX_PARAMETERS = 5
+IMPORTED = (
+    "Import the names of this table from `{}`. The site, which `make docs` builds, adds "
+    "parameters with units and shapes, returned values and errors."
+)
+DETAILS = """::: {}
+    options:
+      show_root_heading: false
+      show_root_toc_entry: false
+"""
 
 
 def documented(target: Any) -> dict[str, str]:
@@ -151,10 +184,49 @@ def metrics_page() -> str:
     return "\n".join(["# Metrics of episodes", "", introduction, "", *parts])
 
 
-def main() -> None:
-    """Write the pages."""
-    folder = Path(sys.argv[1])
-    folder.mkdir(parents=True, exist_ok=True)
+def call_of(name: str, target: Any) -> str:
+    """Return a name with its parameters, or only the name if it takes none."""
+    no_call = inspect.isabstract(target) or is_derived(target, (BaseException, Enum))
+    if no_call or not callable(target):
+        return name
+    parameters = list(inspect.signature(target).parameters)
+    if parameters == ["args", "kwargs"]:
+        return name
+    shown = parameters[:MAX_PARAMETERS]
+    if len(parameters) > MAX_PARAMETERS:
+        shown.append("…")
+    return f"{name}({', '.join(shown)})"
+
+
+def is_derived(target: Any, bases: tuple[type, ...]) -> bool:
+    """Return whether a target is a class derived from one of some bases."""
+    return isinstance(target, type) and issubclass(target, bases)
+
+
+def names_page(package: str) -> str:
+    """Return the page of a package's public names."""
+    parts = [f"# {package}"]
+    for section_package in (package, *EXTRA.get(package, ())):
+        module = import_module(section_package)
+        introduction = (inspect.getdoc(module) or "").partition("\n\n")[0]
+        rows = []
+        for name in module.__all__:
+            target = getattr(module, name)
+            summary = (inspect.getdoc(target) or "").partition("\n\n")[0]
+            meaning = " ".join(summary.split()).removesuffix(".")
+            rows.append(line(f"`{call_of(name, target)}`", meaning))
+        if len(parts) > 1:
+            parts.append(f"## {section_package}")
+        parts += [
+            f"{' '.join(introduction.split())} {IMPORTED.format(section_package)}",
+            "\n".join([line("name", "meaning"), "|---|---|", *rows]),
+            DETAILS.format(section_package),
+        ]
+    return "\n\n".join(parts)
+
+
+def write_commands(folder: Path) -> None:
+    """Write the pages of commands and metrics."""
     for name, module in PROGRAMS.items():
         program = f"benchnav-{name}"
         commands: dict[str, Command] = import_module(module).COMMANDS
@@ -164,6 +236,21 @@ def main() -> None:
         ]
         write_text(folder / f"{name}.md", f"# {program}\n\n" + "\n".join(sections))
     write_text(folder / "metrics.md", metrics_page())
+
+
+def write_names(folder: Path) -> None:
+    """Write the pages of public names."""
+    for package in PACKAGES:
+        page = package.rpartition(".")[2]
+        write_text(folder / f"{page}.md", names_page(package))
+
+
+def main() -> None:
+    """Write the pages of a kind."""
+    kind, path = sys.argv[1:]
+    folder = Path(path)
+    folder.mkdir(parents=True, exist_ok=True)
+    {"commands": write_commands, "names": write_names}[kind](folder)
 
 
 if __name__ == "__main__":

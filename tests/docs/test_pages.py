@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 from tests.docs.pages import DOCS, ROOT, blocks, name, pages
+from tools.reference import PACKAGES, names_page
 
 MOST_WORDS = 1500
 LONG = ("docs/studies/", "docs/reference/")
@@ -43,6 +44,14 @@ def test_the_site_shows_every_page() -> None:
     assert {page.relative_to(DOCS).as_posix() for page in pages()[1:]} == {
         page for page in shown if not page.startswith("reference/commands/")
     }
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_pages_of_public_names_follow_the_docstrings(package: str) -> None:
+    page = DOCS / "reference" / "api" / f"{package.rpartition('.')[2]}.md"
+    assert page.read_text() == names_page(package), (
+        "run: python tools/reference.py names docs/reference/api"
+    )
 
 
 @pytest.mark.parametrize("page", [*pages(), ROOT / "CONTRIBUTING.md"], ids=name)
