@@ -1,7 +1,7 @@
 """BenchNav: benchmarks for off-road robot navigation under uncertain traversability.
 
 Importing the package registers the Gymnasium environments `benchnav/OffRoad-v0` and
-`-v1`, and loads no PyTorch.
+`benchnav/OffRoad-v1`, and does not import PyTorch.
 """
 
 import gymnasium
@@ -34,7 +34,7 @@ __getattr__, __dir__, __all__ = face(
 
 __version__ = "2.0.0.dev0"
 
-# Gymnasium takes 0.05 s beside NumPy and loads no PyTorch.
+# The import of Gymnasium takes 0.05 s after that of NumPy, and does not import PyTorch.
 gymnasium.register(
     id="benchnav/OffRoad-v0",
     entry_point="benchnav.env.environment:OffRoadEnv",

@@ -42,7 +42,9 @@ def table(
     headings: Sequence[str], rows: Sequence[Sequence[str]], labels: int = 1
 ) -> Table:
     """Return a table whose first `labels` columns are labels."""
-    return Table(headings=tuple(headings), rows=tuple(map(tuple, rows)), labels=labels)
+    return Table(
+        headings=tuple(headings), rows=tuple(map(tuple, rows)), n_labels=labels
+    )
 
 
 def success(row: Mapping[Any, Any]) -> str:

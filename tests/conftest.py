@@ -16,8 +16,8 @@ _THRESHOLD = gc.get_threshold()
 gc.set_threshold(1_000_000)
 torch.set_num_threads(1)
 # To embed a font as publishers ask takes half a second a file.
-_SAVED = figures._SAVED.copy()
-figures._SAVED["pdf.fonttype"] = 3
+_SAVED = figures._SAVE_STYLE.copy()
+figures._SAVE_STYLE["pdf.fonttype"] = 3
 
 
 def pytest_collection_finish() -> None:

@@ -1,4 +1,4 @@
-"""Annotated types: their members, and their names in messages."""
+"""Types in annotations: members of unions, and names of types in messages."""
 
 from dataclasses import is_dataclass
 from types import NoneType, UnionType
@@ -15,7 +15,7 @@ _WORDS = {
 
 
 def dataclass_in(kind: Any) -> Any:
-    """Return the dataclass among the members of a type, as in `Config | None`, or None."""
+    """Return the dataclass in a type such as `Config | None`; None if it has none."""
     for member in members_of(kind):
         if isinstance(member, type) and is_dataclass(member):
             return member

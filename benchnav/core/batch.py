@@ -1,6 +1,7 @@
 """Batches: frozen dataclasses of tensors whose first dimension indexes the elements.
 
-Elements are episodes or maps. Letters in shapes: B elements; M selected elements.
+Elements are episodes or maps. Letters in shapes: B elements of a batch; M selected
+elements.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -19,7 +20,7 @@ class Batch:
     """Base class of dataclasses whose tensors and nested batches have B elements."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Set the short representation, which the dataclass decorator keeps."""
+        """Set `__repr__` to a short one, which the dataclass decorator keeps."""
         super().__init_subclass__(**kwargs)
         cls.__repr__ = short_repr  # type: ignore[method-assign]
 
@@ -34,7 +35,7 @@ class Batch:
             return values[members]
 
         def select_nested(batch: Any) -> Any:
-            return batch.select(members)  # which a nested batch may override
+            return batch.select(members)  # a nested batch may override this method
 
         return _mapped(self, rows_of, select_nested, ())
 
@@ -52,24 +53,25 @@ class Batch:
         return map_tensors(self, put_rows, others)
 
     def clone(self) -> Self:
-        """Return a copy that shares no tensor."""
+        """Return a copy of the batch with copies of all tensors."""
         return map_tensors(self, torch.clone)
 
     def to(self, device: torch.device | str) -> Self:
-        """Return the batch on a device."""
+        """Return the batch with all tensors on a device."""
         return map_tensors(self, lambda values: values.to(device))
 
 
 def map_tensors(value: Value, change: Callable[..., Tensor], *others: Value) -> Value:
     """Apply a function to each tensor of a dataclass.
 
-    This includes nested batches, tuples of batches and mappings. Other fields are
-    unchanged.
+    It is also applied to tensors in nested batches, tuples of batches and mappings.
+    Other fields are unchanged.
 
     Args:
         value: the dataclass.
-        change: function of a tensor and of the corresponding tensors of `others`.
-        others: dataclasses of the same type.
+        change: function of a tensor and of the corresponding tensors of `others`; it
+            returns the new tensor.
+        others: dataclasses of the same type as `value`.
     """
 
     def map_nested(batch: Any, *other_batches: Any) -> Any:
@@ -98,7 +100,7 @@ def _changed(
     change: Callable[..., Tensor],
     change_nested: Callable[..., Any],
 ) -> Any:
-    """Return the new value of a field; `values` has that of each dataclass."""
+    """Return the new value of a field from its values in all dataclasses."""
     first = values[0]
     if isinstance(first, Tensor):
         return change(*values)
@@ -116,15 +118,15 @@ def _changed(
 
 
 def put_if_alike(value: Value, members: Tensor, others: Value) -> Value:
-    """Replace selected elements by those of another batch of the same type and shapes.
+    """Replace selected elements of a batch by the same elements of another batch.
 
     Args:
         value: batch of B elements.
-        members: indices of the elements, int64, shape [M].
-        others: batch of B elements.
+        members: indices of the elements to replace, int64, shape [M].
+        others: batch of B elements that contains the new ones.
 
     Returns:
-        A new batch; `others` if its type or shapes differ.
+        A new batch. If `others` has a different type or different shapes, `others`.
     """
     shapes = [tensor.shape for tensor in tensors_of(value)]
     other_shapes = [tensor.shape for tensor in tensors_of(others)]
@@ -134,7 +136,7 @@ def put_if_alike(value: Value, members: Tensor, others: Value) -> Value:
 
 
 def have_same_structure(first: Any, second: Any) -> bool:
-    """Return whether two values are equal except for the numbers in tensors."""
+    """Return whether two values differ at most in the numbers of their tensors."""
     if isinstance(first, Tensor) and isinstance(second, Tensor):
         return first.shape == second.shape
     if isinstance(first, tuple) and isinstance(second, tuple):
@@ -178,7 +180,7 @@ def find_tensor_fault(
     shape: tuple[int, ...],
     device: torch.device,
 ) -> str:
-    """Return a message if a value is not the expected tensor, or empty text.
+    """Return a message if a value is not a tensor as expected; otherwise empty text.
 
     Args:
         what: name of the value in the message.

@@ -1,6 +1,6 @@
 """A choice between two distributions in each cell of a map.
 
-For example, the prediction in observed cells and a prior elsewhere.
+For example, observed cells have the predicted distribution, all other cells a prior.
 Letters in shapes: H×W cells; K components; *B any leading dimensions.
 """
 
@@ -12,17 +12,17 @@ from torch import Tensor
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.mixture import TraversabilityMixture
 
-NO_CLASS = -1  # group of components without a class
+NO_CLASS = -1  # class index of components without a class
 
 
 @dataclass(frozen=True)
 class ChosenDistribution(TraversabilityDistribution):
-    """The first distribution in chosen cells, the second in all others.
+    """The first distribution in chosen cells, the second in all other cells.
 
     Args:
         first: distribution of shape [*B, H, W]; results have its dtype.
         second: distribution of shape [*B, H, W].
-        chosen: mask of the cells of the first, bool, shape [*B, H, W].
+        chosen: mask of the cells with the first distribution, bool, shape [*B, H, W].
     """
 
     first: TraversabilityDistribution
@@ -49,7 +49,7 @@ class ChosenDistribution(TraversabilityDistribution):
 
     @property
     def searched(self) -> bool:
-        """Whether both distributions search for quantiles."""
+        """Whether both distributions find their quantiles by a slow search."""
         return self.first.searched and self.second.searched
 
     def quantile(self, probability: Tensor | float) -> Tensor:
@@ -103,28 +103,28 @@ def choose(
     first: TraversabilityDistribution,
     second: TraversabilityDistribution,
 ) -> TraversabilityDistribution:
-    """Return the first distribution in chosen cells, the second in all others.
+    """Return the first distribution in chosen cells, the second in all other cells.
 
     Args:
-        chosen: mask of the cells of the first, bool, shape [*B, H, W].
+        chosen: mask of the cells with the first distribution, bool, shape [*B, H, W].
         first: distribution of shape [*B, H, W].
         second: distribution of shape [*B, H, W].
 
     Returns:
-        A mixture if both are mixtures, in which components of the second have no class;
-        otherwise a `ChosenDistribution`.
+        If both are mixtures, a mixture in which components of the second have no class.
+        Otherwise a `ChosenDistribution`.
     """
     if not isinstance(first, TraversabilityMixture):
         return ChosenDistribution(first, second, chosen)
     if not isinstance(second, TraversabilityMixture):
         return ChosenDistribution(first, second, chosen)
-    like = first.weights
     is_first = chosen.unsqueeze(-3)
-    first_weights = torch.where(is_first, like, 0.0).to(like)
-    second_weights = torch.where(~is_first, second.weights, 0.0).to(like)
+    dtype_source = first.weights
+    first_weights = torch.where(is_first, first.weights, 0.0).to(dtype_source)
+    second_weights = torch.where(~is_first, second.weights, 0.0).to(dtype_source)
     weights = torch.cat([first_weights, second_weights], -3)
-    means = _joined(first.means, second.means, like)
-    stds = _joined(first.stds, second.stds, like)
+    means = _concatenated(first.means, second.means, dtype_source)
+    stds = _concatenated(first.stds, second.stds, dtype_source)
     group = None
     if first.group is not None:
         n_second = second.weights.shape[-3]
@@ -132,6 +132,6 @@ def choose(
     return TraversabilityMixture(weights, means, stds, group)
 
 
-def _joined(first: Tensor, second: Tensor, like: Tensor) -> Tensor:
-    """Return the components of both mixtures, with the dtype and device of `like`."""
+def _concatenated(first: Tensor, second: Tensor, like: Tensor) -> Tensor:
+    """Return a parameter of both mixtures, with the dtype and device of `like`."""
     return torch.cat([first.to(like), second.to(like)], -3)

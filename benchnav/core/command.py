@@ -1,11 +1,12 @@
 """Command lines: parsing of arguments, help and error reports of all three commands.
 
-Command lines and YAML files are merged into one plain mapping.
+The arguments of a command line and of YAML files are merged into one plain mapping.
 `benchnav.core.settings` converts its values to the types of the function's parameters;
 jsonargparse prints the help. `--contact-sheet` means `--contact_sheet true`, and
-`--maps 3` means `--maps [3]`. A flag whose value is a name or a mapping accepts both:
-`--world paper --world.noise stored`. Bad input ends in one line on standard error and
-exit status 2, an interruption in status 130. `benchnav.core.failures` words the errors.
+`--maps 3` means `--maps [3]`. A flag whose value is a name or a mapping accepts both in
+one command: `--world paper --world.noise stored`. Invalid input ends the command with
+one line on standard error and exit status 2, an interruption with status 130.
+`benchnav.core.failures` formulates the error messages.
 """
 
 import inspect
@@ -46,14 +47,14 @@ from benchnav.core.settings import (
 from benchnav.core.store import check_output
 from benchnav.core.yaml_text import load_yaml, read_yaml
 
-INTERRUPTED = 130
+INTERRUPTED = 130  # exit status
 
-# Options of all commands that name an output.
+# Options whose value is the path of an output, over all commands.
 OUTPUTS = ("out", "json", "onnx", "video")
 
 _SWITCH_VALUES = ("true", "false", "yes", "no")
 
-# A flag's option followed by keys within its value, and the text of the value.
+# Option of a flag followed by keys within the option's value; text of the value.
 _Flag = tuple[list[str], str]
 
 # Type of the flag --device; see `benchnav.core.device`.
@@ -65,15 +66,16 @@ class Command:
     """A subcommand.
 
     Args:
-        function: its type hints and docstring become flags and help. Each field of a
-            dataclass without a default becomes a flag. It returns the exit status, or
-            None for success.
-        positionals: names of its positional parameters; one that is a list takes all
-            remaining arguments.
-        repeated: names of lists whose flag appends to the list when repeated; any other
+        function: function that runs the subcommand. Its type hints become flags, and
+            its docstring becomes the help. If a parameter without a default is a
+            dataclass, each field becomes a flag. The function returns the exit status,
+            or None for success.
+        positionals: names of the function's positional parameters; a parameter that is
+            a list takes all remaining arguments.
+        repeated: names of lists to which a repeated flag appends. Any other repeated
             flag replaces the earlier value.
-        configs: folder of shipped YAML files, which `--config NAME` finds if no such
-            file exists.
+        configs: folder of shipped YAML files. `--config NAME` means the shipped file of
+            this name, unless the path NAME exists.
     """
 
     function: Callable[..., int | None]
@@ -83,7 +85,7 @@ class Command:
 
     @cached_property
     def settings(self) -> dict[str, type]:
-        """Dataclasses whose fields are flags, by the function's parameter."""
+        """Dataclasses whose fields are flags, by name of the function's parameter."""
         kinds = {
             name: dataclass_in(option.kind)
             for name, option in list_options(self.function).items()
@@ -93,7 +95,7 @@ class Command:
 
     @cached_property
     def options(self) -> dict[str, Option]:
-        """Options by name, positional ones included."""
+        """Options by name, including positional arguments."""
         options: dict[str, Option] = {}
         for name, option in list_options(self.function).items():
             if name in self.settings:
@@ -104,7 +106,7 @@ class Command:
 
     @cached_property
     def flags(self) -> dict[str, Any]:
-        """Types by flag, with one dot for each level of nested dataclasses."""
+        """Types by name of the flag; a dot separates levels of nested dataclasses."""
         kinds = {
             name: option.kind
             for name, option in self.options.items()
@@ -137,19 +139,19 @@ def run(
     commands: dict[str, Command],
     argv: Sequence[str] | None = None,
 ) -> int:
-    """Run the subcommand that a command line names, or print the help without one.
+    """Run the subcommand that a command line names; without arguments, print the help.
 
     Args:
         program: name of the command.
         description: one line for `--help`.
         commands: subcommands by name.
-        argv: arguments; None for those of the process.
+        argv: arguments; if None, the arguments of the process.
 
     Returns:
-        Exit status: 0 for success, 1 if the command or its error sets it, 2 for bad
-            input, 130 when interrupted.
+        Exit status: 0 for success, 1 if the command or its error sets it, 2 for invalid
+            input, 130 if interrupted.
     """
-    # Warnings to developers of libraries would hide messages to the user.
+    # Warnings that address developers of libraries would hide messages to the user.
     warnings.filterwarnings("ignore", category=FutureWarning, module=r"torch\..*")
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -178,14 +180,14 @@ def run(
         report_failure(program, message)
         return status
     except KeyboardInterrupt as stopped:  # Ctrl-C, or SIGTERM from a scheduler
-        # Commands that save partial results describe them in the interruption's text.
+        # The interruption's text describes the partial results that a command saved.
         parts = [f"{program}: interrupted", *map(str, stopped.args)]
         print("; ".join(parts), file=sys.stderr)
         return INTERRUPTED
 
 
 def _call(program: str, command: Command, words: Sequence[str]) -> int | None:
-    """Call the function of a subcommand, or print its help or settings."""
+    """Call the function of a subcommand, or print the subcommand's help or settings."""
     import yaml
 
     for word in words:
@@ -227,12 +229,12 @@ def _call(program: str, command: Command, words: Sequence[str]) -> int | None:
 
 
 def _shown_name(command: Command, name: str) -> str:
-    """Return an option's name as in the help: `NAME` if positional, else `--name`."""
+    """Return an option's name for messages: `NAME` if positional, else `--name`."""
     return name.upper() if name in command.positionals else f"--{name}"
 
 
 def _check_texts(command: Command, arguments: dict[str, Any]) -> None:
-    """Reject invalid empty texts and output paths; expand `~` in output paths."""
+    """Reject empty texts and invalid output paths, and expand `~` in output paths."""
     for name, value in arguments.items():
         option = command.options[name]
         shown = _shown_name(command, name)
@@ -248,27 +250,28 @@ def _read_arguments(
 ) -> dict[str, Any]:
     """Return arguments by name from flags and positional words.
 
-    YAML files are read first, then flags, then keys within the value of a flag,
-    regardless of their order.
+    Whatever the order on the command line, YAML files are read first, then flags, and
+    then flags for a key within an option's value.
 
     Raises:
         ConfigError: If an argument is unknown or has a different type.
     """
     options = command.options
     arguments: dict[str, Any] = {}
-    for file in [text for path, text in flags if path == ["config"]]:
+    config_files = [text for path, text in flags if path == ["config"]]
+    for file in config_files:
         config = _read_config(command, file)
-        arguments |= read_options(options, config, of(file), now=arguments)
+        arguments |= read_options(options, config, of(file), present=arguments)
     values: dict[str, Any] = {}
     for (name, *keys), text in sorted(flags, key=lambda flag: len(flag[0])):
         if name not in options:
             continue
         option = options[name]
-        now = values.get(name, arguments.get(name, option.default))
+        present = values.get(name, arguments.get(name, option.default))
         if name in values and name in command.repeated:
-            values[name] = _appended(now, text)
+            values[name] = _appended(present, text)
         else:
-            values[name] = _merged(name, option.kind, now, keys, text)
+            values[name] = _merged(name, option.kind, present, keys, text)
     remaining = list(positionals)
     for name in command.positionals:
         if options[name].kind == list[str] and (remaining or name not in arguments):
@@ -278,10 +281,10 @@ def _read_arguments(
             values[name] = remaining.pop(0)
     if remaining:
         raise ConfigError(
-            f"Expected no more arguments, got {' '.join(remaining)!r}. See `{program} "
-            "--help`."
+            f"Expected no further arguments, got {' '.join(remaining)!r}. See "
+            f"`{program} --help`."
         )
-    return arguments | read_options(options, values, "--{}".format, now=arguments)
+    return arguments | read_options(options, values, "--{}".format, present=arguments)
 
 
 def _read_words(
@@ -314,10 +317,10 @@ def _read_words(
 
 
 def _path_of(program: str, command: Command, flag: str) -> list[str]:
-    """Return a flag's option, followed by keys within its value.
+    """Return a flag's option, followed by keys within the option's value.
 
     Raises:
-        ConfigError: If there is no such option.
+        ConfigError: If the command has no such option.
     """
     full_name = flag.removeprefix("--")
     name, *keys = full_name.split(".")
@@ -329,29 +332,28 @@ def _path_of(program: str, command: Command, flag: str) -> list[str]:
         return [name, *keys]  # Keys of a mapping may contain hyphens.
     remedy = hint(full_name, command.flags, "--")
     raise ConfigError(
-        f"Expected flags that `{program}` has, got {flag}.{remedy} See `{program} "
-        "--help`."
+        f"Expected a flag of `{program}`, got {flag}.{remedy} See `{program} --help`."
     )
 
 
-def _merged(name: str, kind: Any, now: Any, keys: Sequence[str], text: str) -> Any:
-    """Return the value of an option after a flag has set it, or a key within it."""
+def _merged(name: str, kind: Any, present: Any, keys: Sequence[str], text: str) -> Any:
+    """Return the value of an option after a flag has set the option or a key in it."""
     value = text
     is_group = dataclass_in(kind) is not None
     is_mapping = text.lstrip().startswith("{") and (is_group or _takes_mapping(kind))
     if (keys and not is_group) or is_mapping:
         value = load_yaml(text)
-    if is_group and not isinstance(now, dict):
-        now = {}  # Fields that are not set keep their values.
+    if is_group and not isinstance(present, dict):
+        present = {}  # `read` keeps the values of fields that are not set
     if not keys:
         return value
-    if isinstance(now, str) and str in members_of(kind):
-        now = {"part" if name in KINDS else "preset": now}
-    return changed(now, keys, value)
+    if isinstance(present, str) and str in members_of(kind):
+        present = {"part" if name in KINDS else "preset": present}
+    return changed(present, keys, value)
 
 
 def _read_config(command: Command, value: str) -> dict[str, Any]:
-    """Read a YAML file of settings, by path or by the name of a shipped file."""
+    """Read a YAML file of settings, given its path or the name of a shipped file."""
     path = Path(os.path.expanduser(value))
     if not path.is_file():
         path = command.shipped.get(value, path)
@@ -367,7 +369,7 @@ def _read_config(command: Command, value: str) -> dict[str, Any]:
     content = read_yaml(path)
     if not isinstance(content, dict | None):
         raise ConfigError(
-            f"Expected {path} to contain settings as `name: value`, got "
+            f"Expected {path} to contain settings as `name: value`, got a value of type "
             f"{type(content).__name__}."
         )
     settings: dict[str, Any] = {}
@@ -375,7 +377,7 @@ def _read_config(command: Command, value: str) -> dict[str, Any]:
         keys = str(key).split(".")
         expect(
             not _is_set(settings, keys),
-            f"each setting of {path} once, got {str(key)!r} twice.",
+            f"each setting once in {path}, got {str(key)!r} twice. Remove one.",
         )
         settings = changed(settings, keys, item)
     return settings

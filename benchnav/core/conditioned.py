@@ -2,9 +2,9 @@
 
 A λ field is a transform of correlated standard normals z, λ = Q(Φ(z)). If the posterior
 of z is N(μ, σ²), λ has the quantile function Q(Φ(μ + σ Φ⁻¹(u))) and the CDF
-Φ((Φ⁻¹(F(x)) − μ) / σ). If the posterior is skewed, as near interval-censored
-observations, σ multiplies a shifted log-normal variable of the same skewness instead of
-a normal variable.
+Φ((Φ⁻¹(F(x)) − μ) / σ). The posterior may be skewed, as it is near interval-censored
+observations. Then σ multiplies a shifted log-normal variable of the same skewness
+instead of a normal variable.
 Letters in shapes: H×W cells; *B any leading dimensions.
 """
 
@@ -19,7 +19,7 @@ from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
 
 _MIN_STD = 1e-9
-MIN_SKEW = 1e-3  # below it, a variable counts as normal
+MIN_SKEW = 1e-3  # a variable of smaller absolute skewness counts as normal
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class ConditionedDistribution(TraversabilityDistribution):
         score_mean: posterior mean μ, shape [*B, H, W].
         score_std: posterior standard deviation σ ≥ 0, shape [*B, H, W]; if it is 0, λ
             is Q(Φ(μ)).
-        score_skew: posterior skewness, shape [*B, H, W]; if None, 0.
+        score_skew: posterior skewness, shape [*B, H, W]; if None, the skewness is 0.
 
     Raises:
         ConfigError: If the shapes differ.
@@ -48,7 +48,7 @@ class ConditionedDistribution(TraversabilityDistribution):
         shapes = (self.score_std.shape, skew.shape, self.base.shape)
         if any(shape != self.score_mean.shape for shape in shapes):
             raise ConfigError(
-                "Expected `score_mean` and `score_std` of the base's shape "
+                "Expected `score_mean` and `score_std` of the shape of `base`, "
                 f"{list(self.base.shape)}, got "
                 f"{list(self.score_mean.shape)} and {list(self.score_std.shape)}."
             )
@@ -77,7 +77,8 @@ class ConditionedDistribution(TraversabilityDistribution):
         value = self.from_normal(score.expand(self.shape))
         if not isinstance(probability, Tensor) and 0 < probability < 1:
             return value
-        # No finite score reaches the ends of the range.
+        # At probability 0 or 1, λ is at an end of its range, for which no score is
+        # finite.
         end_level = (u >= 1).double().expand(self.shape)
         ends = self.base.quantile(end_level).to(self.dtype)
         is_extreme = (u <= 0) | (u >= 1)
@@ -99,14 +100,15 @@ class ConditionedDistribution(TraversabilityDistribution):
     def log_prob(self, value: Tensor) -> Tensor:
         """Return log density on (0, 1) and log mass at 0 and 1, shape [*B, H, W].
 
-        It is NaN where the base has no density.
+        It is NaN where `base` has no density.
         """
         value = value.double()
         std = self.score_std.double().clamp(min=_MIN_STD)
         lower, upper = self._scores(value)
-        base = self.base._exact()
+        base = self.base._in_float64()
         prior = base.to_normal(value)[1]
-        # Change of variables from the prior score, with the prior's density.
+        # The density of λ follows from that of `base` by a change of the score from the
+        # prior's to the posterior's.
         log_ratio = (prior.square() - upper.square()) / 2
         inside = base.log_prob(value).double() + log_ratio - std.log()
         if self.score_skew is not None:
@@ -121,7 +123,7 @@ class ConditionedDistribution(TraversabilityDistribution):
 
     def _scores(self, value: Tensor | float) -> tuple[Tensor, Tensor]:
         """Return Φ⁻¹ of P(λ < value) and of P(λ ≤ value), float64."""
-        lower, upper = self.base._exact().to_normal(value)
+        lower, upper = self.base._in_float64().to_normal(value)
         mean = self.score_mean.double()
         std = self.score_std.double().clamp(min=_MIN_STD)
         lower = (lower - mean) / std
@@ -136,7 +138,7 @@ def skewed(normal: Tensor, skew: Tensor) -> Tensor:
 
     Args:
         normal: values of any shape.
-        skew: skewness of the result, of a shape that broadcasts.
+        skew: skewness of the result, of a shape that broadcasts to that of `normal`.
 
     Returns:
         Values of mean 0 and variance 1, float64.
@@ -148,7 +150,7 @@ def skewed(normal: Tensor, skew: Tensor) -> Tensor:
 
 
 def unskewed(value: Tensor, skew: Tensor) -> Tensor:
-    """Return the inverse of `skewed`; infinite beyond its range."""
+    """Return the inverse of `skewed`; infinite for values outside its range."""
     sign, mean, std, sigma = _log_normal(skew)
     log_normal = (mean + sign * value * std).clamp(min=0)
     normal = sign * log_normal.log() / sigma
@@ -156,7 +158,7 @@ def unskewed(value: Tensor, skew: Tensor) -> Tensor:
 
 
 def _slope(normal: Tensor, skew: Tensor) -> Tensor:
-    """Return the derivative of `skewed`."""
+    """Return the derivative of `skewed` with respect to `normal`."""
     sign, _, std, sigma = _log_normal(skew)
     log_normal = (sign * sigma * normal).exp()
     slope = sigma * log_normal / std
@@ -164,9 +166,9 @@ def _slope(normal: Tensor, skew: Tensor) -> Tensor:
 
 
 def _log_normal(skew: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return sign, mean, standard deviation and σ of exp(σ z) with a given skewness.
+    """Return the sign of a skewness, and mean, standard deviation and σ of exp(σ z).
 
-    The sign is that of the skewness; exp(σ z) has the absolute value.
+    The skewness of exp(σ z) is the absolute value of the given one.
     """
     abs_skew = skew.double().abs().clamp(min=MIN_SKEW)
     # Solve skew² = (w + 2)² (w − 1) for w = exp(σ²).
@@ -191,8 +193,8 @@ def conditioned(
         std: posterior standard deviation σ ≥ 0 of the score, shape [*B, H, W].
 
     Returns:
-        The exact mixture clip(m + s (μ + σ z)) if the base is a mixture of a single
-        component, else a `ConditionedDistribution`.
+        The exact mixture clip(m + s (μ + σ z)) if `base` is a mixture of a single
+        component N(m, s²), else a `ConditionedDistribution`.
     """
     if not isinstance(base, TraversabilityMixture) or base.weights.shape[-3] > 1:
         return ConditionedDistribution(base, mean, std)

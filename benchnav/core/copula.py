@@ -1,14 +1,14 @@
 """Fields of spatially correlated standard normal scores.
 
-A field is white noise convolved with a kernel ∝ exp(−d²/ℓ²), whose autocorrelation is
-exp(−d²/2ℓ²), and divided by the kernel's norm, so that each cell is standard normal. It
-is computed on a torus of twice the extent and cropped. Fields of different ℓ or kernel
-filter the same white noise. The quantile function of each cell transforms its score to
-λ, so that marginals are exact: a Gaussian copula (Nelsen 2006, "An introduction to
-copulas").
+A field is white noise that is convolved with a kernel ∝ exp(−d²/ℓ²), whose
+autocorrelation is exp(−d²/2ℓ²), and divided by the kernel's norm. Each cell is thus
+standard normal. The field is computed on a torus of twice the map's extent and cropped.
+Fields with a different ℓ or kernel are filtered from the same white noise. The quantile
+function of each cell transforms its score to λ, so that marginals are exact: a Gaussian
+copula (Nelsen 2006, "An introduction to copulas").
 
-Computations are in float64 with NumPy, batched, and the same on every machine. Letters
-in shapes: B fields; H×W cells.
+Computations are batched in float64 with NumPy. Results are the same on every machine.
+Letters in shapes: B fields; H×W cells.
 """
 
 import numpy as np
@@ -17,8 +17,8 @@ from numpy import ndarray
 from benchnav.core import rng
 
 KERNELS = ("gaussian", "matern32")
-# Maximum ℓ relative to a map's shorter side, so that the period of the torus is not
-# visible.
+# Maximum ℓ as a fraction of a map's shorter side. With a longer ℓ, opposite borders of
+# a map would be visibly correlated, because of the torus.
 LONGEST_CORRELATION = 1 / 4
 _MATERN32 = 1.3576766739458990  # solves (1 + a) exp(−a) = exp(−1/2)
 
@@ -33,8 +33,8 @@ def correlated_normal(
     """Draw fields of correlated standard normals.
 
     Args:
-        key: stream key.
-        indices: indices of the stream's elements, shape [B].
+        key: key of a random stream; see `rng.stream_key`.
+        indices: index of each field in the stream, integers ≥ 0, shape [B].
         shape: (H, W).
         correlation_cells: correlation length ℓ in cells, at most `LONGEST_CORRELATION`
             times the map's shorter side. Cells at distance d have the correlation
@@ -65,11 +65,11 @@ def correlated_normal(
 
 
 def correlations(size: int, correlation_cells: float) -> ndarray:
-    """Return the correlations along one axis of `correlated_normal`, Gaussian kernel.
+    """Return the correlations of `correlated_normal` along one axis.
 
-    The correlation of two cells is the product over both axes. For ℓ ≥ 2 cells it is
-    exp(−d²/2ℓ²) within 10⁻³. For smaller ℓ it is the autocorrelation of the discrete
-    kernel.
+    The kernel is the Gaussian one. The correlation of two cells is the product of those
+    along both axes. For ℓ ≥ 2 cells it is exp(−d²/2ℓ²) within 10⁻³. For smaller ℓ it is
+    the autocorrelation of the discrete kernel.
 
     Args:
         size: number of cells along the axis.
@@ -87,7 +87,10 @@ def correlations(size: int, correlation_cells: float) -> ndarray:
 
 
 def _matern32(height: int, width: int, correlation_cells: float) -> ndarray:
-    """Return the transfer function: the square root of the correlation's spectrum."""
+    """Return the transfer function: the square root of the correlation's spectrum.
+
+    Its shape is that of `np.fft.rfft2` of a torus of the given height and width.
+    """
     distances = np.hypot(_ring(height)[:, None], _ring(width))
     scaled = _MATERN32 * distances / correlation_cells
     correlation = (1 + scaled) * np.exp(-scaled)

@@ -2,9 +2,9 @@
 
 An object that a user creates in a program, such as `CVaR(0.8)` or
 `MPPI(MPPIConfig(samples=200))`, is described by the name, module or file of its class
-and the arguments of its constructor. Other objects (a function without a name, a class
-of a notebook, an object that was modified after its creation) have a name in this
-process only.
+and the arguments of its constructor. Other objects are registered by a name in this
+process only: functions without a name, classes of a notebook, and objects that were
+modified after their creation.
 """
 
 import inspect
@@ -27,12 +27,12 @@ def describe(kind: str, instance: Any) -> Part:
 
     Args:
         kind: one of `registry.KINDS`.
-        instance: an object of that kind; its class, if all options have defaults; or an
-            argument of `registry.read_part`.
+        instance: an object of that kind; its class, if all options have defaults; or a
+            text or mapping that `registry.read_part` reads.
 
     Returns:
-        The part that creates the object again. If no part does, a part by a name in
-        this process only, see `registry.is_object`.
+        The part that creates the object again. If no part can, a part that names the
+        object in this process only; see `registry.is_object`.
 
     Raises:
         ConfigError: If the object is not of that kind.
@@ -52,13 +52,16 @@ def describe(kind: str, instance: Any) -> Part:
 
 
 def name_object(kind: str, instance: Any) -> Part:
-    """Return a part by a name of the object in this process only."""
+    """Register an object by a name in this process only, and return its part."""
     name = getattr(instance, "__name__", type(instance).__name__).strip("<>")
     return Part(part=registry.register_object(kind, name, instance), label=name)
 
 
 def _from_arguments(kind: str, instance: Any) -> Part | None:
-    """Describe an object by its class and constructor arguments; None if unknown."""
+    """Describe an object by its class and constructor arguments.
+
+    The result is None if the class or the arguments cannot be described.
+    """
     if inspect.isroutine(instance):
         source = _source_of(kind, instance)
         return None if source is None else Part(part=source, label=_short(source))
@@ -82,7 +85,7 @@ def _from_arguments(kind: str, instance: Any) -> Part | None:
                 if name in option_names
             }
     except (BenchnavError, TypeError):
-        return None  # an argument is an object itself, or a setting has no default
+        return None  # an argument is not plain data, or a setting has no default
     first_option = next(iter(option_names), "")
     label = registry.label_of(_short(source), options, first_option)
     return Part(part=source, label=label, options=options)
@@ -98,7 +101,10 @@ def _changed_settings(config: Any) -> dict[str, Any]:
 
 
 def _source_of(kind: str, target: Any) -> str | None:
-    """Return a name that locates a class or function in other processes, or None."""
+    """Return the name, module or file of a class or function for other processes.
+
+    It is None if other processes cannot find the class or function.
+    """
     module = getattr(target, "__module__", "")
     name = getattr(target, "__qualname__", "")
     if not name or "<" in name or module == "__main__":
@@ -114,7 +120,8 @@ def _source_of(kind: str, target: Any) -> str | None:
         return None
     if "." in module or any(map(file.is_relative_to, installed_folders())):
         return location
-    # A single module is located by its file, in whatever folder a command runs.
+    # A module outside a package is described by its file, which a command finds from
+    # any folder.
     shown = file.relative_to(Path.cwd()) if file.is_relative_to(Path.cwd()) else file
     return f"{shown}:{name}"
 
@@ -142,7 +149,7 @@ def _is_same(kind: str, part: Part, instance: Any) -> bool:
 
 
 def _code_of(target: type) -> list[tuple[str, Any]]:
-    """Return the compiled functions of a class and its bases, which edits change."""
+    """Return the compiled functions of a class and its bases, to detect edits."""
     return [
         (f"{base.__qualname__}.{name}", value.__code__)
         for base in target.__mro__

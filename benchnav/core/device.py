@@ -10,7 +10,7 @@ from benchnav.core.errors import BenchnavError, expect
 
 CPU = torch.device("cpu")
 
-# Exceptions of PyTorch for failures of a GPU, in contrast to those of code.
+# Exceptions that PyTorch raises if a GPU fails.
 GPU_FAULTS = (torch.OutOfMemoryError, torch.AcceleratorError)
 
 
@@ -19,11 +19,11 @@ class DeviceError(BenchnavError):
 
 
 def gpu_failed(error: object) -> DeviceError:
-    """Return an error of one line with PyTorch's message about a failed GPU."""
+    """Return an error that quotes the first line of PyTorch's message."""
     line = str(error).strip().splitlines()[0].rstrip(".")
     return DeviceError(
-        f"The GPU failed: {line}. Finished work is kept: give the same command again, "
-        "if need be with fewer `jobs`."
+        f"The GPU failed: {line}. Finished work is kept. Run the same command again, if "
+        "necessary with fewer `jobs`."
     )
 
 
@@ -31,7 +31,7 @@ def find_device(name: str) -> torch.device:
     """Return a device by name.
 
     Args:
-        name: "cpu", "cuda", or "auto" for CUDA if there is a GPU and else the CPU.
+        name: "cpu", "cuda", or "auto", which is CUDA if there is a GPU and else the CPU.
 
     Raises:
         ConfigError: If the device is not available.
@@ -43,7 +43,7 @@ def find_device(name: str) -> torch.device:
     has_gpu = torch.cuda.is_available()
     expect(
         has_gpu or name != "cuda",
-        "a GPU for `device` cuda, got none that PyTorch can use. Use cpu or auto.",
+        "a GPU that PyTorch can use for `device` cuda, got none. Use cpu or auto.",
     )
     return torch.device("cuda" if has_gpu and name != "cpu" else "cpu")
 
@@ -52,14 +52,15 @@ def device_of_run(run: Mapping[str, Any]) -> torch.device:
     """Return the device that a run was computed on.
 
     Args:
-        run: contents of its `run.json`.
+        run: contents of the run's `run.json`.
 
     Raises:
         ConfigError: If the device is not available.
     """
     expect(
         run["device"] != "cuda" or torch.cuda.is_available(),
-        "a GPU, on which this run was computed, got none that PyTorch can use.",
+        "a GPU that PyTorch can use, since this run was computed on one, got none. Run "
+        "the command on a machine with a GPU.",
     )
     return find_device(run["device"])
 

@@ -1,8 +1,8 @@
 """Base class of distributions of traversability λ in each cell of a map.
 
 λ is in [0, 1]; F(x) = P(λ ≤ x) is its CDF, which jumps where λ has an atom; Q(u) is the
-smallest x with F(x) ≥ u. Risk is the *lower* tail of λ. A subclass defines F and Q, and
-may have other functions in closed form. The base computes them as integrals of F:
+smallest x with F(x) ≥ u. Risk is the *lower* tail of λ. A subclass defines F and Q. The
+base class computes other quantities as integrals of F, unless a subclass overrides them:
 
     E[λ] = 1 − ∫₀¹ F
     CVaR_α = v − 1/p ∫₀^v F  at p = 1 − α and v = Q(p)
@@ -35,10 +35,10 @@ from benchnav.core.batch import (
 from benchnav.core.errors import ConfigError, expect
 from benchnav.core.quadrature import N_INTERVALS, edges_between, integral
 
-_ROUNDS_OF_TIME = 40  # bisections; times span a larger range than λ
-_CELLS_AT_ONCE = 2**13
-_CELLS_ON_A_GPU = 2**18  # on a GPU, few large chunks are faster than many small ones
-MAX_SCORE = 40.0  # standard deviations; beyond, Φ is 0 or 1 in float64
+_ROUNDS_FOR_TIMES = 40  # bisections; times span a larger range than λ
+_CHUNK_CELLS_ON_CPU = 2**13
+_CHUNK_CELLS_ON_GPU = 2**18  # larger, since few large chunks are faster on a GPU
+MAX_SCORE = 40.0  # standard normal score beyond which Φ is 0 or 1 in float64
 
 
 class TraversabilityDistribution(Batch, ABC):
@@ -46,8 +46,8 @@ class TraversabilityDistribution(Batch, ABC):
 
     A subclass is a frozen dataclass whose tensors are maps, of shape [*B, H, W] or
     [*B, K, H, W] for any K, and implements `shape`, `cdf` and `quantile`. The integrals
-    of the base are within 10⁻⁴, that of `expected_time` relative to its value (tested
-    with up to 50 atoms per cell), and have no gradient.
+    of this base class have errors of at most 10⁻⁴, as tested with up to 50 atoms per
+    cell. The error of expected times is relative. The integrals have no gradient.
     """
 
     @property
@@ -89,7 +89,7 @@ class TraversabilityDistribution(Batch, ABC):
 
     @property
     def searched(self) -> bool:
-        """Whether quantiles are found by a slow search, without atoms in (0, 1)."""
+        """Whether `quantile` is a slow search, and λ has no atoms in (0, 1)."""
         return False
 
     def cdf_limits(self, value: Tensor | float) -> tuple[Tensor, Tensor]:
@@ -101,8 +101,8 @@ class TraversabilityDistribution(Batch, ABC):
         Returns:
             Two probabilities, each of shape [*B, H, W].
         """
-        exact = torch.float64 if self.dtype == torch.float64 else torch.float32
-        at = torch.as_tensor(value, dtype=exact, device=self.device)
+        dtype = torch.float64 if self.dtype == torch.float64 else torch.float32
+        at = torch.as_tensor(value, dtype=dtype, device=self.device)
         minus_infinity = torch.full_like(at, -math.inf)
         below = torch.nextafter(at, minus_infinity)
         return self.cdf(below), self.cdf(at)
@@ -123,7 +123,7 @@ class TraversabilityDistribution(Batch, ABC):
         """Return the value at risk: λ is below it with probability 1 − level.
 
         Args:
-            level: α in [0, 1); at 0 the result is 1, the supremum of λ's range.
+            level: α in [0, 1); at 0 the result is 1, the upper end of λ's range.
 
         Returns:
             Traversability, shape [*B, H, W].
@@ -150,7 +150,7 @@ class TraversabilityDistribution(Batch, ABC):
             value = chunk.quantile(tail).double()
             edges = edges_between(torch.zeros_like(value), value)
             first = (chunk.cdf(0.0) / tail).clamp(max=1)
-            # F / tail is 1 at the VaR, even if F jumps beyond the tail there.
+            # F / tail counts as 1 at the VaR, even if F jumps above `tail` there.
             last = torch.ones_like(value)
             shortfall = integral(
                 chunk, lambda cdf, x: cdf(x) / tail, edges, first, last
@@ -198,7 +198,8 @@ class TraversabilityDistribution(Batch, ABC):
             times = (floor**-exponents).view(-1, 1, 1, 1).expand(-1, *chunk.shape)
             first = in_tail(chunk.cdf_limits(1.0)[0])
             last = in_tail(chunk.cdf(floor))
-            return 1 + integral(chunk, cdf_of_time, times, first, last, _ROUNDS_OF_TIME)
+            rounds = _ROUNDS_FOR_TIMES
+            return 1 + integral(chunk, cdf_of_time, times, first, last, rounds)
 
         return self._in_chunks(compute)
 
@@ -208,13 +209,13 @@ class TraversabilityDistribution(Batch, ABC):
         Args:
             value: traversability in [0, 1].
         """
-        below = self._exact().cdf_limits(value)[0].double()
+        below = self._in_float64().cdf_limits(value)[0].double()
         return (1 - below).to(self.dtype)
 
     def spread(self) -> Tensor:
-        """Return half the distance of the 16 % and 84 % quantiles, shape [*B, H, W].
+        """Return half the difference of the 84 % and 16 % quantiles, shape [*B, H, W].
 
-        For a normal distribution it is σ.
+        For a normal distribution, this is σ.
         """
         high = self.quantile(0.84)
         low = self.quantile(0.16)
@@ -227,7 +228,7 @@ class TraversabilityDistribution(Batch, ABC):
             value: observed traversability, shape [*B, H, W].
 
         Returns:
-            Values of shape [*B, H, W]; NaN without a density, as in the base class.
+            Values of shape [*B, H, W]; NaN if a subclass defines no density.
         """
         return torch.full(self.shape, math.nan, dtype=self.dtype, device=self.device)
 
@@ -279,13 +280,13 @@ class TraversabilityDistribution(Batch, ABC):
         Its ends are Φ⁻¹ of P(λ < value) and P(λ ≤ value).
 
         Args:
-            value: traversability, a number or shape [*B, H, W].
+            value: traversability λ, a number or shape [*B, H, W].
 
         Returns:
-            Both ends, each of shape [*B, H, W]. They are equal if F is continuous at
-            the value, and infinite at atoms at 0 and 1.
+            Both ends, each of shape [*B, H, W]; equal if F is continuous at the value.
+            The lower end is −∞ for λ = 0, and the upper end is ∞ for λ = 1.
         """
-        lower, upper = self._exact().cdf_limits(value)
+        lower, upper = self._in_float64().cdf_limits(value)
         lower_score = torch.special.ndtri(lower.double())
         upper_score = torch.special.ndtri(upper.double())
         return lower_score.to(self.dtype), upper_score.to(self.dtype)
@@ -297,13 +298,13 @@ class TraversabilityDistribution(Batch, ABC):
             cells: mask of the cells, bool, shape [*B, H, W].
         """
         flat = cells.reshape(-1, *cells.shape[-2:])
-        member, row, column = flat.nonzero(as_tuple=True)
+        map_index, row, column = flat.nonzero(as_tuple=True)
 
         def select(values: Tensor) -> Tensor:
             maps = values.movedim(0, -3)
-            return maps[..., member, row, column].unsqueeze(-2)
+            return maps[..., map_index, row, column].unsqueeze(-2)
 
-        return map_tensors(self._in_members(), select)
+        return map_tensors(self._with_flat_batch(), select)
 
     def differs(
         self, distribution: "TraversabilityDistribution", tolerance: float = 0.0
@@ -311,9 +312,9 @@ class TraversabilityDistribution(Batch, ABC):
         """Return a mask of cells whose parameters differ, bool, shape [*B, H, W].
 
         Args:
-            distribution: distribution of the same shape. If its class or its
-                components differ, all cells differ.
-            tolerance: maximum difference of equal parameters.
+            distribution: distribution of the same shape. If its class or its number of
+                components differs, all cells differ.
+            tolerance: maximum difference of parameters that count as equal, ≥ 0.
         """
         n_batch = len(self.shape) - 2
         changed = torch.zeros(self.shape, dtype=torch.bool, device=self.device)
@@ -330,14 +331,13 @@ class TraversabilityDistribution(Batch, ABC):
     def replaced(
         self, cells: Tensor, replacement: "TraversabilityDistribution"
     ) -> "TraversabilityDistribution":
-        """Return the distribution with selected cells of another.
+        """Return the distribution with selected cells replaced.
 
         Args:
             cells: mask of the cells to replace, bool, shape [*B, H, W].
-            replacement: distribution with parameters of the same shapes.
+            replacement: distribution of the new cells, with parameters of equal shapes.
         """
         n_batch = len(self.shape) - 2
-
         batch_shape = cells.shape[:n_batch]
         map_shape = cells.shape[n_batch:]
 
@@ -358,7 +358,7 @@ class TraversabilityDistribution(Batch, ABC):
         raise ConfigError(self._no_classes())
 
     def most_likely(self) -> "TraversabilityDistribution":
-        """Return the distribution given the most likely terrain class of each cell.
+        """Return the distribution of λ given each cell's most likely terrain class.
 
         This is the single-class option of the paper.
 
@@ -370,20 +370,20 @@ class TraversabilityDistribution(Batch, ABC):
     def _no_classes(self) -> str:
         return (
             "Expected a distribution with terrain classes for the single-class "
-            f"option, got {type(self).__name__}, which has none. Take another risk "
+            f"option, got {type(self).__name__}, which has no classes. Use another risk "
             "measure, or a model that predicts classes."
         )
 
-    def _exact(self) -> Self:
-        """Return the distribution in float64."""
+    def _in_float64(self) -> Self:
+        """Return the distribution with its floating-point parameters in float64."""
 
-        def exact(values: Tensor) -> Tensor:
+        def convert(values: Tensor) -> Tensor:
             return values.double() if values.is_floating_point() else values
 
-        return map_tensors(self, exact)
+        return map_tensors(self, convert)
 
-    def _in_members(self) -> Self:
-        """Return the distribution with a single leading dimension."""
+    def _with_flat_batch(self) -> Self:
+        """Return the distribution with the leading dimensions *B as a single one."""
         n_batch = len(self.shape) - 2
 
         def flatten(values: Tensor) -> Tensor:
@@ -395,31 +395,31 @@ class TraversabilityDistribution(Batch, ABC):
         """Apply a function in chunks of cells, to limit memory.
 
         Args:
-            compute: function of a distribution of shape [b, h, w] in float64 and layers
-                of that shape. It returns values of that shape, and the value of a cell
-                depends only on this cell.
-            layers: further arguments, each of shape [*B, H, W].
+            compute: function of a distribution in float64 and layers, each of shape
+                [b, h, w]. It returns values of that shape, computed cell by cell.
+            layers: further arguments of `compute`, each of shape [*B, H, W].
 
         Returns:
             Values of shape [*B, H, W], in the dtype of the parameters.
         """
         with torch.no_grad():
-            flat = self._exact()._in_members()
+            flat = self._in_float64()._with_flat_batch()
             height, width = self.shape[-2:]
             flat_layers = [layer.reshape(-1, height, width) for layer in layers]
-            size = _CELLS_AT_ONCE if self.device.type == "cpu" else _CELLS_ON_A_GPU
-            n_members = max(1, size // (height * width))
-            n_rows = max(1, size // width)
+            on_cpu = self.device.type == "cpu"
+            chunk_cells = _CHUNK_CELLS_ON_CPU if on_cpu else _CHUNK_CELLS_ON_GPU
+            n_maps = max(1, chunk_cells // (height * width))
+            n_rows = max(1, chunk_cells // width)
             results = []
-            for start in range(0, flat.shape[0], n_members):
-                stop = min(start + n_members, flat.shape[0])
-                members = torch.arange(start, stop, device=self.device)
-                maps = flat.select(members)
+            for start in range(0, flat.shape[0], n_maps):
+                stop = min(start + n_maps, flat.shape[0])
+                indices = torch.arange(start, stop, device=self.device)
+                maps = flat.select(indices)
                 rows = []
                 for top in range(0, height, n_rows):
                     band = slice(top, top + n_rows)
                     chunk = map_tensors(maps, partial(_rows_of, band=band))
-                    chunk_layers = [layer[members, band] for layer in flat_layers]
+                    chunk_layers = [layer[indices, band] for layer in flat_layers]
                     rows.append(compute(chunk, *chunk_layers))
                 results.append(torch.cat(rows, dim=1))
             return torch.cat(results).view(self.shape).to(self.dtype)
@@ -430,7 +430,7 @@ def _rows_of(values: Tensor, band: slice) -> Tensor:
 
 
 def tail_of(level: float) -> float:
-    """Return the probability 1 − level of the tail.
+    """Return the probability 1 − α of the tail at a risk level α.
 
     Raises:
         ConfigError: If the level is outside [0, 1).
@@ -442,9 +442,9 @@ def tail_of(level: float) -> float:
 
 
 def check_floor(floor: float) -> None:
-    """Validate a minimum speed.
+    """Validate a minimum speed, relative to the commanded speed.
 
     Raises:
-        ConfigError: If it is outside (0, 1].
+        ConfigError: If the speed is outside (0, 1].
     """
     expect(0 < floor <= 1, f"a minimum speed in (0, 1], got {floor}.")

@@ -15,7 +15,7 @@ class BenchnavError(Exception):
     """Base class of errors that a user can fix."""
 
     status: ClassVar[int] = 2
-    """Exit status of a command that ends with it."""
+    """Exit status of a command that ends with this error."""
 
 
 class ConfigError(BenchnavError, ValueError):
@@ -32,11 +32,12 @@ def expect(is_valid: object, what: str) -> None:
     """Raise an error unless a setting, recipe or argument is valid.
 
     Args:
-        is_valid: whether it is valid.
-        what: argument, expectation, value and remedy, which continue "Expected".
+        is_valid: whether the setting, recipe or argument is valid.
+        what: rest of the message after "Expected": argument, expectation, value and
+            remedy.
 
     Raises:
-        ConfigError: If it is not valid.
+        ConfigError: If `is_valid` is false.
     """
     if not is_valid:
         raise ConfigError(f"Expected {what}")
@@ -45,15 +46,15 @@ def expect(is_valid: object, what: str) -> None:
 def choose(
     what: str, requested: Collection[str] | None, options: Iterable[str]
 ) -> list[str]:
-    """Return the requested options in their own order.
+    """Return the requested options in the order of all options.
 
     Args:
         what: name of the argument in messages.
-        requested: requested options; if None, all.
+        requested: requested options; if None, all options.
         options: all options.
 
     Raises:
-        ConfigError: If no option is requested, or one that does not exist.
+        ConfigError: If `requested` is empty, or contains an option that does not exist.
     """
     options = list(options)
     requested = options if requested is None else requested
@@ -63,8 +64,8 @@ def choose(
     return [name for name in options if name in requested]
 
 
-# NUL ends a path, other control characters move the cursor of a terminal; surrogates
-# stand for bytes that are not UTF-8.
+# NUL ends a path, and other control characters move the cursor of a terminal.
+# Surrogates represent bytes that are not UTF-8.
 _CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff]")
 
 
@@ -73,16 +74,17 @@ def check_text(text: str, location: str = "") -> None:
 
     Args:
         text: text from a user.
-        location: location of the text in messages.
+        location: location of the text in messages; may be empty.
 
     Raises:
-        ConfigError: If it contains control characters, or bytes that are not UTF-8.
+        ConfigError: If the text contains control characters, or bytes that are not
+            UTF-8.
     """
     where = f" in {location}" if location else ""
     expect(
         not _CONTROL.search(text),
-        f"text in UTF-8 without control characters{where}, got {text!r}. Leave them "
-        "out.",
+        f"text in UTF-8 without control characters{where}, got {text!r}. Remove these "
+        "characters.",
     )
 
 
@@ -90,7 +92,7 @@ def check_label(what: str, text: str) -> None:
     """Reject text that a table cannot show: empty, unprintable or of several lines.
 
     Args:
-        what: meaning of the text in messages.
+        what: name of the text in messages.
         text: text from a user.
 
     Raises:
@@ -103,20 +105,23 @@ def check_label(what: str, text: str) -> None:
 
 
 class OutOfMemoryError(BenchnavError):
-    """Memory ran out; only the size of the input is at fault."""
+    """Memory ran out; the input is valid but too large."""
 
 
-# Messages of PyTorch, HDF5 and C++, which do not raise `MemoryError`.
+# Messages of PyTorch, HDF5 and C++ about a lack of memory, which is not a `MemoryError`.
 _NO_MEMORY = re.compile(
     r"can't allocate memory|cannot allocate memory|not enough memory|out of memory|std::bad_alloc|unable to allocate",
     re.IGNORECASE,
 )
 
 
-def out_of_memory(error: BaseException) -> OutOfMemoryError | None:
-    """Return the error to raise if an error or its cause is a lack of memory."""
+def out_of_memory_error(error: BaseException) -> OutOfMemoryError | None:
+    """Return an `OutOfMemoryError` if an error or its cause is a lack of memory.
+
+    Otherwise, return None.
+    """
     if isinstance(error, BenchnavError) and _NO_MEMORY.search(str(error)):
-        return None  # its message already states it
+        return None  # the message already states the lack of memory
     cause: BaseException | None = error
     seen: set[int] = set()  # an error may be its own cause
     while cause is not None and id(cause) not in seen:
@@ -126,9 +131,8 @@ def out_of_memory(error: BaseException) -> OutOfMemoryError | None:
         if _is_out_of_memory(cause):
             text = " ".join(str(cause).split())[:200].rstrip(".")
             return OutOfMemoryError(
-                f"Memory ran out ({text or type(cause).__name__}). Ask for less at "
-                "once: fewer `jobs`, samples or maps of a batch, smaller maps or a "
-                "smaller network."
+                f"Memory ran out ({text or type(cause).__name__}). Use fewer `jobs`, "
+                "fewer samples, fewer maps per batch, smaller maps or a smaller network."
             )
         cause = cause.__cause__
     return None
@@ -142,7 +146,7 @@ def _is_out_of_memory(error: BaseException) -> bool:
 
 
 class DatasetError(BenchnavError):
-    """A dataset file is missing, damaged, of another format or incomplete."""
+    """A dataset file is missing, damaged, incomplete or has another format."""
 
 
 class CheckpointError(BenchnavError):
@@ -151,7 +155,7 @@ class CheckpointError(BenchnavError):
 
 @contextmanager
 def quiet(*loggers: str) -> Iterator[None]:
-    """Silence loggers of libraries; errors that matter to a user are raised."""
+    """Silence loggers of libraries by name; exceptions are still raised."""
     levels = {name: logging.getLogger(name).level for name in loggers}
     for name in loggers:
         logging.getLogger(name).setLevel(logging.CRITICAL)

@@ -1,13 +1,13 @@
-"""Messages of commands on standard error, and wording of their failures."""
+"""Messages of commands on standard error, and texts for errors that end a command."""
 
 import errno
 import os
 import sys
 from pathlib import Path
 
-from benchnav.core.errors import BenchnavError, out_of_memory
+from benchnav.core.errors import BenchnavError, out_of_memory_error
 
-# Maximum length of a message in characters; a longer one loses its middle.
+# Maximum length of a message in characters; the middle of a longer message is omitted.
 _MAX_LENGTH = 2000
 
 
@@ -20,13 +20,13 @@ def tell(line: str) -> None:
 
 
 def describe_failure(error: Exception, has_out: bool) -> str | None:
-    """Return a message on an error that the user can correct; None for a bug.
+    """Return a message about an error that the user can correct; None for a bug.
 
     Args:
         error: exception that ended a command.
-        has_out: the command has a flag `--out`.
+        has_out: whether the command has a flag `--out`.
     """
-    no_memory = out_of_memory(error)
+    no_memory = out_of_memory_error(error)
     if no_memory:
         return str(no_memory)
     if isinstance(error, BenchnavError | UnicodeDecodeError):
@@ -45,7 +45,7 @@ def report_failure(program: str, message: str) -> None:
 
 
 def _describe_os_error(error: OSError, has_out: bool) -> str:
-    """Return the path that the system could not use, the reason and a remedy."""
+    """Return a message with the path that could not be used, the reason and a remedy."""
     reason = error.strerror or str(error)
     if not error.filename:
         return f"could not use a file: {reason}"

@@ -1,9 +1,9 @@
 """Grid of a map: conversion between positions and cells.
 
-Maps are indexed [row = y, column = x]. Cell (i, j) is centred at
-((j + ½)·res, (i + ½)·res). A position belongs to the cell that contains it. Positions
-outside the map are not free. Letters in shapes: B maps, H×W cells, *S any dimensions
-of positions, M edges.
+Maps are indexed [row = y, column = x]. The centre (x, y) of cell (i, j) is
+((j + ½)·r, (i + ½)·r), where r is the resolution. A position belongs to the cell that
+contains it. Positions off the map are not free. Letters in shapes: B maps; H×W cells;
+*B any leading dimensions; *S any dimensions of positions; M edges.
 
 PyTorch is imported within functions, because generating and listing datasets does not
 need it.
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
-MAX_CELLS = 2**28  # of a map; the fields of a larger one exceed any memory
+MAX_CELLS = 2**28  # maximum for a map; fields of a larger map exceed any memory
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Grid:
         return along_x, along_y
 
     def maps_in(self, cells: int) -> int:
-        """Return how many maps fit into a number of cells, at least 1."""
+        """Return the number of maps that have `cells` cells in total, at least 1."""
         return max(1, cells // (self.height * self.width))
 
     def contains(self, x_m: "Tensor", y_m: "Tensor") -> "Tensor":
@@ -103,7 +103,7 @@ class Grid:
 
         Args:
             maps: maps of any dtype, shape [*B, H, W].
-            outside: value off the map.
+            outside: value of the padding, for positions off the map.
 
         Returns:
             Padded maps, dtype of `maps`, shape [*B, (H + 2)·(W + 2)].
@@ -114,7 +114,7 @@ class Grid:
         return padded.flatten(-2)
 
     def lookup(self, padded: "Tensor", x_m: "Tensor", y_m: "Tensor") -> "Tensor":
-        """Return the values of maps at positions; NaN positions are off the map.
+        """Return the values of maps at positions; NaN positions count as off the map.
 
         Args:
             padded: maps from `pad`, shape [B, (H + 2)·(W + 2)].
@@ -139,9 +139,9 @@ class Grid:
 
 
 def is_azimuth(layer: str) -> bool:
-    """Return whether the name of a layer says that it contains directions.
+    """Return whether a layer contains directions, as the end of its name indicates.
 
-    Directions are in degrees from +x towards +y and rotate with the map.
+    Directions are in degrees from +x towards +y, and rotate with the map.
     """
     return layer.endswith("_azimuth_deg")
 

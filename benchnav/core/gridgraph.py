@@ -1,9 +1,10 @@
 """The 8-connected graph of a map's cells, with exact shortest paths for batches.
 
-A diagonal step between two free cells is closed if both cells next to it are not free,
-since these touch at the corner that the step would cross. Cells that are connected by
-steps are therefore also connected across shared edges. Each map has its own compiled
-Dijkstra search: a single search of the batch takes twice as long, since its heap
+An edge of the graph is a step from a cell to a neighbour. A diagonal step between two
+free cells is closed if the two cells on either side of it are not free, because these
+touch at the corner that the step would cross. Cells that are connected by steps are
+therefore also connected across shared cell borders. Each map has its own compiled
+Dijkstra search: a single search of the batch takes twice as long, because its heap
 exceeds the processor's cache.
 Letters in shapes: B maps; H×W cells, with flat index row·W + column; E edges.
 """
@@ -20,7 +21,7 @@ from scipy.sparse.csgraph import dijkstra
 if TYPE_CHECKING:
     from torch import Tensor
 
-NO_CELL = -1
+NO_CELL = -1  # index that stands for no cell
 Cells = TypeVar("Cells", ndarray, "Tensor")
 Mask = TypeVar("Mask", ndarray, "Tensor")
 
@@ -30,8 +31,9 @@ def neighbour_pairs(height: int, width: int) -> tuple[ndarray, ndarray, ndarray]
     """Return the directed edges between 8-connected cells, sorted by target.
 
     Returns:
-        Flat indices of source cells and of target cells, and edge lengths in cell
-        widths (1 or √2), each of shape [E]. The arrays are shared: do not modify them.
+        Flat indices of source cells, flat indices of target cells, and edge lengths in
+        cell widths (1 or √2), each of shape [E]. The arrays are cached: do not modify
+        them.
     """
     indices = np.arange(height * width).reshape(height, width)
     padded = np.pad(indices, 1, constant_values=NO_CELL)
@@ -52,14 +54,15 @@ def squeezes(
     """Return a mask of diagonal steps between free cells past two non-free cells.
 
     Args:
-        free_of: function that returns whether the cells of flat indices are free, bool.
+        free_of: function of flat indices that returns whether these cells are free,
+            bool.
         source: flat index of the cell that each step leaves, an array or a tensor.
-        target: flat index of the cell that it enters, at most one row and one column
-            away, of the same shape.
+        target: flat index of the cell that each step enters, at most one row and one
+            column from `source`, of the same shape.
         width: number of columns W.
 
     Returns:
-        Bool, of the shape that `free_of` returns; False for steps over a shared edge.
+        Bool, of the shape that `free_of` returns; False for steps that are not diagonal.
     """
     first_corner = source // width * width + target % width
     second_corner = target // width * width + source % width
@@ -79,14 +82,14 @@ def cost_to_go(
         shape: (H, W).
 
     Returns:
-        Cost to go, infinite where no path leads to a goal, float64, shape [B, H, W];
-        and the flat index of the next cell on a shortest path, `NO_CELL` at goals and
-        without a path, int64, shape [B, H·W].
+        Cost to go, float64, shape [B, H, W], infinite in cells without a path to a
+        goal; and the flat index of the next cell on a shortest path, int64, shape
+        [B, H·W], `NO_CELL` at goals and in cells without a path.
     """
     batch = len(goals)
     height, width = shape
     n_cells = height * width
-    # The search starts at the goals, so edges are reversed: rows are their targets.
+    # The search starts at the goals, so edges are reversed: rows are target cells.
     source, target, _ = neighbour_pairs(height, width)
     columns = source.astype(np.int32)
     row_indices = np.arange(n_cells + 1)
@@ -115,19 +118,20 @@ def travel_time_costs(
     resolution_m: float,
     closed_corners: bool = True,
 ) -> ndarray:
-    """Return the travel time of each edge at a commanded 1 m/s.
+    """Return the travel time of each edge at a commanded speed of 1 m/s.
 
-    Half of an edge is in either cell.
+    Half of an edge lies in each of its two cells.
 
     Args:
         traversability: λ in [0, 1], shape [B, H, W].
         free: mask of free cells, bool, shape [B, H, W].
         resolution_m: edge length of a cell in metres.
-        closed_corners: whether `squeezes` are closed, the rule since version 1.2.
+        closed_corners: whether the diagonal steps that `squeezes` marks are closed, as
+            is the rule since version 1.2.
 
     Returns:
-        Seconds, infinite for closed edges and edges of non-free cells, float64, shape
-        [B, E].
+        Seconds, float64, shape [B, E]; infinite for closed edges and edges of non-free
+        cells.
     """
     batch, height, width = traversability.shape
     source, target, length = neighbour_pairs(height, width)

@@ -15,9 +15,9 @@ from benchnav.core.mixture import TraversabilityMixture
 
 FORMAT = "benchnav-ground-1"
 SEEN = "seen"
-"""Layer of an observation that is 1 in observed cells and 0 elsewhere.
+"""Layer of an observation that is 1 in observed cells and 0 in all other cells.
 
-It is for models that declare it as an input.
+Only models that declare this layer as an input receive it.
 """
 
 
@@ -26,12 +26,13 @@ class GroundStatistics:
     """Statistics over all training maps.
 
     Args:
-        weights: weights of the Gaussian mixture of λ over all cells, clipped to [0, 1],
-            K numbers.
-        means: means of its components, before clipping.
-        stds: standard deviations of its components, before clipping.
-        layer_means: mean of each channel by layer of an `Observation`; three for `rgb`,
-            in 0–255.
+        weights: weights of the Gaussian mixture, clipped to [0, 1], that describes λ
+            over all cells, K numbers.
+        means: means of the mixture's components before clipping, K numbers.
+        stds: standard deviations of the mixture's components before clipping, ≥ 0, K
+            numbers.
+        layer_means: mean of each channel by name of an `Observation`'s layer; `rgb` has
+            three channels, in 0–255.
         look_alikes: pairs of names of look-alike classes.
         potts_strength: coupling β of the two-state random field of a pair's classes:
             the log odds that each of four neighbours adds to its class.
@@ -48,7 +49,7 @@ class GroundStatistics:
         """Validate the mixture."""
         expect(
             len(self.weights) == len(self.means) == len(self.stds) > 0,
-            "as many `weights` as `means` and `stds`, got "
+            "`weights`, `means` and `stds` of the same length > 0, got the lengths "
             f"{len(self.weights)}, {len(self.means)} and {len(self.stds)}.",
         )
         expect(
@@ -64,7 +65,7 @@ class GroundStatistics:
 
         Args:
             shape: [*B, H, W].
-            like: tensor of the dtype and device.
+            like: tensor whose dtype and device the result has.
         """
         *batch, height, width = shape
         maps = (*batch, len(self.weights), height, width)
@@ -77,22 +78,23 @@ class GroundStatistics:
         )
 
     def to_json(self) -> str:
-        """Return the text of a file."""
+        """Return the statistics as the text of a file."""
         return json.dumps({"format": FORMAT, **asdict(self)}, indent=1) + "\n"
 
     @classmethod
     def from_json(cls, text: str) -> "GroundStatistics":
-        """Read the text of a file.
+        """Read statistics from the text of a file.
 
         Raises:
-            ConfigError: If it has another format or is damaged.
+            ConfigError: If the text has another format or is damaged.
         """
         try:
             record: dict[str, Any] = json.loads(text)
             file_format = record.pop("format", None)
             expect(
                 file_format == FORMAT,
-                f"ground statistics of the format {FORMAT}, got {file_format!r}.",
+                f"ground statistics of the format {FORMAT}, got the format "
+                f"{file_format!r}. Create them again.",
             )
             layer_means = {
                 name: tuple(values) for name, values in record["layer_means"].items()
@@ -109,14 +111,14 @@ class GroundStatistics:
             required = {"rgb": 3, "elevation_m": 1, "slope_deg": 1}
             expect(
                 required.items() <= channels.items(),
-                f"`layer_means` with the numbers of channels {required}, got "
-                f"{channels}.",
+                f"`layer_means` with these numbers of channels, {required}, got "
+                f"{channels}. Create the ground statistics again.",
             )
             return statistics
         except ConfigError:
             raise
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise ConfigError(
-                "Expected ground statistics as `benchnav-datagen ground` writes "
-                f"them, got {type(error).__name__} {error}. Create them again."
+                "Expected ground statistics in the form that `benchnav-datagen ground` "
+                f"writes, got {type(error).__name__}: {error}. Create them again."
             ) from error

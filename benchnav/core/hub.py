@@ -1,9 +1,9 @@
 """Datasets and checkpoints of a hub, `owner/name@revision`, as cached downloads.
 
-Only files with the names that the readers read are downloaded, and no code is executed.
-The revision is part of the address, so that a run records its input. A commit never
-changes; a branch or tag may move. `HF_HOME`, `HF_HUB_OFFLINE`, `HF_ENDPOINT` and
-`HF_TOKEN` have the meaning that huggingface_hub gives them.
+Only the files in `FILES` are downloaded, and no code is executed. The address contains
+the revision, so that a run records its exact input. A commit never changes; a branch or
+tag may move. The environment variables `HF_HOME`, `HF_HUB_OFFLINE`, `HF_ENDPOINT` and
+`HF_TOKEN` act as in huggingface_hub.
 """
 
 import json
@@ -22,7 +22,7 @@ FILES: dict[Kind, tuple[str, ...]] = {
     "model": ("config.json", "ground.json", "*.safetensors", "README.md"),
     "dataset": ("*.h5", "manifest.json", "README.md"),
 }
-"""Patterns of the files that are downloaded, by kind of repository."""
+"""Name patterns of the files that are downloaded, by kind of repository."""
 
 _ADDRESS = re.compile(r"(\w[\w.-]*/\w[\w.-]*)@([\w][\w./-]*)", re.ASCII)
 _COMMIT = re.compile(r"[0-9a-f]{40}")
@@ -46,8 +46,8 @@ def download(address: str, kind: Kind, error: type[BenchnavError]) -> Path:
         The folder of the revision in the cache.
 
     Raises:
-        BenchnavError: If the hub is not reachable, or has no such repository or
-            revision. The exception is an `error`.
+        BenchnavError: If the hub cannot be reached, or has no such repository or
+            revision. The exception is an instance of `error`.
     """
     from huggingface_hub import errors, snapshot_download
 
@@ -77,21 +77,21 @@ def download(address: str, kind: Kind, error: type[BenchnavError]) -> Path:
                     return folder
         try:
             folder = snapshot(local=False)
-        except Exception as cause:  # the client raises unrelated classes
+        except Exception as cause:  # the client's exceptions have no common base class
             raise error(f"Expected {_reason(cause, name, revision, kind)}") from cause
     if not _COMMIT.fullmatch(revision):
         commit = folder.name
         tell(
-            f"benchnav: note: {address} is {commit} now and may move; @{commit} never "
-            "changes"
+            f"benchnav: note: {address} is commit {commit} now and may change; "
+            f"@{commit} never changes"
         )
     return folder
 
 
 def _is_complete(folder: Path, kind: Kind) -> bool:
-    """Return whether a folder contains all files that its index lists.
+    """Return whether a folder contains all files that its index file lists.
 
-    A download may have been interrupted.
+    Files are missing after an interrupted download.
     """
     try:
         if kind == "model":
@@ -110,7 +110,7 @@ def _is_complete(folder: Path, kind: Kind) -> bool:
 
 
 def _reason(cause: Exception, name: str, revision: str, kind: Kind) -> str:
-    """Return expectation, value and remedy for an exception of the client."""
+    """Return the message for an exception of huggingface_hub, after "Expected"."""
     from huggingface_hub import errors
 
     if isinstance(cause, errors.RevisionNotFoundError):
@@ -120,8 +120,8 @@ def _reason(cause: Exception, name: str, revision: str, kind: Kind) -> str:
         )
     if isinstance(cause, errors.GatedRepoError):
         return (
-            f"access to {name} on the hub, got none. Request it from the owner, and "
-            "log in with `hf auth login`."
+            f"access to {name} on the hub, got no access. Request access from the owner, "
+            "and log in with `hf auth login`."
         )
     if isinstance(cause, errors.RepositoryNotFoundError):
         return (
@@ -129,10 +129,10 @@ def _reason(cause: Exception, name: str, revision: str, kind: Kind) -> str:
             "private. Check the name, or log in with `hf auth login`."
         )
     if isinstance(cause, errors.HFValidationError):
-        return f"the name of a repository, owner/name, got {name!r}."
+        return f"the name of a repository as owner/name, got {name!r}."
     detail = " ".join(str(cause).split())[:160]
     return (
-        f"to reach the hub for {name}@{revision}, which is not in the cache, got "
-        f"{type(cause).__name__}: {detail} Try again with a connection, or name a "
-        "local folder."
+        f"the hub to be reachable for {name}@{revision}, which is not in the cache, got "
+        f"{type(cause).__name__}: {detail.rstrip('.')}. Try again with a network "
+        "connection, or name a local folder."
     )

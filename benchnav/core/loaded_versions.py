@@ -16,10 +16,10 @@ def loaded_versions(modules: Iterable[str]) -> dict[str, str]:
     """Return versions of the distributions of modules and of their loaded requirements.
 
     Args:
-        modules: names of modules, with dots.
+        modules: dotted names of modules.
 
     Returns:
-        Versions by the name of the distribution.
+        Versions by name of the distribution.
     """
     search_path = _search_path()
     distributions = _distributions(search_path)
@@ -43,9 +43,10 @@ def loaded_versions(modules: Iterable[str]) -> dict[str, str]:
 
 
 def _search_path() -> tuple[tuple[str, int], ...]:
-    """Return `sys.path`, with the times at which its folders last changed [ns].
+    """Return the entries of `sys.path`, each with the time of its last change in ns.
 
-    Installing a package changes them, so that the caches below stay valid.
+    An installation changes this time. As an argument of the cached functions below, it
+    makes them search again.
     """
     search_path = []
     for entry in sys.path:
@@ -59,7 +60,7 @@ def _search_path() -> tuple[tuple[str, int], ...]:
 def _distributions(search_path: tuple[tuple[str, int], ...]) -> Mapping[str, list[str]]:
     """Return the installed distributions of each top-level module.
 
-    It is cached because the search takes 0.25 s.
+    The result is cached, because the search takes 0.25 s.
     """
     return packages_distributions()
 

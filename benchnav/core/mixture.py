@@ -5,13 +5,14 @@ of λ: at level α, VaR and CVaR refer to the worst 1 − α fraction (`benchnav
 Computations are in float64 for any dtype of the parameters, and a cell's results do not
 depend on the number of cells.
 
-The expected time over terrain, relative to that at λ = 1, is for a minimum speed ε
+With a minimum speed ε, the expected time over terrain, relative to the time at λ = 1,
+is
 
     E[1 / max(λ, ε)] = 1 + ∫_ε^1 F(x) / x² dx
                      = Σ_k w_k (1 + ∫_ε^1 Φ((x − m_k) / s_k) / x² dx),
 
-where each integrand is 0 well below m_k and 1 / x² well above. In between it is
-integrated by Gauss-Legendre quadrature over log x.
+where the integrand of component k is 0 well below m_k and 1 / x² well above it. In
+between, it is integrated by Gauss-Legendre quadrature over log x.
 
 Sources: equation (1) of the paper; Gneiting and Raftery (2007), "Strictly proper
 scoring rules" (CRPS).
@@ -45,8 +46,10 @@ from benchnav.core.mixture_integrals import (
 
 _BELOW_1 = 1 - 2**-53  # the largest float64 below 1
 _DEEP_TAIL = 1e-6  # for smaller tails, the relative error of F must be small
-_NUMBERS_AT_ONCE = 2**16  # of each parameter: half a MiB in float64
-_NUMBERS_ON_A_GPU = 2**24  # on a GPU, few large chunks are faster than many small ones
+# Numbers of each parameter in a chunk: half a MiB in float64.
+_CHUNK_NUMBERS_ON_CPU = 2**16
+# Larger, since few large chunks are faster than many small chunks on a GPU.
+_CHUNK_NUMBERS_ON_GPU = 2**24
 
 
 @dataclass(frozen=True)
@@ -58,8 +61,8 @@ class TraversabilityMixture(TraversabilityDistribution):
             are normalised in computations), shape [*B, K, H, W].
         means: component means before clipping, shape [*B, K, H, W].
         stds: component standard deviations before clipping, ≥ 0, shape [*B, K, H, W].
-        group: index of the terrain class of each of K components; −1 for components
-            without a class, as in unobserved cells; None if no component has a class.
+        group: index of the terrain class of each of the K components; −1 for components
+            without a class, as in unobserved cells. If None, no component has a class.
 
     Raises:
         ConfigError: If the shapes differ or have fewer than three dimensions, or
@@ -79,14 +82,14 @@ class TraversabilityMixture(TraversabilityDistribution):
         is_same = weights == means == stds
         if not is_same or len(weights) < 3:
             raise ConfigError(
-                "Expected `weights`, `means` and `stds` of one shape [*B, K, H, W], "
+                "Expected `weights`, `means` and `stds` of the same shape [*B, K, H, W], "
                 f"got {list(weights)}, {list(means)} and {list(stds)}."
             )
         n_components = weights[-3]
         if self.group is not None and len(self.group) != n_components:
             raise ConfigError(
-                f"Expected `group` to name the class of each of {n_components} "
-                f"components, got {len(self.group)}."
+                f"Expected `group` with one class index for each of {n_components} "
+                f"components, got {len(self.group)} indices."
             )
 
     @property
@@ -95,7 +98,7 @@ class TraversabilityMixture(TraversabilityDistribution):
         return self.weights.select(-3, 0).shape
 
     def cdf(self, value: Tensor | float) -> Tensor:
-        """Return P(λ ≤ value), with the atoms of clipping at 0 and 1.
+        """Return P(λ ≤ value), which includes the atoms at 0 and 1 due to clipping.
 
         Args:
             value: traversability, a number or shape [*B, H, W].
@@ -111,7 +114,7 @@ class TraversabilityMixture(TraversabilityDistribution):
     def cdf_limits(self, value: Tensor | float) -> tuple[Tensor, Tensor]:
         """Return P(λ < value) and P(λ ≤ value), each of shape [*B, H, W].
 
-        They differ only at 0 and 1.
+        The two probabilities differ only at 0 and 1.
         """
         value = self._as_tensor(value)
         at = value.clamp(max=_BELOW_1)
@@ -124,11 +127,11 @@ class TraversabilityMixture(TraversabilityDistribution):
 
     @property
     def searched(self) -> bool:
-        """Whether quantiles are found by a search: True without atoms in (0, 1)."""
+        """Whether `quantile` is a search, and λ has no atoms in (0, 1)."""
         return bool((self.stds > 0).all())
 
     def quantile(self, probability: Tensor | float) -> Tensor:
-        """Return the quantiles of λ, exact at 0 and 1, shape [*B, H, W]."""
+        """Return the quantiles of λ, shape [*B, H, W]; quantiles 0 and 1 are exact."""
         u = self._as_tensor(probability).expand(self.shape)
         quantiles = self._in_cells(value_at_risk, u, deep=True)
         return torch.where(u <= 0, 0.0, quantiles)
@@ -141,7 +144,7 @@ class TraversabilityMixture(TraversabilityDistribution):
         """Return the value at risk: λ is below it with probability 1 − level.
 
         Args:
-            level: α in [0, 1); at 0 the result is 1, the supremum of λ's range.
+            level: α in [0, 1); at 0 the result is 1, the upper end of λ's range.
 
         Returns:
             Traversability, shape [*B, H, W].
@@ -183,7 +186,8 @@ class TraversabilityMixture(TraversabilityDistribution):
             floor: minimum speed ε, in (0, 1].
 
         Returns:
-            Values ≥ 1 within 1e-6 or the precision of the dtype, shape [*B, H, W].
+            Values ≥ 1, shape [*B, H, W]. Their error is at most 1e-6 or the precision
+            of the dtype.
         """
         check_floor(floor)
         return self._in_cells(lambda cells: expected_time(cells, floor, 1.0))
@@ -191,7 +195,7 @@ class TraversabilityMixture(TraversabilityDistribution):
     def time_cvar(self, level: float, floor: float) -> Tensor:
         """Return the CVaR of the time 1 / max(λ, floor), shape [*B, H, W].
 
-        It is as exact as `expected_time`.
+        Its error is at most that of `expected_time`.
         """
         tail = tail_of(level)
         check_floor(floor)
@@ -208,8 +212,8 @@ class TraversabilityMixture(TraversabilityDistribution):
     def crps(self, observed: Tensor) -> Tensor:
         """Return the continuous ranked probability score ∫₀¹ (F(x) − 1[y ≤ x])² dx.
 
-        It is computed as ∫₀¹ F² dx − 2·∫_y^1 F dx + 1 − y, to within 1e-5. The second
-        integral has a closed form; the first is `squared_integral`.
+        It is computed as ∫₀¹ F² dx − 2·∫_y^1 F dx + 1 − y, with an error of at most
+        1e-5. `squared_integral` is the first integral; the second has a closed form.
 
         Args:
             observed: observed λ y in [0, 1], shape [*B, H, W].
@@ -247,11 +251,11 @@ class TraversabilityMixture(TraversabilityDistribution):
     def to_normal(self, value: Tensor | float) -> tuple[Tensor, Tensor]:
         """Return the interval of standard normal scores that `from_normal` maps to λ.
 
-        Its ends are equal and finite for λ in (0, 1), however improbable λ is. The
-        interval extends from −∞ for λ = 0, and to ∞ for λ = 1.
+        For λ in (0, 1), both ends are equal and finite, however improbable λ is. For
+        λ = 0 the lower end is −∞, and for λ = 1 the upper end is ∞.
 
         Args:
-            value: traversability, a number or shape [*B, H, W].
+            value: traversability λ, a number or shape [*B, H, W].
 
         Returns:
             Both ends, each of shape [*B, H, W].
@@ -292,7 +296,7 @@ class TraversabilityMixture(TraversabilityDistribution):
         weights, means, stds = self._parameters()
         component = component_log_prob(means, stds, value.unsqueeze(-3))
         total = torch.logsumexp(component + weights.log(), dim=-3)
-        # At 0 and 1 it is a probability, which must not exceed 1 by rounding.
+        # At 0 and 1, the total is a log probability, which rounding must not make > 0.
         is_end = (value <= 0) | (value >= 1)
         total = torch.where(is_end, total.clamp(max=0), total)
         is_outside = (value < 0) | (value > 1)
@@ -301,8 +305,8 @@ class TraversabilityMixture(TraversabilityDistribution):
     def class_probabilities(self, count: int) -> Tensor:
         """Return the probability of each of `count` terrain classes.
 
-        The probability of a class is the sum of the weights of its components. Without
-        `group`, each component is a class.
+        The probability of a class is the sum of the weights of its components. If
+        `group` is None, each component is a class.
 
         Returns:
             Probabilities of shape [*B, count, H, W]; the weights themselves if each
@@ -311,7 +315,7 @@ class TraversabilityMixture(TraversabilityDistribution):
         if self.group in (None, tuple(range(count))):
             return self.weights
         weights = self.weights.movedim(-3, 0)
-        # The last index collects components without a class.
+        # Weights of components without a class are added at the last index.
         total = weights.new_zeros(count + 1, *weights.shape[1:])
         indices = [count if index < 0 else index for index in self.group]
         class_index = torch.tensor(indices, device=weights.device)
@@ -319,7 +323,7 @@ class TraversabilityMixture(TraversabilityDistribution):
         return total[:count].movedim(0, -3)
 
     def most_likely(self) -> "TraversabilityMixture":
-        """Return the mixture given the most likely terrain class of each cell.
+        """Return the mixture given each cell's most likely terrain class.
 
         It contains all components of that class. This is the single-class option of
         the paper.
@@ -332,18 +336,18 @@ class TraversabilityMixture(TraversabilityDistribution):
         if self.group is None:
             raise ConfigError(
                 "Expected components that belong to terrain classes for the "
-                "single-class option, got a mixture without `group`. Take another risk "
+                "single-class option, got a mixture without `group`. Use another risk "
                 "measure, or set `group`."
             )
-        # Components without a class count as a class of their own, since unobserved
-        # cells have no others.
+        # Components without a class form one further class, since unobserved cells
+        # have only such components.
         no_class = max(self.group) + 1
         group = tuple(no_class if index < 0 else index for index in self.group)
         grouped = replace(self, group=group)
         best = grouped.class_probabilities(no_class + 1).argmax(-3, keepdim=True)
         component_class = torch.tensor(group, device=best.device)
         is_best = component_class.view(-1, 1, 1) == best
-        if len(set(group)) == len(group):  # a single component per class
+        if len(set(group)) == len(group):  # each class has a single component
             index = is_best.int().argmax(-3, keepdim=True)
             means = torch.gather(self.means, -3, index)
             stds = torch.gather(self.stds, -3, index)
@@ -358,9 +362,9 @@ class TraversabilityMixture(TraversabilityDistribution):
 
         Args:
             compute: function of `Cells` and layers of N cells. It returns values of
-                shape [N], and the value of a cell depends only on this cell.
-            layers: further arguments, each of shape [*B, H, W].
-            deep: option of `Cells`.
+                shape [N]. The value of a cell depends only on that cell.
+            layers: further arguments of `compute`, each of shape [*B, H, W].
+            deep: `Cells.deep`: whether the relative error of F must be small.
 
         Returns:
             Values of shape [*B, H, W], in the dtype of the parameters.
@@ -368,7 +372,7 @@ class TraversabilityMixture(TraversabilityDistribution):
         all_parameters = (self.weights, self.means, self.stds)
         parameters = [values.movedim(-3, 0).flatten(1) for values in all_parameters]
         is_cpu = self.weights.device.type == "cpu"
-        numbers = _NUMBERS_AT_ONCE if is_cpu else _NUMBERS_ON_A_GPU
+        numbers = _CHUNK_NUMBERS_ON_CPU if is_cpu else _CHUNK_NUMBERS_ON_GPU
         size = max(1, numbers // len(parameters[0]))
         flat = [*parameters, *(layer.flatten() for layer in layers)]
         chunks = [values.split(size, -1) for values in flat]

@@ -1,4 +1,4 @@
-"""Log-likelihood of the components of clipped Gaussian mixtures.
+"""Log-likelihood of each component of a clipped Gaussian mixture.
 
 Letters in shapes: K components; H×W cells; *B any leading dimensions.
 """
@@ -11,11 +11,11 @@ from torch import Tensor
 
 
 class LogNormalCDF(torch.autograd.Function):
-    """log Φ(z) with the gradient φ/Φ as √(2/π) / erfcx(−z/√2).
+    """log Φ(z), whose gradient φ/Φ is computed as √(2/π) / erfcx(−z/√2).
 
-    The gradient of `torch.special.log_ndtr` subtracts two squares. In float32 its error
-    is 5 % at z = −10³, and it is invalid below −10⁴. Narrow components far from the
-    observation have such z.
+    The gradient of `torch.special.log_ndtr` subtracts two squares. In float32, its
+    error is 5 % at z = −10³, and its values are invalid below z = −10⁴. Narrow
+    components far from the observed λ have such z.
     """
 
     @staticmethod
@@ -33,12 +33,12 @@ class LogNormalCDF(torch.autograd.Function):
 
 
 def component_log_prob(means: Tensor, stds: Tensor, value: Tensor) -> Tensor:
-    """Return log density in (0, 1), and log mass at 0 and 1, of each component.
+    """Return each component's log density in (0, 1), and log mass at 0 and 1.
 
     Args:
         means: means before clipping, shape [*B, K, H, W].
         stds: standard deviations before clipping, > 0, shape [*B, K, H, W].
-        value: λ, shape [*B, 1, H, W].
+        value: observed λ in [0, 1], shape [*B, 1, H, W].
 
     Returns:
         Values of shape [*B, K, H, W].

@@ -13,29 +13,31 @@ from torch import Tensor
 from benchnav.core.cvar import Cells, added
 
 MIN_STD = 1e-9
-_REACH = 7.0  # standard deviations beyond which Φ is 0 or 1 to within 1e-11
+_MAX_Z = 7.0  # standard deviations beyond which Φ is 0 or 1 to within 1e-11
 
 _CRPS_NODES = 48
-# Minimum standard deviation that these nodes resolve; narrower components have
-# their own nodes.
+# Minimum standard deviation that these nodes resolve. A component with a smaller one is
+# narrow, and is integrated with nodes of its own.
 _NARROW_STD = 0.03
 _NARROW_NODES = 32
 
 
 def expected_time(cells: Cells, floor: float, upper: Tensor | float) -> Tensor:
-    """Return 1 / upper + ∫ F / x² from `floor` to `upper`, to within 1e-8, shape [N].
+    """Return 1 / upper + ∫ F / x² from `floor` to `upper`, shape [N].
+
+    Its error is at most 1e-8.
 
     Args:
         cells: mixtures of N cells.
-        floor: lower limit, in (0, 1].
-        upper: upper limit, a number or shape [N].
+        floor: lower limit of the integral, in (0, 1].
+        upper: upper limit of the integral, in [floor, 1], a number or shape [N].
     """
     n_nodes = 28 + 8 * math.ceil(math.log(max(0.05 / floor, 1), 5))
     # Outside [low, high] the CDF of a component is 0 or 1, and the integral of 1 / x²
     # has a closed form.
-    reach = _REACH * math.sqrt(0.5) / cells.scales
-    low = (cells.means - reach).clamp(min=floor).clamp(max=upper)
-    high = (cells.means + reach).clamp(min=floor).clamp(max=upper)
+    half_width = _MAX_Z * math.sqrt(0.5) / cells.scales
+    low = (cells.means - half_width).clamp(min=floor).clamp(max=upper)
+    high = (cells.means + half_width).clamp(min=floor).clamp(max=upper)
     start = low.log()
     span = high.log() - start
     time = 1 / upper + (1 / high - 1 / upper)
@@ -51,14 +53,14 @@ def expected_time(cells: Cells, floor: float, upper: Tensor | float) -> Tensor:
 def squared_integral(weights: Tensor, means: Tensor, stds: Tensor) -> Tensor:
     """Return ∫₀¹ F² of mixtures, float64, shape [*B, H, W].
 
-    For components that are not narrow, F² is smooth, and Gauss-Legendre quadrature in
-    the dtype of the parameters suffices. For a narrow component j, the products with
-    all others k are integrated by parts:
+    For components that are not narrow (`_NARROW_STD`), F² is smooth, and Gauss-Legendre
+    quadrature in the dtype of the parameters suffices. The product of a narrow
+    component j with each other component k is integrated by parts:
 
         ∫₀¹ Φ_j Φ_k dx = G_k(1) Φ_j(1) − ∫₀¹ G_k φ_j dx,    G_k(x) = ∫₀ˣ Φ_k,
 
-    where G_k of a wider k is smooth over the width of j. Of two narrow components, j is
-    the narrower.
+    where G_k of a wider k is smooth over the width of j. If both are narrow, j is the
+    narrower one.
 
     Args:
         weights: weights, shape [K, *B, H, W].
@@ -83,7 +85,7 @@ def squared_integral(weights: Tensor, means: Tensor, stds: Tensor) -> Tensor:
     for index in narrow_indices.tolist():
         std = stds[index]
         weight_of_j = weights[index]
-        # Of equally narrow components, the one with the smaller index counts as j.
+        # If two components are equally narrow, j is the one with the smaller index.
         is_later = (stds == std) & (components > index)
         is_wider = ~narrow | (stds > std) | is_later
         factor = torch.where(is_wider, 2 * weights, 0).double()
@@ -94,7 +96,7 @@ def squared_integral(weights: Tensor, means: Tensor, stds: Tensor) -> Tensor:
 
 
 def component_integral(value: Tensor, means: Tensor, stds: Tensor) -> Tensor:
-    """Return ∫_{−∞}^value of normal CDFs, float64, of shapes that broadcast."""
+    """Return ∫_{−∞}^value of normal CDFs, float64; the arguments' shapes broadcast."""
     stds = stds.double().clamp(min=MIN_STD)
     z = (value.double() - means.double()) / stds
     return stds * (z * torch.special.ndtr(z) + _normal_density(z))
@@ -112,14 +114,17 @@ def _normal_density(z: Tensor) -> Tensor:
 def _product_integral(
     mean: Tensor, std: Tensor, means: Tensor, stds: Tensor, factor: Tensor
 ) -> Tensor:
-    """Return Σ_k factor_k ∫₀¹ Φ Φ_k dx, see `squared_integral`.
+    """Return Σ_k factor_k ∫₀¹ Φ_j Φ_k dx of a narrow component j.
+
+    See `squared_integral`.
 
     Args:
-        mean: mean of a component, shape [*B, H, W].
-        std: standard deviation of the component, shape [*B, H, W].
-        means: means of K components that are not narrower, shape [K, *B, H, W].
-        stds: standard deviations of the K components, shape [K, *B, H, W].
-        factor: factors of the K components, shape [K, *B, H, W].
+        mean: mean of component j, shape [*B, H, W].
+        std: standard deviation of component j, shape [*B, H, W].
+        means: means of all components k, shape [K, *B, H, W].
+        stds: standard deviations of all components k, shape [K, *B, H, W].
+        factor: factors of all components k, shape [K, *B, H, W]; 0 for components that
+            are narrower than j.
 
     Returns:
         Integrals, float64, shape [*B, H, W].
@@ -135,8 +140,8 @@ def _product_integral(
     low = (0.0 - mean) / std
     high = (1.0 - mean) / std
     total = integral(torch.ones_like(mean)) * normal_cdf(high)
-    low = low.clamp(-_REACH, _REACH)
-    high = high.clamp(-_REACH, _REACH)
+    low = low.clamp(-_MAX_Z, _MAX_Z)
+    high = high.clamp(-_MAX_Z, _MAX_Z)
     width = high - low
     for node, weight in _legendre(_NARROW_NODES):
         z = low + width * node

@@ -19,19 +19,19 @@ from pathlib import Path
 from typing import Any
 
 from benchnav.core import touched
-from benchnav.core.errors import ConfigError, out_of_memory
+from benchnav.core.errors import ConfigError, out_of_memory_error
 from benchnav.core.renamed import PARTS
 from benchnav.core.settings import hint, one_line, parameters
 from benchnav.core.sources import (
     attribute,
     digest_of,
-    digest_of_file_part,
+    digest_of_file_and_imports,
     digest_of_modules,
     digest_of_path,
     digest_of_target,
     distribution_of,
     load_file,
-    moved,
+    renaming_note,
 )
 
 KINDS = (
@@ -55,12 +55,12 @@ class Found:
 
     Args:
         target: the class or function.
-        origin: distribution, module or file, as text for users.
-        source_digest: returns the digest of the source and of all its imports; empty
-            for shipped parts and without a source.
-        shipped: whether the part is in this package.
-        everywhere: whether other processes find it too.
-        instance: an object that no source creates; None for all other parts.
+        origin: distribution, module or file that defines it, as text for users.
+        source_digest: function that returns the digest of the source and all its
+            imports; the digest is empty for shipped parts and parts without a source.
+        shipped: whether benchnav contains the part.
+        everywhere: whether other processes can find the part too.
+        instance: object that was registered by `register_object`; None for other parts.
     """
 
     target: Any
@@ -72,17 +72,17 @@ class Found:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the source, of its imports, and of the `files` that it lists.
+        """SHA-256 of the source, its imports, and the `files` that the part lists.
 
         Raises:
-            ConfigError: If a listed file does not exist.
+            ConfigError: If one of these `files` does not exist.
         """
         source = self.source_digest()
         files = list(_listed_files(self.target))
         return digest_of(map(str.encode, (source, *files))) if files else source
 
 
-# Parts of this process only, by kind and name.
+# Parts that were registered in this process, by kind and name.
 _REGISTERED: dict[tuple[str, str], Found] = {}
 
 
@@ -94,8 +94,8 @@ def register(kind: str, name: str, target: Any) -> None:
 
     Args:
         kind: one of `KINDS`.
-        name: its name; a registered name takes precedence over an entry point.
-        target: the class or function.
+        name: name of the part; it takes precedence over an entry point of that name.
+        target: class or function of the part.
     """
     digest = partial(digest_of_target, target)
     _REGISTERED[check_kind(kind), name] = Found(
@@ -108,7 +108,7 @@ def register_object(kind: str, name: str, instance: Any) -> str:
 
     Args:
         kind: one of `KINDS`.
-        name: its name; if another part has it, a number is appended.
+        name: name of the object; if another part has this name, a number is appended.
         instance: the object.
 
     Returns:
@@ -116,8 +116,9 @@ def register_object(kind: str, name: str, instance: Any) -> str:
     """
     free_name = _free_name(kind, name, instance)
     is_class = inspect.isclass(instance)
-    # `make` creates an instance of a class, and calls a risk measure with a
-    # distribution. A function returns any other object unchanged.
+    # `make` creates an instance of a registered class, and calls a registered risk
+    # measure with a distribution. For any other object, register a function that
+    # returns the object.
     if is_class or kind == "risk":
         register(kind, free_name, instance)
     else:
@@ -132,7 +133,7 @@ def register_object(kind: str, name: str, instance: Any) -> str:
 
 
 def _free_name(kind: str, name: str, instance: Any) -> str:
-    """Return the first of `name`, `name-2`, … that is unused or belongs to the object."""
+    """Return the first of `name`, `name-2`, … that no other object has."""
     used_names = names(kind)
     candidate = name
     for number in itertools.count(2):
@@ -143,7 +144,7 @@ def _free_name(kind: str, name: str, instance: Any) -> str:
 
 
 def is_object(kind: str, source: str) -> bool:
-    """Return whether a name was given to an object by `register_object`."""
+    """Return whether `register_object` registered an object by this name."""
     return _instance_of(kind, source) is not None
 
 
@@ -153,7 +154,7 @@ def _instance_of(kind: str, source: str) -> Any:
 
 
 def names(kind: str) -> list[str]:
-    """Return all names of a kind in alphabetical order, registered ones included."""
+    """Return all names of a kind, registered names included, in alphabetical order."""
     installed = {point.name for point in entry_points_of(kind)}
     registered = {
         name for registered_kind, name in _REGISTERED if registered_kind == kind
@@ -162,7 +163,7 @@ def names(kind: str) -> list[str]:
 
 
 def shipped_names(kind: str) -> list[str]:
-    """Return the names of shipped parts in alphabetical order, without imports."""
+    """Return the names of shipped parts in alphabetical order; imports no part."""
     return sorted(
         point.name
         for point in entry_points_of(kind)
@@ -177,12 +178,12 @@ def entry_points_of(kind: str) -> tuple[EntryPoint, ...]:
 
 @cache
 def _points_on(kind: str, path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
-    """Return the entry points of a kind; `path` is a key of the cache only."""
+    """Return the entry points of a kind; `path` only distinguishes cached results."""
     return tuple(entry_points(group=f"benchnav.{kind}s"))
 
 
 def check_kind(kind: str) -> str:
-    """Return the kind if it exists.
+    """Return the kind unchanged if it is valid.
 
     Raises:
         ConfigError: If `kind` is not one of `KINDS`.
@@ -215,8 +216,8 @@ def find(kind: str, source: str) -> Found:
     if len(points) > 1:
         values = ", ".join(point.value for point in points)
         raise ConfigError(
-            f"Expected one {kind} {source!r}, got several: {values}. "
-            "Write package.module:Name."
+            f"Expected one {kind} named {source!r}, got several: {values}. Write one of "
+            "these in place of the name."
         )
     if points:
         location, colon, name = points[0].value.partition(":")
@@ -231,7 +232,7 @@ def find(kind: str, source: str) -> Found:
 
 
 def _remedy(kind: str, source: str) -> str:
-    """Return a sentence for a source that is not found, or ''."""
+    """Return a sentence with a remedy for a source that is not found, or ''."""
     if source.endswith(".py"):
         return f" Name a class or function in the file: {source}:Name."
     if Path(f"{source}.py").is_file():
@@ -285,11 +286,11 @@ def _import_error(
         error, ModuleNotFoundError
     ) and f"{module_name}.".startswith(f"{error.name}.")
     if not is_missing:
-        return out_of_memory(error) or ConfigError(
-            f"module {module_name} could not be imported: "
-            f"{one_line(error)}{moved(error)}"
+        return out_of_memory_error(error) or ConfigError(
+            f"Expected a module that can be imported, got {module_name}: "
+            f"{one_line(error)}{renaming_note(error)}"
         )
-    remedy = moved(error).removeprefix(".")
+    remedy = renaming_note(error).removeprefix(".")
     if not remedy:
         file = Path(*module_name.split(".")).with_suffix(".py")
         remedy = hint(module_name, names(kind))
@@ -303,10 +304,10 @@ def _import_error(
 
 
 def _installed_folder(package: str) -> Path | None:
-    """Return the folder of a package, whose code belongs to the part.
+    """Return the folder of an installed package that contains a part, or None.
 
-    Installed packages are not watched otherwise. The standard library has no folder
-    here, because a name may lead to it by mistake.
+    The code in this folder then counts as code of the part; see `touched.watch`. The
+    result is None for the standard library, to which a name may lead by mistake.
     """
     if package in sys.stdlib_module_names:
         return None
@@ -331,12 +332,12 @@ def _find_in_file(kind: str, path: Path, name: str) -> Found:
     touched.watch()
     module = load_file(path.resolve(), content)
     target = attribute(module, str(path), name)
-    digest = partial(digest_of_file_part, path.resolve(), content)
+    digest = partial(digest_of_file_and_imports, path.resolve(), content)
     return Found(target=target, origin=f"file {path}", source_digest=digest)
 
 
 def _listed_files(target: Any) -> Iterator[str]:
-    """Return the name and the digest of each of the `files` that a part lists."""
+    """Yield the name and then the digest of each of the `files` that a part lists."""
     files = getattr(target, "files", ())
     is_list = isinstance(files, list | tuple)
     if not files or not is_list or "files" in parameters(target):
@@ -347,8 +348,8 @@ def _listed_files(target: Any) -> Iterator[str]:
         digest = digest_of_path(folder / name)
         if not digest:
             raise ConfigError(
-                f"Expected `files` of {target.__qualname__} in {folder}, got "
-                f"{name!r}, which does not exist."
+                f"Expected `files` of {target.__qualname__} to exist in {folder}, got "
+                f"{name!r}, which does not."
             )
         yield name
         yield digest

@@ -14,28 +14,28 @@ from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import ConfigError, expect
 from benchnav.core.mixture import TraversabilityMixture
 
-_HALVINGS = 40  # of [0, 1], to 10⁻¹²
+_BISECTIONS = 40  # of [0, 1]; the last interval is 10⁻¹² wide
 
 
 @dataclass(frozen=True)
 class PooledDistribution(TraversabilityDistribution):
-    """The weighted average of distributions; `pool` creates one of equal weights.
+    """The weighted average of distributions; `pool` returns one with equal weights.
 
     Args:
-        members: at least one distribution, of one shape, dtype and device.
+        members: at least one distribution, all of the same shape, dtype and device.
         weights: weights of the members, summing to 1 over M, shape [*B, M, H, W]; if
             None, equal weights.
 
     Raises:
-        ConfigError: If there are no members, if their shape, dtype or device differ, or
-            if the weights have another shape.
+        ConfigError: If there are no members, their shapes, dtypes or devices differ, or
+            the weights have another shape.
     """
 
     members: tuple[TraversabilityDistribution, ...]
     weights: Tensor | None = None
 
     def __post_init__(self) -> None:
-        """Validate that the members have one shape, dtype and device."""
+        """Validate that the members have the same shape, dtype and device."""
         expect(self.members, "at least one distribution to pool, got none.")
         kinds = {
             f"{list(member.shape)} as {member.dtype} on {member.device}": None
@@ -43,8 +43,8 @@ class PooledDistribution(TraversabilityDistribution):
         }
         if len(kinds) > 1:
             raise ConfigError(
-                "Expected distributions of one shape, dtype and device to pool, got "
-                f"{', '.join(kinds)}."
+                "Expected distributions of the same shape, dtype and device to pool, "
+                f"got {', '.join(kinds)}."
             )
         if self.weights is not None:
             *batch, height, width = self.shape
@@ -56,7 +56,7 @@ class PooledDistribution(TraversabilityDistribution):
 
     @property
     def shape(self) -> torch.Size:
-        """[*B, H, W]."""
+        """Shape of the maps, [*B, H, W]."""
         return self.members[0].shape
 
     def cdf(self, value: Tensor | float) -> Tensor:
@@ -71,24 +71,24 @@ class PooledDistribution(TraversabilityDistribution):
 
     @property
     def searched(self) -> bool:
-        """Whether all members search for quantiles."""
+        """Whether all members find their quantiles by a slow search."""
         return all(member.searched for member in self.members)
 
     def quantile(self, probability: Tensor | float) -> Tensor:
         """Return the quantiles of λ by bisection, shape [*B, H, W].
 
-        They are within 10⁻¹², and exact at 0 and 1.
+        Their error is at most 10⁻¹². Quantiles that equal 0 or 1 are exact.
         """
-        exact = self._exact()
+        in_float64 = self._in_float64()
         u = torch.as_tensor(probability, dtype=torch.float64, device=self.device)
         u = u.expand(self.shape)
         low = torch.zeros(self.shape, dtype=torch.float64, device=self.device)
-        high = torch.where(exact.cdf(low) >= u, 0.0, torch.ones_like(low))
-        for _ in range(_HALVINGS):
+        high = torch.where(in_float64.cdf(low) >= u, 0.0, torch.ones_like(low))
+        for _ in range(_BISECTIONS):
             middle = (low + high) / 2
-            is_upper = exact.cdf(middle) >= u
-            low = torch.where(is_upper, low, middle)
-            high = torch.where(is_upper, middle, high)
+            reaches_u = in_float64.cdf(middle) >= u
+            low = torch.where(reaches_u, low, middle)
+            high = torch.where(reaches_u, middle, high)
         return high.to(self.dtype)
 
     def mean(self) -> Tensor:
@@ -127,15 +127,16 @@ def pool(
     """Average the CDFs of distributions, such as those of an ensemble.
 
     Args:
-        distributions: M distributions of one shape, dtype and device.
+        distributions: M distributions of the same shape, dtype and device.
 
     Returns:
-        The distribution itself if M is 1. An exact mixture of all components if all are
-        mixtures whose components have the same classes. Otherwise a
-        `PooledDistribution`.
+        If M is 1, the distribution itself. If all distributions are mixtures with the
+        same classes of components, the exact mixture of all their components. Otherwise
+        a `PooledDistribution`.
 
     Raises:
-        ConfigError: If there are no distributions, or shape, dtype or device differ.
+        ConfigError: If there are no distributions, or their shapes, dtypes or devices
+            differ.
     """
     pooled = PooledDistribution(tuple(distributions))
     n_members = len(pooled.members)
@@ -144,8 +145,8 @@ def pool(
     mixtures = [
         member for member in distributions if isinstance(member, TraversabilityMixture)
     ]
-    groups = {mixture.group for mixture in mixtures}
-    if len(mixtures) < n_members or len(groups) > 1:
+    component_classes = {mixture.group for mixture in mixtures}
+    if len(mixtures) < n_members or len(component_classes) > 1:
         return pooled
     weights = [
         mixture.weights / (mixture.weights.sum(-3, keepdim=True) * n_members)

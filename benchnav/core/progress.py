@@ -1,8 +1,7 @@
 """Progress of long work in a terminal and in plain logs: count, rate, remaining time.
 
-The rate is that of this command. It excludes results of earlier commands and includes
-the start-up. Early estimates of the remaining time are therefore too long; a line says
-"about".
+The rate excludes results of earlier commands, and includes the start-up of this command.
+Early estimates of the remaining time are therefore too long, and are shown with "about".
 """
 
 import signal
@@ -15,10 +14,10 @@ from typing import Any
 
 from benchnav.core.command import tell
 
-# Earlier, the rate would measure only the start-up.
+# Time before the first estimate; an earlier rate would measure only the start-up.
 _ESTIMATED_FROM_S = 5.0
-# A log has a line at each tenth, and after this time without one. The time grows with
-# the duration of the work.
+# A log has a line at each tenth of the work, and after a time without a line. This time
+# is a tenth of the elapsed time, within these limits.
 _MIN_SILENCE_S = 60.0
 _MAX_SILENCE_S = 600.0
 _POLL_S = 1.0
@@ -29,12 +28,12 @@ class Progress:
     """Progress of some work; unpacks as `done, total`.
 
     Args:
-        done: number of finished parts, including those of earlier commands.
-        total: number of all parts.
-        doing: description of the current or last part.
-        size_done: sum of the sizes of finished parts, if parts differ in size.
-        size: sum of the sizes of all parts; 0 if all parts have the same size.
-        sized: plural noun for what sizes count, such as "episodes".
+        done: number of finished items, including those of earlier commands.
+        total: number of all items.
+        doing: description of the current or last item.
+        size_done: sum of the sizes of finished items, if items differ in size.
+        size: sum of the sizes of all items; 0 if all items have the same size.
+        sized: plural noun for the unit of sizes, such as "episodes".
     """
 
     done: int
@@ -50,15 +49,15 @@ class Progress:
 
     @property
     def amount(self) -> tuple[int, int]:
-        """Finished and total amount, in the unit of the rate."""
+        """Finished amount and total amount, in the unit of the rate."""
         return (self.size_done, self.size) if self.size else (self.done, self.total)
 
 
 class Watch:
-    """Description of the progress of some work, with its rate.
+    """Clock and text for the progress of some work.
 
     Args:
-        noun: plural noun for what is counted, for example "units".
+        noun: plural noun for the counted items, for example "units".
     """
 
     def __init__(self, noun: str) -> None:
@@ -71,14 +70,14 @@ class Watch:
         self._tenth = -1
 
     def update(self, step: Progress | tuple[int, int]) -> None:
-        """Record progress; work done at the first call is of an earlier command."""
+        """Record progress; work that is done at the first call counts as earlier work."""
         self.step = step if isinstance(step, Progress) else Progress(*step)
         if self._initial_amount is None:
             self._initial_amount = self.step.amount[0]
             self._start_s = time.monotonic()
 
     def is_due(self) -> bool:
-        """Return whether a log line is due; True once for each line."""
+        """Return whether a log line is due, and count that line as written."""
         now_s = time.monotonic()
         if not self.step.total:
             return False
@@ -92,12 +91,15 @@ class Watch:
         return True
 
     def line(self) -> str:
-        """Return a line for a log."""
+        """Return a log line with the count, rate, time and activity."""
         count = f"{self.noun}: {self.step.done}/{self.step.total}"
         return ", ".join([count, *self.words()])
 
     def words(self) -> list[str]:
-        """Return the available ones of rate, remaining or elapsed time and activity."""
+        """Return texts for the rate, the remaining or elapsed time, and the activity.
+
+        Texts for unknown values are omitted.
+        """
         activity = [self.step.doing] if self.step.doing else []
         return [*self._pace(), *activity]
 
@@ -117,7 +119,7 @@ class Watch:
 
 
 def _rate(per_s: float, unit: str) -> str:
-    """Return a rate per s, min or h, the first in which it is at least 1."""
+    """Return a rate as text, per s, min or h: the first unit with a rate of at least 1."""
     for seconds, name in ((1, "s"), (60, "min")):
         if per_s * seconds >= 1:
             return f"{_two_digits(per_s * seconds)} {unit}/{name}"
@@ -129,7 +131,7 @@ def _two_digits(value: float) -> str:
 
 
 def in_words(seconds: float) -> str:
-    """Return a duration as text, in s, min, h or days by its length."""
+    """Return a duration as text, in s, min, h or days depending on its length."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     if seconds < 90 * 60:
@@ -144,8 +146,8 @@ def show_progress(steps: Iterable[Progress | tuple[int, int]], noun: str) -> Non
 
     Args:
         steps: iterator that does the work and yields its progress. The first value
-            counts the results of earlier commands.
-        noun: plural noun for what is counted, for example "maps".
+            contains only the results of earlier commands.
+        noun: plural noun for the counted items, for example "maps".
     """
     from rich.console import Console
 
@@ -200,7 +202,8 @@ def _lines(watch: Watch) -> Iterator[Any]:
                 tell(watch.line())
 
     def poll() -> None:
-        # If this thread received an interruption, the main thread would not wake.
+        # Block interruptions here: if this thread received one, the main thread would
+        # continue to wait.
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
         while not ended.wait(_POLL_S):
             show()

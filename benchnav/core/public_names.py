@@ -13,32 +13,33 @@ def face(
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
     """Return `__getattr__`, `__dir__` and `__all__` of a package (PEP 562).
 
-    Importing the package then loads nothing else. Editors and type checkers read the
-    same names in `__init__.pyi`. A public name may differ from that in the module, as
-    in `create as create_dataset`: the parser of the commands looks up the names of
-    their functions in the surrounding packages, and would load a module with the name
-    of a command.
+    Importing the package then imports no module. Editors and type checkers read the
+    same names in `__init__.pyi`.
 
     Args:
         package: `__name__` of the package.
-        modules: public names by module.
+        modules: public names by module that defines them. `create as create_dataset`
+            gives the name `create` of the module the public name `create_dataset`.
+            This is needed for functions of commands: the parser looks up their names
+            in the surrounding packages, and would import a module of the same name.
     """
     sources = {}
     for module, names in modules.items():
         for name in names:
-            module_name, _, public = name.partition(" as ")
-            sources[public or module_name] = module, module_name
+            defined_name, _, public_name = name.partition(" as ")
+            sources[public_name or defined_name] = module, defined_name
 
     def find(name: str) -> Any:
-        old = f"{package}.{name}"
-        if old in IMPORTS:
-            # An ImportError, since `from … import` hides the text of an AttributeError.
-            raise ImportError(f"{old} is now {IMPORTS[old]}.")
+        full_name = f"{package}.{name}"
+        if full_name in IMPORTS:
+            # `from … import` would hide the text of an AttributeError.
+            raise ImportError(f"{full_name} is now {IMPORTS[full_name]}.")
         if name not in sources:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        module, module_name = sources[name]
-        value = getattr(import_module(module), module_name)
-        setattr(sys.modules[package], name, value)  # skips this function from now on
+        module, defined_name = sources[name]
+        value = getattr(import_module(module), defined_name)
+        # Later accesses find the attribute and do not call this function.
+        setattr(sys.modules[package], name, value)
         return value
 
     def list_names() -> list[str]:

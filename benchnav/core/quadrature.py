@@ -1,10 +1,11 @@
 """Integrals of monotone functions of a CDF, cell by cell.
 
-The error of a trapezium over an interval is at most half of its length times the change
-of the function over it, whatever atoms and gaps it contains. In each cell, the
-intervals with the largest error bound are bisected, a fixed number of times. Where the
-function is smooth, a parabola replaces the chord. Cells whose parabolas still have a
-large correction, for example with many atoms, are computed again with more bisections.
+The trapezium rule over an interval has an error of at most half the interval's length
+times the change of the function over the interval, even if the CDF has atoms or gaps
+there. In each cell, the intervals with the largest error bounds are bisected, in a
+fixed number of rounds. Where the function is smooth, the area below a parabola replaces
+the trapezium. Cells with a large error estimate, for example because of many atoms, are
+computed again with more rounds.
 
 Letters in shapes: b×h×w cells of a chunk; M nodes; S intervals.
 """
@@ -16,16 +17,17 @@ from typing import Protocol, Self
 import torch
 from torch import Tensor
 
-N_INTERVALS = 16  # initial intervals
-_AT_ONCE = 4  # intervals of a cell that are bisected together
+N_INTERVALS = 16  # number of initial intervals of a cell
+_N_LANES = 4  # intervals of a cell that are bisected together in a round
 _ROUNDS = 24
-_MORE_ROUNDS = 3  # factor for cells whose error estimate exceeds `_MAX_ERROR`
+_ROUNDS_FACTOR = 3  # for cells whose error estimate exceeds `_MAX_ERROR`
 _MAX_ERROR = 3e-5
-# An error bound includes the correction by the parabola and, since an interval may hide
-# a jump, this fraction of the change over the interval.
+# An error bound includes the correction by the parabola and, since the function may
+# jump within an interval, this fraction of the change over the interval.
 _JUMP_FRACTION = 0.1
-# Ratio of the change over an interval to the maximum correction of a monotone parabola.
-_MAX_CORRECTION = 3
+# The correction by a monotone parabola is at most the change over the interval divided
+# by this number.
+_MAX_CORRECTION_DIVISOR = 3
 
 
 class _Distribution(Protocol):
@@ -43,7 +45,7 @@ class _Distribution(Protocol):
 
     def select(self, members: Tensor) -> Self: ...
 
-    def _in_members(self) -> Self: ...
+    def _with_flat_batch(self) -> Self: ...
 
 
 def edges_between(low: Tensor, high: Tensor | float) -> Tensor:
@@ -72,12 +74,12 @@ def integral(
 
     Args:
         distribution: distribution of shape [b, h, w].
-        curve: function of the CDF and of nodes [M, b, h, w]; returns values of that
-            shape.
+        curve: monotone function of the CDF and of nodes of shape [M, b, h, w]; it
+            returns values of that shape.
         edges: ascending edges of the initial intervals, shape [S + 1, b, h, w].
-        first: value at the first edge, shape [b, h, w].
-        last: value at the last edge, shape [b, h, w].
-        rounds: number of bisections.
+        first: value of `curve` at the first edge, shape [b, h, w].
+        last: value of `curve` at the last edge, shape [b, h, w].
+        rounds: number of rounds of bisection.
 
     Returns:
         Integrals, float64, shape [b, h, w].
@@ -86,14 +88,14 @@ def integral(
     total, error = _trapezia(function, edges, first, last, rounds)
     is_inexact = error > _MAX_ERROR
     if is_inexact.any():
-        inexact = distribution.at(is_inexact)._in_members()
+        inexact = distribution.at(is_inexact)._with_flat_batch()
         function = partial(curve, _stacked(inexact))
         # The inexact cells become a map of one row.
         edges, first, last = (
             values[..., is_inexact][..., None, None, :]
             for values in (edges, first, last)
         )
-        more_rounds = rounds * _MORE_ROUNDS
+        more_rounds = rounds * _ROUNDS_FACTOR
         refined, _ = _trapezia(function, edges, first, last, more_rounds)
         total[is_inexact] = refined.flatten()
     return total
@@ -102,9 +104,10 @@ def integral(
 def _stacked(
     distribution: _Distribution,
 ) -> Callable[[Tensor], Tensor]:
-    """Return the CDF as a function of M values per cell, [M, b, h, w] to [M, b, h, w].
+    """Return the CDF as a function of M values per cell.
 
-    The distribution is repeated M times, so that a single call computes all values.
+    Argument and result have the shape [M, b, h, w]. The distribution is repeated M
+    times, so that a single call computes all values.
     """
     cache: dict[int, _Distribution] = {}
 
@@ -128,14 +131,15 @@ def _trapezia(
 ) -> tuple[Tensor, Tensor]:
     """Return integrals and their error estimates, both of shape [b, h, w].
 
-    The error is estimated from intervals with a jump.
+    The estimate assumes that the error is due to jumps within the final intervals.
     """
     inner_values = function(edges[1:-1])
     values = torch.cat((first[None], inner_values, last[None]))
-    # A lane bisects one of its intervals per round and passes one half to the next
-    # lane, so that all lanes have intervals to bisect.
-    n_filled = N_INTERVALS // _AT_ONCE
-    lane_shape = _AT_ONCE, *first.shape
+    # The intervals of a cell are divided into lanes. A lane bisects one of its
+    # intervals per round and passes one half to the next lane, so that each lane has
+    # intervals with large error bounds.
+    n_filled = N_INTERVALS // _N_LANES
+    lane_shape = _N_LANES, *first.shape
     shape = (n_filled + rounds, *lane_shape)
     intervals = [values.new_empty(shape) for _ in range(6)]
     begin, width, value, rise, correction, bound = intervals
@@ -147,29 +151,31 @@ def _trapezia(
     for new in range(n_filled, len(begin)):
         # `max` is several times faster than `argmax`.
         worst = bound[:new].max(0, keepdim=True).indices
-        x, old_width, old_value, old_rise = (
+        old_begin, old_width, old_value, old_rise = (
             layer.gather(0, worst)[0] for layer in intervals[:4]
         )
         half = old_width / 2
-        centre = x + half
+        centre = old_begin + half
         middle = function(centre)
         left_rise = middle - old_value
         right_rise = old_value + old_rise - middle
-        # Mean of the parabola through the three points minus the chord of either half.
+        # Mean difference between the parabola through the three points and the chord,
+        # in either half.
         mean_excess = (left_rise - right_rise) / 12
         left_correction = _limited(mean_excess, left_rise)
         right_correction = _limited(mean_excess, right_rise)
         left_bound = _bound(half, left_correction, left_rise)
         right_bound = _bound(half, right_correction, right_rise)
-        replaced = (half, left_rise, left_correction, left_bound)
-        for layer, part in zip((width, rise, correction, bound), replaced, strict=True):
+        left_half = (half, left_rise, left_correction, left_bound)
+        changed = (width, rise, correction, bound)
+        for layer, part in zip(changed, left_half, strict=True):
             layer.scatter_(0, worst, part[None])
-        added = (centre, half, middle, right_rise, right_correction, right_bound)
-        for layer, part in zip(intervals, added, strict=True):
+        right_half = (centre, half, middle, right_rise, right_correction, right_bound)
+        for layer, part in zip(intervals, right_half, strict=True):
             layer[new] = part.roll(1, 0)
     mean_value = value + rise / 2 + correction
     areas = width * mean_value
-    # At a jump, the correction is a twelfth of the rise.
+    # In an interval with a jump, the correction is a twelfth of the rise.
     abs_rise = rise.abs().clamp(min=1e-300)
     errors = 12 * width * correction.square() / abs_rise
     total = areas.flatten(0, 1).sum(0)
@@ -178,8 +184,8 @@ def _trapezia(
 
 
 def _limited(excess: Tensor, rise: Tensor) -> Tensor:
-    """Return a correction, limited to that of a monotone parabola."""
-    limit = rise.abs() / _MAX_CORRECTION
+    """Return a correction, limited to the maximum of a monotone parabola."""
+    limit = rise.abs() / _MAX_CORRECTION_DIVISOR
     return excess.minimum(limit).maximum(-limit)
 
 

@@ -1,8 +1,8 @@
-"""Distributions by their quantiles, as in quantile regression, with exact integrals.
+"""Distributions given by their quantiles, as in quantile regression.
 
 The quantile function has the values x_i at levels u_i and is linear in between. If it
-is constant over an interval, λ has an atom. Mean, VaR and CVaR are weighted sums of the
-x_i; expected time and CRPS are sums over intervals.
+is constant over an interval of levels, λ has an atom. Mean, VaR and CVaR are weighted
+sums of the x_i; expected time and CRPS are sums over intervals. All are exact.
 Letters in shapes: Q levels; H×W cells; *B any leading dimensions.
 """
 
@@ -18,9 +18,9 @@ from torch import Tensor
 from benchnav.core.distribution import TraversabilityDistribution, check_floor, tail_of
 from benchnav.core.errors import ConfigError, expect
 
-_MIN_LEVELS = 64
-_TAIL = 0.1
-_TAIL_STEP = 0.01  # maximum step of levels below `_TAIL`
+_MIN_LEVELS = 64  # minimum number of levels
+_TAIL = 0.1  # upper end of the tail, as a level
+_TAIL_STEP = 0.01  # maximum difference between levels in the tail
 
 LEVELS: tuple[float, ...] = (
     *(0.0, 0.001, 0.002, 0.003, 0.005, 0.0075),
@@ -28,7 +28,7 @@ LEVELS: tuple[float, ...] = (
     *(round(0.1 + 0.02 * step, 2) for step in range(45)),
     *(0.99, 0.995, 1.0),
 )
-"""Default levels of models: 72, a third of them in the lower tail, up to 0.1."""
+"""Default levels of models: 72 levels, a third of them in the lower tail up to 0.1."""
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,10 @@ class QuantileDistribution(TraversabilityDistribution):
     """Quantiles of λ in each cell, with linear interpolation.
 
     Args:
-        values: λ at the levels, ascending and in [0, 1], shape [*B, Q, H, W]. Equal
-            values at several levels are an atom.
-        levels: at least 64 levels, ascending from 0 (the minimum of λ) to 1 (the
-            maximum), and at most 0.01 apart up to 0.1.
+        values: quantiles of λ at the levels, never descending, in [0, 1], shape
+            [*B, Q, H, W]. Equal values at several levels form an atom.
+        levels: at least 64 levels, ascending from 0 (the minimum of λ) to 1 (its
+            maximum), and at most 0.01 apart up to level 0.1.
 
     Raises:
         ConfigError: If the levels or the shape are invalid.
@@ -50,29 +50,29 @@ class QuantileDistribution(TraversabilityDistribution):
 
     def __post_init__(self) -> None:
         """Validate levels and shape; `check_model` validates that values ascend."""
-        # Python floats, since PyTorch would trace an array when it exports a graph.
+        # Python floats, since PyTorch would trace an array during export of a graph.
         levels = self.levels
         steps = [upper - lower for lower, upper in pairwise(levels)]
         spans = bool(levels) and levels[0] == 0 and levels[-1] == 1
         is_ascending = bool(steps) and min(steps) > 0
         expect(
             len(levels) >= _MIN_LEVELS and spans and is_ascending,
-            f"`levels` that ascend from 0 to 1, {_MIN_LEVELS} or more, got "
-            f"{len(levels)}. Use `benchnav.core.quantiles.LEVELS`.",
+            f"at least {_MIN_LEVELS} `levels` that ascend from 0 to 1, got "
+            f"{len(levels)} levels. Use `benchnav.core.quantiles.LEVELS`.",
         )
-        # Steps that start in the tail; rounding must not add the step from 0.1.
+        # Steps that start in the tail. Rounding must not add the step from level 0.1.
         n_tail_steps = bisect_left(levels, _TAIL - 1e-9)
         max_step = max(steps[:n_tail_steps])
         expect(
             max_step <= _TAIL_STEP + 1e-9,
-            f"`levels` at most {_TAIL_STEP} apart up to {_TAIL}, where risk is, got "
-            f"{max_step:.3g}. Add levels there.",
+            f"`levels` at most {_TAIL_STEP} apart up to {_TAIL}, the tail that risk "
+            f"depends on, got a step of {max_step:.3g}. Add levels there.",
         )
         shape = self.values.shape
         if len(shape) < 3 or shape[-3] != len(levels):
             raise ConfigError(
-                f"Expected `values` of shape [*B, {len(levels)}, H, W], one map a "
-                f"level, got {list(shape)}."
+                f"Expected `values` of shape [*B, {len(levels)}, H, W], with one map "
+                f"per level, got {list(shape)}."
             )
 
     @property
@@ -154,8 +154,8 @@ class QuantileDistribution(TraversabilityDistribution):
         width = width * in_tail / tail
         slow = low.clamp(min=floor)
         fast = high.clamp(min=floor)
-        # Below the floor, 1 / λ counts as 1 / floor. Over the remainder [a, b] of an
-        # interval, the mean of 1 / λ is log(b / a) / (b − a).
+        # Below the floor, 1 / λ counts as 1 / floor. Over the remaining part [a, b] of
+        # an interval, the mean of 1 / λ is log(b / a) / (b − a).
         below_floor = _fraction(floor, low, high)
         below_floor = torch.where(high <= floor, 1.0, below_floor)
         growth = (fast - slow) / slow
@@ -174,7 +174,7 @@ class QuantileDistribution(TraversabilityDistribution):
         split = at.clamp(low, high)
         gap = torch.where(high > low, high - low, 1.0)
         f = before + width * ((split - low) / gap)  # F at the split
-        # Integrals of squares of linear functions, times 3.
+        # Three times the integrals of squares of linear functions.
         below = (split - low) * (before * before + before * f + f * f)
         g = 1 - f
         last = 1 - levels[1:]
@@ -193,7 +193,10 @@ class QuantileDistribution(TraversabilityDistribution):
         return self.values.double().movedim(-3, -1).contiguous()
 
     def _intervals(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Return both ends [*B, H, W, Q − 1] and probabilities [Q − 1] of intervals."""
+        """Return lower ends, upper ends and probabilities of intervals between levels.
+
+        The ends have shape [*B, H, W, Q − 1], the probabilities shape [Q − 1].
+        """
         knots = self._knots()
         low = knots[..., :-1]
         high = knots[..., 1:]
@@ -202,7 +205,8 @@ class QuantileDistribution(TraversabilityDistribution):
     def _tail_mean(self, tail: float) -> Tensor:
         """Return the mean of the quantile function over [0, tail], shape [*B, H, W].
 
-        It is a sum of the x_i, weighted by the integrals of their hat functions.
+        It is a sum of the x_i, weighted by the integrals of the hat functions with
+        which the quantile function interpolates.
         """
         levels = np.array(self.levels)
         start = levels[:-1]
@@ -227,22 +231,23 @@ def _fraction(value: Tensor | float, low: Tensor, high: Tensor) -> Tensor:
 
 def quantiles_at(
     distribution: TraversabilityDistribution,
-    reads: Sequence[float],
+    probabilities: Sequence[float],
     levels: tuple[float, ...] = LEVELS,
 ) -> QuantileDistribution:
-    """Return a distribution whose levels are relabelled quantiles of another.
+    """Return a distribution with the quantiles of another at changed levels.
 
-    Its quantile at `levels[i]` is that of `distribution` at `reads[i]`.
+    Its quantile at `levels[i]` is the quantile of `distribution` at `probabilities[i]`.
 
     Args:
         distribution: distribution of shape [*B, H, W].
-        reads: probability in `distribution` for each level, ascending from 0 to 1.
+        probabilities: probability in `distribution` for each level, from 0 to 1, never
+            descending.
         levels: levels of the result, as in `QuantileDistribution`.
 
     Returns:
         A distribution of shape [*B, H, W].
     """
-    values = (distribution.quantile(read).clamp(0, 1) for read in reads)
-    # Rounding may break the ascending order.
+    values = (distribution.quantile(u).clamp(0, 1) for u in probabilities)
+    # Rounding may cause a small descent, which the cumulative maximum removes.
     ascending = list(accumulate(values, torch.maximum))
     return QuantileDistribution(torch.stack(ascending, -3), levels)

@@ -1,4 +1,4 @@
-"""Quantities of a column: name, unit and better direction, for tables and figures."""
+"""Quantities in tables of episodes: name, unit and better direction."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -18,7 +18,7 @@ class Quantity:
         unit: unit of differences, margins and tables; may be empty.
         scale: factor from the column's unit to `unit`, such as 100 from a fraction to
             percentage points.
-        heading: heading of its column in a report.
+        heading: heading of the quantity's column in a report.
         meaning: phrase that defines one value, without a full stop.
         better: better direction.
         of_arrivals: whether conditions are compared only over the episodes in which
@@ -37,5 +37,5 @@ class Quantity:
     of_arrivals: bool = False
 
     def summary_column(self, statistic: str) -> str:
-        """Return a statistic's column in a summary, such as `total_time_mean_s`."""
+        """Return the column of a statistic in a summary, such as `total_time_mean_s`."""
         return f"{self.column.removesuffix(self.suffix)}_{statistic}{self.suffix}"

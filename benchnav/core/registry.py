@@ -4,25 +4,28 @@ Parts are planners, models, risk measures, robots, objectives, appearance sensor
 `sensor`), traversability sensors (kind `ground`), beliefs, metrics of episodes, layers
 of recipes, and figures of reports. A user names a part in one of four forms:
 
-- the name of an entry point in the group `benchnav.<kind>s` of an installed package;
-  shipped parts such as `mppi` are entry points too;
-- `package.module:Name`, for anything that can be imported;
+- the name of an entry point in the group `benchnav.<kind>s` of an installed package,
+  such as `mppi`, a shipped part;
+- `package.module:Name`, for a module that can be imported;
 - `path/to/file.py:Name`, for a single file;
-- any of these followed by `:VALUE`, which sets the first option: `cvar:0.5` is `cvar`
-  at level 0.5.
+- any of these forms followed by `:VALUE`, which sets the first option: `cvar:0.5` is
+  `cvar` at level 0.5.
 
 The name refers to a class or a function, whose keyword parameters are the options. If
 the only parameter is a dataclass named `config`, its fields are the options. A class is
-called with the options. If a risk measure is a function, it is called with its mixture
-and the options.
+called with the options. A function that is a risk measure is called with the mixture of
+λ and the options.
 
-The identity of a part consists of three digests: of its source and all its imports, of
-each file or folder that an option names, and of the `files` that the class or function
-lists relative to its own file, as in `files = ("weights.npz",)`. Options that name
-output files are listed in `writes`, as in `writes = ("log",)`. Options that were added
-after the first release are listed in `added`, as in `added = ("explore",)`, by the class
-or by that of its `config`. At their default they are omitted from records, so that older
-records still identify the same part.
+The identity of a part consists of digests of its source and all its imports, of each
+file or folder that an option names, and of the part's `files`. Three attributes of the
+class or function are lists of names:
+
+- `files`, as in `files = ("weights.npz",)`: files that it reads, relative to its own
+  file;
+- `writes`, as in `writes = ("log",)`: options that name output files;
+- `added`, as in `added = ("explore",)`: options that are newer than the first release;
+  the dataclass of `config` may list them instead. Records omit these options if they
+  have their default, so that older records still identify the same part.
 """
 
 import importlib
@@ -59,8 +62,8 @@ from benchnav.core.settings import hint as hint
 from benchnav.core.sources import digest_of_path
 from benchnav.core.yaml_text import load_yaml
 
-# The base class of each kind, and the package from which users import it. A risk
-# measure may be any function.
+# Package and name of the base class of each kind. A risk measure has no base class: it
+# may be any function.
 _BASES = {
     "planner": ("benchnav.planning", "Planner"),
     "model": ("benchnav.models", "TraversabilityModel"),
@@ -77,11 +80,11 @@ _BASES = {
 
 @dataclass(frozen=True, kw_only=True)
 class Part:
-    """Description of a part, by which any process can create the object.
+    """Description of a part, from which any process can create the part's object.
 
     Args:
         part: a name, `package.module:Name` or `path/to/file.py:Name`.
-        label: name in tables.
+        label: name of the part in tables.
         options: values of options by name.
         kind: one of `KINDS`.
     """
@@ -93,14 +96,14 @@ class Part:
 
     @property
     def found(self) -> Found:
-        """The class or function that creates the object, and where it comes from."""
+        """The class or function that creates the object, and its origin."""
         return find(self.kind, self.part)
 
     @property
     def object(self) -> Any:
-        """The object for queries of its properties; a process creates it once.
+        """The object, for reading its properties; a process creates it once.
 
-        The object must not have state.
+        Callers share the object, so it must not have state.
         """
         target = self.found.target
         description = json.dumps(
@@ -117,8 +120,8 @@ class Part:
         return make(self.kind, self, **arguments)
 
 
-# Objects by description, with the class or function that created them. The target in a
-# file changes with the file.
+# Class or function and the object that it created, by description of the part. A part
+# in a file has another class or function after the file has changed.
 _CREATED: dict[str, tuple[Any, Any]] = {}
 
 
@@ -133,8 +136,8 @@ def read_part(kind: str, entry: str | Mapping[str, Any] | Part) -> Part:
         entry: the text or the mapping; a `Part` is returned unchanged.
 
     Returns:
-        The part. A value after the last colon becomes an option. The default label is
-        the text without module or file.
+        The part. A value after the last colon becomes the first option. The default
+        label is the text without module or file.
 
     Raises:
         ConfigError: If the entry has neither form.
@@ -154,8 +157,8 @@ def read_part(kind: str, entry: str | Mapping[str, Any] | Part) -> Part:
         name, first_value = _read_first_option(kind, text, source, value)
         if name in options:
             raise ConfigError(
-                f"Expected option {name!r} of {kind} {text!r} once, got "
-                f"{options[name]!r} too."
+                f"Expected option {name!r} of {kind} {text!r} once, got also "
+                f"{options[name]!r} in `options`. Leave one of the values out."
             )
         options = {name: first_value, **options}
     label = fields.get("label")
@@ -167,7 +170,7 @@ def read_part(kind: str, entry: str | Mapping[str, Any] | Part) -> Part:
 
 
 def _is_part(fields: Any) -> bool:
-    """Return whether a value has the keys of a part, with values of their types."""
+    """Return whether a value is a mapping with the keys and value types of a part."""
     if not isinstance(fields, Mapping):
         return False
     has_keys = {"part"} <= set(fields) <= {"part", "label", "options"}
@@ -184,8 +187,8 @@ def _read_first_option(
     options = options_of(kind, find(kind, source).target)
     if not options:
         raise ConfigError(
-            f"Expected {kind} {source!r} without a value, got {text!r}: it has no "
-            "options."
+            f"Expected {kind} {source!r} without a value, since it has no options, got "
+            f"{text!r}."
         )
     name, option = next(iter(options.items()))
     data = load_yaml(value) if option.kind is Any else value
@@ -193,10 +196,10 @@ def _read_first_option(
 
 
 def complete(kind: str, part: Part) -> Part:
-    """Check the options of a part, and add their defaults.
+    """Check the options of a part, and add the defaults of all other options.
 
     Two descriptions of the same part then have equal options. Options that the part
-    lists as `added` are omitted at their default.
+    lists in `added` are omitted if they have their default.
 
     Raises:
         ConfigError: If there is no such part or option, or a value has a different type.
@@ -232,8 +235,8 @@ def make(kind: str, part: str | Mapping[str, Any] | Part, **arguments: Any) -> A
     Args:
         kind: one of `KINDS`.
         part: a part in any form that `read_part` reads.
-        arguments: arguments that the program passes, such as an objective's `robot`;
-            those without a parameter of their name are ignored.
+        **arguments: arguments that benchnav passes, such as an objective's `robot`. An
+            argument is ignored if the part has no parameter of its name.
 
     Returns:
         The object. For a risk measure, a function whose only argument is the mixture.
@@ -261,7 +264,12 @@ def make(kind: str, part: str | Mapping[str, Any] | Part, **arguments: Any) -> A
 
 
 def take(kind: str, part: Any, **arguments: Any) -> Any:
-    """Return an object unchanged, or create that of a part as `make` does.
+    """Return an object unchanged, or create the object of a part as `make` does.
+
+    Args:
+        kind: one of `KINDS`.
+        part: an object, or a part in any form that `read_part` reads.
+        **arguments: arguments for `make`.
 
     Raises:
         ConfigError: If the object is not of this kind, or `make` raises an error.
@@ -281,7 +289,7 @@ def check_base(kind: str, instance: Any, owner: str) -> None:
         owner: name of the object in the message.
 
     Raises:
-        ConfigError: If it is not. The message names the base class and its package.
+        ConfigError: If the object is not an instance of the base class.
     """
     if kind not in _BASES:
         return
@@ -290,8 +298,8 @@ def check_base(kind: str, instance: Any, owner: str) -> None:
     if not isinstance(instance, base_class):
         name = type(instance).__name__
         raise ConfigError(
-            f"Expected {owner} to be a subclass of {package}.{base}, got {name}. Write "
-            f"class {name}({base})."
+            f"Expected {owner} to be an instance of {package}.{base}, got {name}. "
+            f"Write class {name}({base})."
         )
 
 
@@ -299,11 +307,11 @@ def check_base(kind: str, instance: Any, owner: str) -> None:
 
 
 def option_files(part: Part) -> dict[str, str]:
-    """Return digests of files and folders that options name, by path as written.
+    """Return digests of the files and folders that options name, by path as written.
 
-    A text that looks like a path but does not exist is included with an empty digest,
-    so that its creation and deletion are noticed. Options that the part lists as
-    `writes` are excluded.
+    A text that looks like a path is included even if no such file exists, with an empty
+    digest, so that a later creation of the file changes the record. Options that the
+    part lists in `writes` are excluded.
 
     Raises:
         ConfigError: If an option names a folder that contains the working folder.
@@ -313,13 +321,13 @@ def option_files(part: Part) -> dict[str, str]:
     digests = {}
     for text in _texts(values):
         path = Path(os.path.expanduser(text))
-        # `os.path.exists` accepts invalid paths, for which `Path.exists` raises errors.
+        # `Path.exists` would raise an error for an invalid path.
         exists = os.path.exists(path)
         if exists and path.is_dir() and Path.cwd().is_relative_to(path.resolve()):
             raise ConfigError(
-                f"Expected options of {part.kind} {part.part!r} that name files or "
-                f"folders of their own, got {text!r}, which contains the working "
-                "folder. Name the folder that is read, or list the option in `writes`."
+                f"Expected no option of {part.kind} {part.part!r} to name a folder that "
+                f"contains the working folder, got {text!r}. Name the folder that the "
+                "part reads, or list the option in `writes`."
             )
         looks_like_path = os.sep in text or re.search(r"\.[A-Za-z]\w*$", text)
         if exists or looks_like_path:

@@ -1,6 +1,6 @@
 """Names of version 1 and their replacements in version 2, for error messages."""
 
-# Imports of programs.
+# New dotted names of modules, classes and functions, by old dotted name.
 IMPORTS = {
     "benchnav.core.figures": "benchnav.viz",
     "benchnav.metrics.Learnt": "benchnav.metrics.LearningRecord",
@@ -19,5 +19,5 @@ IMPORTS = {
     "benchnav.planning.risk.var": "benchnav.planning.VaR",
 }
 
-# Parts, by kind.
+# New names of parts, by kind and old name.
 PARTS = {("planner", "optimal_bound"): "near_optimal"}

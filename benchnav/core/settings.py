@@ -3,8 +3,8 @@
 Plain data comes from YAML, JSON and command lines. It becomes dataclasses and options of
 parts. The options of a class or function are its keyword parameters. If its only
 parameter is a dataclass named `config`, the fields of `config` are the options. A value
-is read by its annotated type. Dataclasses are read here, key by key, because messages
-name the wrong key; jsonargparse reads all other types.
+is read according to its annotated type. This module reads dataclasses, key by key, so
+that messages name the invalid key; jsonargparse reads all other types.
 """
 
 import difflib
@@ -22,12 +22,12 @@ from typing import Any, get_args, get_origin, get_type_hints
 from benchnav.core.annotations import dataclass_in as dataclass_in
 from benchnav.core.annotations import in_words as in_words
 from benchnav.core.annotations import members_of as members_of
-from benchnav.core.errors import BenchnavError, ConfigError, out_of_memory
+from benchnav.core.errors import BenchnavError, ConfigError, out_of_memory_error
 from benchnav.core.yaml_text import MAX_DEPTH, check_yaml
 
 NO_DEFAULT = inspect.Parameter.empty
 
-# From a key with dots to its name in messages; an empty key stands for all settings.
+# Function from a dotted key to its name in messages; an empty key means all settings.
 Naming = Callable[[str], str]
 
 _UNNAMED = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
@@ -38,8 +38,8 @@ class Option:
     """Type and default of an option.
 
     Args:
-        kind: annotated type; `Any` without an annotation.
-        default: `NO_DEFAULT` if the option is required.
+        kind: annotated type; `Any` if there is no annotation.
+        default: default value; `NO_DEFAULT` if the option is required.
     """
 
     kind: Any
@@ -77,14 +77,14 @@ def list_options(
 
 
 def config_class(target: Callable[..., Any], skipped: Iterable[str] = ()) -> Any:
-    """Return the dataclass of `config` if this is the only parameter, else None."""
+    """Return the dataclass of the parameter `config` if it is the only one, else None."""
     if set(parameters(target)) - set(skipped) != {"config"}:
         return None
     return dataclass_in(_types(target).get("config"))
 
 
 def parameters(target: Callable[..., Any]) -> dict[str, inspect.Parameter]:
-    """Return named parameters: no `*args` or `**kwargs`; empty without a constructor."""
+    """Return parameters by name, except `*args` and `**kwargs`."""
     if inspect.isclass(target) and target.__init__ is object.__init__:
         return {}
     return {
@@ -95,9 +95,9 @@ def parameters(target: Callable[..., Any]) -> dict[str, inspect.Parameter]:
 
 
 def _types(target: Any) -> dict[str, Any]:
-    """Return types of parameters by name, without those that cannot be resolved.
+    """Return types of parameters by name, except those that cannot be resolved.
 
-    A name that is imported only for type checkers cannot be resolved.
+    A type cannot be resolved if it is imported only for type checkers.
     """
     if inspect.isclass(target) and not is_dataclass(target):
         target = target.__init__
@@ -116,7 +116,7 @@ def _types(target: Any) -> dict[str, Any]:
 
 
 def call(what: str, target: Callable[..., Any], arguments: Mapping[str, Any]) -> Any:
-    """Call a user's class or function, and convert its exceptions.
+    """Call a user's class or function; convert its exceptions to `ConfigError`.
 
     Args:
         what: name of the result in messages.
@@ -124,14 +124,14 @@ def call(what: str, target: Callable[..., Any], arguments: Mapping[str, Any]) ->
         arguments: keyword arguments.
 
     Raises:
-        ConfigError: If the call raises an exception that is not BenchNav's own.
+        ConfigError: If the call raises an exception other than a `BenchnavError`.
     """
     try:
         return target(**arguments)
     except BenchnavError:
         raise
     except Exception as error:
-        raise out_of_memory(error) or ConfigError(
+        raise out_of_memory_error(error) or ConfigError(
             f"{what} could not be created: {one_line(error)}"
         ) from error
 
@@ -140,22 +140,22 @@ def call(what: str, target: Callable[..., Any], arguments: Mapping[str, Any]) ->
 
 
 def of(owner: str) -> Naming:
-    """Return a naming of keys as those of an owner, such as "planner 'mppi'"."""
+    """Return a function that names keys of an owner, such as "planner 'mppi'"."""
     return lambda key: f"`{key}` of {owner}" if key else owner
 
 
 def read(
-    kind: Any, value: Any, name: Naming, key: str = "", now: Any = NO_DEFAULT
+    kind: Any, value: Any, name: Naming, key: str = "", present: Any = NO_DEFAULT
 ) -> Any:
     """Return a value converted to a type.
 
     Args:
         kind: annotated type.
         value: plain data, or a value of the type; text is parsed as on the command line.
-        name: name of a key in messages.
-        key: key of the value, with dots; empty for all settings.
-        now: present value, which `value` replaces; for a dataclass, only the fields in
-            `value` are replaced.
+        name: function from a key to its name in messages.
+        key: dotted key of the value; empty for all settings.
+        present: present value, which `value` replaces. If it is a dataclass, only the
+            fields in `value` are replaced.
 
     Raises:
         ConfigError: If a key is unknown or missing, a value has a different type, or the
@@ -165,14 +165,14 @@ def read(
     if (
         kind is Any
         or (isinstance(kind, type) and type(value) is kind)
-        or (value is None and now is None)
+        or (value is None and present is None)
     ):
         return value
     config = dataclass_in(kind)
     origin = get_origin(kind)
     members = get_args(kind)
     if config and isinstance(value, Mapping):
-        base = now if isinstance(now, config) else None
+        base = present if isinstance(present, config) else None
         before = None
         if base is not None:
             before = {field.name: getattr(base, field.name) for field in fields(base)}
@@ -182,7 +182,8 @@ def read(
     if origin is dict and dataclass_in(members[1]) and isinstance(value, Mapping):
         if not all(isinstance(inner, str) for inner in value):
             raise ConfigError(
-                f"Expected names in {name(key)}, got {list(value)}. Quote numbers."
+                f"Expected keys of {name(key)} as text, got {list(value)}. Put numbers "
+                "in quotes."
             )
         return {
             inner: read(members[1], item, name, f"{key}.{inner}")
@@ -207,7 +208,7 @@ def read(
         )
         if is_list and not value.lstrip().startswith(("[", "(")):
             data = f"[{value}]"
-        check_yaml(data)  # The parser checks neither keys nor nesting.
+        check_yaml(data)  # the parser checks neither duplicate keys nor nesting
     try:
         parsed = _parsed(kind, data)
     except ValueError as error:
@@ -222,11 +223,11 @@ def read(
 
 
 def _check_size(value: Any, what: str) -> None:
-    """Reject integers of more than 64 bits, which no array or generator accepts."""
+    """Reject integers of more than 64 bits, which arrays and generators cannot store."""
     if type(value) is int and abs(value) >= 2**64:
         raise ConfigError(
             f"Expected {what} as a whole number of at most 64 bits, got one of "
-            f"{value.bit_length()}."
+            f"{value.bit_length()} bits."
         )
 
 
@@ -235,16 +236,16 @@ def read_options(
     values: Mapping[str, Any],
     name: Naming,
     key: str = "",
-    now: Mapping[str, Any] | None = None,
+    present: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Return values converted to the types of their options, by name.
 
     Args:
         options: available options by name.
-        values: plain data by option.
-        name: name of a key in messages.
-        key: key of the options, with dots; empty for all settings.
-        now: present values by name; if None, options without a default are required.
+        values: plain data by name of the option.
+        name: function from a key to its name in messages.
+        key: dotted key of all options; empty for all settings.
+        present: present values by name; if None, options without a default are required.
 
     Raises:
         ConfigError: If an option is unknown or missing, or `read` rejects its value.
@@ -262,12 +263,12 @@ def read_options(
             f"{option_name!r}.{hint(option_name, options)}"
         )
     for option_name, option in options.items():
-        is_required = option.default is NO_DEFAULT and now is None
+        is_required = option.default is NO_DEFAULT and present is None
         if is_required and option_name not in values:
             expected = f"{name(inner + option_name)} as {in_words(option.kind)}"
             raise ConfigError(f"Expected {expected}, got none.")
     before = {option_name: option.default for option_name, option in options.items()}
-    before |= now or {}
+    before |= present or {}
     converted = {}
     for option_name, value in values.items():
         kind = options[option_name].kind
@@ -280,17 +281,18 @@ def changed(data: Any, path: Sequence[str], value: Any) -> Any:
     """Return a copy of plain data with one value set.
 
     Args:
-        data: mappings, and lists whose items are identified by `name`, such as terrain
-            classes.
-        path: keys that lead to the value; missing mappings are created.
-        value: plain data.
+        data: nested mappings and lists. An item of a list is identified by its `name`,
+            as a terrain class is, or by its index.
+        path: keys of nested mappings and lists that lead to the value; missing mappings
+            are created.
+        value: new value, plain data.
 
     Raises:
-        ConfigError: If `path` is too long or leads through a value without keys.
+        ConfigError: If `path` is too long, or leads through a value without keys.
     """
     if len(path) > MAX_DEPTH:
         raise ConfigError(
-            f"Expected at most {MAX_DEPTH} keys with dots between, got {len(path)}."
+            f"Expected at most {MAX_DEPTH} keys, separated by dots, got {len(path)}."
         )
     if not path:
         return value
@@ -328,8 +330,8 @@ def _parsed(kind: Any, value: Any) -> Any:
 
     try:
         parser = _parser(kind)
-        # The parser treats null as a missing value; for a dataclass, it does so with
-        # anything but a mapping.
+        # The parser would treat null as a missing value and, for a dataclass, any value
+        # that is not a mapping.
         if value is None or is_dataclass(kind):
             raise ValueError
         return parser.instantiate(parser.parse_object({"value": value})).value
@@ -352,7 +354,7 @@ def _parser(kind: Any) -> Any:
 def plain(value: Any) -> Any:
     """Return a value as plain data for JSON.
 
-    Fields that a dataclass lists as `added` are omitted at their default.
+    Fields that a dataclass lists in `added` are omitted if they have their default.
 
     Raises:
         ConfigError: If a value cannot be expressed as plain data.
@@ -381,13 +383,16 @@ def plain(value: Any) -> Any:
 
 
 def hint(name: str, names: Iterable[str], prefix: str = "") -> str:
-    """Return a sentence with the most similar name, with a space first, or ''."""
+    """Return a sentence that suggests the most similar name; empty if none is similar.
+
+    The sentence begins with a space.
+    """
     similar = difflib.get_close_matches(name, list(names), n=1)
     return f" Did you mean {prefix + similar[0]!r}?" if similar else ""
 
 
 def check_known(what: str, value: Any, names: Iterable[str]) -> None:
-    """Check that a value is among names; the message suggests a similar one.
+    """Check that a value is among names; the message suggests a similar name.
 
     Args:
         what: name of the value in the message.
@@ -411,7 +416,7 @@ def one_line(error: BaseException) -> str:
 
 
 def fault(error: BaseException) -> str:
-    """Return the error of a part in one line; BenchNav's own errors without a type."""
+    """Return the error of a part in one line; a `BenchnavError` without its type."""
     if isinstance(error, BenchnavError):
         return " ".join(str(error).split())
     return one_line(error)

@@ -10,7 +10,7 @@ _SPACE = "\0"
 
 
 def short_repr(value: Any) -> str:
-    """Return the fields of a dataclass with dtype and shape, or text, of values."""
+    """Return the fields of a dataclass, with dtype and shape of tensors and arrays."""
     texts = [
         _field(field.name, getattr(value, field.name))
         for field in fields(value)

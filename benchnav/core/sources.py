@@ -18,14 +18,17 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from benchnav.core.errors import BenchnavError, ConfigError, out_of_memory
+from benchnav.core.errors import BenchnavError, ConfigError, out_of_memory_error
 from benchnav.core.renamed import IMPORTS
 from benchnav.core.settings import hint, one_line
 from benchnav.core.shipped_files import PACKAGE
 
 
-def moved(error: BaseException) -> str:
-    """Return a sentence with the new name of a failed import; empty without one."""
+def renaming_note(error: BaseException) -> str:
+    """Return a sentence that gives the new name of a renamed import.
+
+    It is empty if the import failed for another reason.
+    """
     if not isinstance(error, ImportError) or not error.name:
         return ""
     match = re.search(r"cannot import name '(\w+)'", str(error))
@@ -40,7 +43,7 @@ def attribute(module: ModuleType, source: str, name: str) -> Any:
     Args:
         module: module that defines the attribute.
         source: name or path of the module as the user wrote it, for messages.
-        name: name of the attribute, with dots within a class.
+        name: name of the attribute; dotted if it is nested in a class.
 
     Raises:
         ConfigError: If the module has no class or function of this name.
@@ -48,12 +51,12 @@ def attribute(module: ModuleType, source: str, name: str) -> Any:
     target: Any = module
     for part in name.split("."):
         target = getattr(target, part, None)
-    if _is_part(target):
+    if _is_class_or_function(target):
         return target
     options = {
         key: value
         for key, value in vars(module).items()
-        if _is_part(value) and not key.startswith("_")
+        if _is_class_or_function(value) and not key.startswith("_")
     }
     defined = [
         key
@@ -68,10 +71,10 @@ def attribute(module: ModuleType, source: str, name: str) -> Any:
     )
 
 
-def _is_part(target: Any) -> bool:
-    """Return whether an object is a class or function, wrapped ones included.
+def _is_class_or_function(target: Any) -> bool:
+    """Return whether an object is a class or a function, which may be wrapped.
 
-    Other objects that can be called, such as a robot, are excluded.
+    Other callable objects, such as a robot, do not count.
     """
     return callable(target) and (
         inspect.isclass(target)
@@ -83,11 +86,11 @@ def _is_part(target: Any) -> bool:
 
 @cache
 def load_file(path: Path, content: bytes) -> ModuleType:
-    """Import a file, once per content, without writing a compiled file.
+    """Import a file once for each content, without writing a compiled file.
 
     Args:
         path: absolute path of the file.
-        content: content of the file.
+        content: present content of the file.
 
     Raises:
         ConfigError: If the file cannot be imported.
@@ -95,7 +98,7 @@ def load_file(path: Path, content: bytes) -> ModuleType:
     digest = hashlib.sha256(str(path).encode() + b"\0" + content).hexdigest()[:16]
     module = ModuleType(f"benchnav_file_{path.stem}_{digest}")
     module.__file__ = str(path)
-    # Dataclasses and compiled functions look up their module.
+    # Dataclasses and compiled functions look up their module in `sys.modules`.
     sys.modules[module.__name__] = module
     try:
         exec(compile(content, str(path), "exec"), vars(module))
@@ -106,13 +109,13 @@ def load_file(path: Path, content: bytes) -> ModuleType:
         frames = traceback.extract_tb(error.__traceback__)
         lines = [frame.lineno for frame in frames if frame.filename == str(path)]
         position = f" (line {lines[-1]})" if lines else ""
-        remedy = moved(error)
+        remedy = renaming_note(error)
         if not remedy and isinstance(error, ModuleNotFoundError):
             remedy = (
-                ". A file must not depend on its folder: install the module, or copy "
-                "its code into the file."
+                ". A file cannot import modules from its own folder: install the "
+                "module, or copy its code into the file."
             )
-        raise out_of_memory(error) or ConfigError(
+        raise out_of_memory_error(error) or ConfigError(
             f"{path} could not be imported: {one_line(error)}{position}{remedy}"
         ) from error
     return module
@@ -127,7 +130,9 @@ def digest_of(contents: Iterable[bytes]) -> str:
 
 
 def digest_of_path(path: Path) -> str:
-    """Return the digest of a file, or of a folder's files and names; empty without any.
+    """Return the digest of a file, or of the names and contents of a folder's files.
+
+    It is empty if the path does not exist.
 
     Raises:
         ConfigError: If the path cannot be read.
@@ -146,21 +151,22 @@ def digest_of_path(path: Path) -> str:
             return hashlib.file_digest(stream, "sha256").hexdigest()
     except OSError as error:
         raise ConfigError(
-            f"Expected {path} to be readable, since a part reads it: {error.strerror}."
+            f"Expected {path} to be readable, since a setting refers to it, got: "
+            f"{error.strerror}. Change its permissions, or name another path."
         ) from error
 
 
-def digest_of_file_part(path: Path, content: bytes) -> str:
-    """Return the digest of a file and its imports; see `imported_sources`."""
+def digest_of_file_and_imports(path: Path, content: bytes) -> str:
+    """Return one digest of a file and of all its imports; see `imported_sources`."""
     imports = imported_sources(path.parent, "", content)
     return _digest_of_sources({"": content} | imports)
 
 
 def digest_of_target(target: Callable[..., Any]) -> str:
-    """Return the digest of the file that defines a target, and of its imports.
+    """Return one digest of the file that defines a class or function, and its imports.
 
-    In a notebook, the source of the target replaces the file. Without a source, the
-    digest is empty.
+    In a notebook, the source of the class or function replaces the file. The digest is
+    empty if there is no source.
     """
     try:
         path = Path(inspect.getfile(target))
@@ -168,11 +174,15 @@ def digest_of_target(target: Callable[..., Any]) -> str:
         content = path.read_bytes() if is_file else inspect.getsource(target).encode()
     except (TypeError, OSError):
         return ""
-    return digest_of_file_part(path, content)
+    return digest_of_file_and_imports(path, content)
 
 
 def digest_of_modules(names: Iterable[str]) -> str:
-    """Return the digest of modules: the sources of their packages and their imports."""
+    """Return one digest of the packages of modules and of all that the modules import.
+
+    Args:
+        names: names of the modules.
+    """
     sources: dict[str, bytes] = {}
     for name in sorted(names):
         package = importlib.import_module(name.partition(".")[0])
@@ -192,33 +202,34 @@ def digest_of_modules(names: Iterable[str]) -> str:
     return _digest_of_sources(sources)
 
 
-def package_modules(names: Iterable[str]) -> dict[str, str]:
-    """Return digests of modules of this package and of all their imports from it.
+def digests_of_package_modules(names: Iterable[str]) -> dict[str, str]:
+    """Return digests of modules of benchnav and of all benchnav modules they import.
 
-    A digest is of the syntax tree without docstrings, so that comments, layout and
-    documentation do not change it. A process reads each module once. Imports within
-    functions count. The `__init__.py` files are excluded, because they only re-export.
+    Each digest is computed from the syntax tree without docstrings, so that comments,
+    layout and documentation do not change it. A process reads each module once. Imports
+    within functions count. The `__init__.py` files are excluded, because they contain
+    only imports.
 
     Args:
-        names: names of the first modules.
+        names: names of the modules to start from.
 
     Returns:
-        12 hexadecimal digits by module name, in alphabetical order.
+        Digests of 12 hexadecimal digits by module name, in alphabetical order.
     """
     digests: dict[str, str] = {}
     pending = list(names)
     while pending:
         name = pending.pop()
-        module = None if name in digests else _module(name)
-        if module is not None:
-            digests[name], imported = module
+        entry = None if name in digests else _digest_and_imports(name)
+        if entry is not None:
+            digests[name], imported = entry
             pending += imported
     return dict(sorted(digests.items()))
 
 
 @cache
-def _module(name: str) -> tuple[str, tuple[str, ...]] | None:
-    """Return digest and imports of a module of this package; None for other names."""
+def _digest_and_imports(name: str) -> tuple[str, tuple[str, ...]] | None:
+    """Return digest and imports of a module of benchnav; None for other names."""
     path = PACKAGE.parent.joinpath(*name.split(".")).with_suffix(".py")
     if name.partition(".")[0] != PACKAGE.name or not path.is_file():
         return None
@@ -246,11 +257,12 @@ def imported_sources(folder: Path, package: str, content: bytes) -> dict[str, by
 
     The standard library, installed distributions and benchnav itself are excluded,
     because `run.json` records their versions and digests. Imports within functions
-    count; names that are composed at run time do not. Nothing is imported.
+    count; imports of names that are composed at run time do not. The search imports no
+    module.
 
     Args:
         folder: folder to search for modules, in addition to `sys.path`.
-        package: package of the module; empty without one.
+        package: package of the module; empty if it is in no package.
         content: source of the module.
 
     Returns:
@@ -278,9 +290,13 @@ def imported_sources(folder: Path, package: str, content: bytes) -> dict[str, by
 
 @cache
 def imported_names(content: bytes, package: str) -> tuple[str, ...]:
-    """Return the modules that a source may import, and their parent packages.
+    """Return the names of modules that a source may import, and of their packages.
 
-    `from a import b` yields both a and a.b.
+    `from a import b` yields both `a` and `a.b`, since `b` may be a module.
+
+    Args:
+        content: source of a module.
+        package: package of that module, for relative imports; may be empty.
     """
     names: list[str] = []
     try:
@@ -316,7 +332,10 @@ def imported_names(content: bytes, package: str) -> tuple[str, ...]:
 
 
 def _spec(name: str, folder: Path) -> ModuleSpec | None:
-    """Return the spec of a module without importing it or its package."""
+    """Return the import spec of a module without importing it or its package.
+
+    It is None if no module of this name exists.
+    """
     package = name.rpartition(".")[0]
     if package:
         parent = _spec(package, folder)
@@ -341,22 +360,24 @@ def installed_folders() -> frozenset[str]:
     return frozenset(folders)
 
 
-_FIRST_READ: dict[Path, bytes] = {}
+# Content of each file when this process first read it.
+_FIRST_CONTENTS: dict[Path, bytes] = {}
 
 
 def _read_source(path: Path) -> bytes:
-    """Return a module's source; after a change, its first content precedes it.
+    """Return a module's source, for a digest.
 
-    A process keeps the module that it imported. Its digest therefore must differ from
-    that of a process with only the old or only the new content.
+    If the file has changed since this process first read it, the first content followed
+    by the present one is returned. The process may have imported the first content, so
+    the digest must differ from those of both contents.
     """
     content = path.read_bytes()
-    first_content = _FIRST_READ.setdefault(path, content)
+    first_content = _FIRST_CONTENTS.setdefault(path, content)
     return content if content == first_content else first_content + content
 
 
 @cache
 def distribution_of(package: str) -> str:
-    """Return name and version of a package's distribution; empty without one."""
+    """Return name and version of a package's distribution; empty if not installed."""
     distribution = next(iter(packages_distributions().get(package, [])), "")
     return f"{distribution} {version(distribution)}" if distribution else ""

@@ -1,4 +1,4 @@
-"""Objects that store the arguments of their constructor, for other processes."""
+"""Objects that store their constructor's arguments, to be created in other processes."""
 
 from typing import Any, Self
 
@@ -8,7 +8,7 @@ _ARGUMENTS = "_arguments"
 class Specified:
     """Base class of all parts: planners, models, risk measures, robots, …
 
-    It only stores the arguments of the constructor, see `arguments_of`.
+    It stores only the arguments of the constructor; see `arguments_of`.
     """
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
@@ -22,5 +22,8 @@ class Specified:
 
 
 def arguments_of(instance: Any) -> tuple[tuple[Any, ...], dict[str, Any]] | None:
-    """Return an object's positional and keyword arguments; None if unknown."""
+    """Return the positional and keyword arguments of an object's constructor.
+
+    The result is None if the object does not store them.
+    """
     return vars(instance).get(_ARGUMENTS) if isinstance(instance, Specified) else None

@@ -1,7 +1,7 @@
 """Storage of datasets, runs and models: locks, atomic writes, digests and shards.
 
-A file or folder is written under a temporary name in the same folder and then renamed.
-A text that describes a store contains its own digest, so that an edit is detected.
+A file or folder is written under a temporary name in the same parent folder and then
+renamed. A text from `seal` contains its own digest, so that an edit is detected.
 """
 
 import fcntl
@@ -24,15 +24,15 @@ MAX_JOBS = 10_000
 
 @contextmanager
 def replacing(path: Path, durable: bool = True) -> Iterator[Path]:
-    """Write a file atomically: yield a temporary path, and rename it at the end.
+    """Write a file atomically: yield a temporary path, and rename that file at the end.
 
-    A kill at any moment leaves the old or the new file. The temporary name contains the
-    process ID, so that two writers of one file do not mix.
+    If the process is killed, either the old or the new file exists. The temporary name
+    contains the process ID, so that two processes never write the same temporary file.
 
     Args:
         path: file to write; its folder is created.
         durable: whether to wait until the data is on the disk, so that a power failure
-            does not damage the file.
+            cannot damage the file.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
@@ -50,13 +50,13 @@ def check_output(name: str, option: str = "out") -> None:
     """Check that an output can be written to a path on this machine.
 
     Args:
-        name: the path; `~` is the user's home.
-        option: option that the path is the value of, for messages.
+        name: path of the output; `~` is the user's home folder.
+        option: name of the option that sets the path, for messages.
 
     Raises:
-        ConfigError: If `name` is empty, is not below a folder, has non-printable
-            characters, or is an address, such as s3://bucket/name, which would create a
-            folder `s3:`. If `option` is not `out`, also if `name` is a folder.
+        ConfigError: If `name` is empty, has non-printable characters, is below a path
+            that is not a folder, or is an address, such as s3://bucket/name. If
+            `option` is not `out`, also if `name` is a folder.
     """
     expect(name, f"`{option}` as a path, got ''.")
     expect(
@@ -73,7 +73,7 @@ def check_output(name: str, option: str = "out") -> None:
     nearest = next(existing, path)
     expect(
         nearest.is_dir(),
-        f"`{option}` as a path in a folder, got {name!r}, and {nearest} is not a "
+        f"`{option}` as a path in a folder, got {name!r}, but {nearest} is not a "
         f"folder. Choose another `{option}`.",
     )
     expect(
@@ -88,24 +88,27 @@ def write_text(path: Path, text: str) -> None:
         partial.write_text(text)
 
 
-def real_place(path: Path) -> Path:
-    """Return the target of a link or of a path that ends in `.` or `..`."""
+def resolve_link(path: Path) -> Path:
+    """Return the path to which a link, or a path that ends in `.` or `..`, leads.
+
+    Any other path is returned unchanged.
+    """
     return path.resolve() if path.is_symlink() or path.name in ("", "..") else path
 
 
 @contextmanager
 def sole_writer(path: Path, output: str, shared: bool = False) -> Iterator[None]:
-    """Acquire an exclusive lock on a path, which need not exist; a kill releases it.
+    """Acquire an exclusive lock on a path, which need not exist.
 
-    The lock is a file in the same folder, so that `path` may be moved, replaced or
-    removed while it is locked.
+    The lock is a file in the same parent folder, so that `path` may be moved, replaced
+    or removed while it is locked. The lock ends with the process, even if it is killed.
 
     Args:
         path: file or folder to lock. Missing parent folders are created, and removed at
             the end if they are empty.
         output: name of the output at `path`, for the message.
-        shared: whether to share the lock with other shared ones. It still excludes
-            those that are not shared.
+        shared: whether other processes that set `shared` may lock `path` at the same
+            time.
 
     Raises:
         BenchnavError: If this or another process has locked `path`.
@@ -119,10 +122,10 @@ def sole_writer(path: Path, output: str, shared: bool = False) -> Iterator[None]
     try:
         yield
     finally:
-        with suppress(BlockingIOError):  # others still share the lock
+        with suppress(BlockingIOError):  # other processes still share the lock
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            # The file is removed while it is locked. A process that has opened it
-            # meanwhile detects that the path no longer leads to it.
+            # The lock file is removed while it is locked. A process that has opened it
+            # meanwhile detects the removal, see `_is_same`.
             lock.unlink(missing_ok=True)
         os.close(descriptor)
         with suppress(OSError):  # a folder is not empty, or already removed
@@ -131,7 +134,7 @@ def sole_writer(path: Path, output: str, shared: bool = False) -> Iterator[None]
 
 
 def _lock(lock: Path, output: str, kind: int) -> int:
-    """Return the descriptor of the lock file, opened and locked."""
+    """Open and lock a lock file, and return its descriptor."""
     while True:
         descriptor = os.open(lock, os.O_RDWR | os.O_CREAT, 0o644)
         try:
@@ -141,13 +144,13 @@ def _lock(lock: Path, output: str, kind: int) -> int:
         except BlockingIOError as error:
             os.close(descriptor)
             raise BenchnavError(
-                f"Another run is writing {output}. Wait for it to end, or choose "
+                f"Another run is writing {output}. Wait until it ends, or choose "
                 "another `out`."
             ) from error
         except BaseException:
             os.close(descriptor)
             raise
-        os.close(descriptor)  # the process that had locked the file has removed it
+        os.close(descriptor)  # another process has removed the file: open a new one
 
 
 def _is_same(descriptor: int, path: Path) -> bool:
@@ -157,17 +160,20 @@ def _is_same(descriptor: int, path: Path) -> bool:
         return False
 
 
-def refuse_taken(out: Path, overwrite: bool, foreign: Callable[[Path], str]) -> None:
+def check_replaceable(
+    out: Path, overwrite: bool, foreign: Callable[[Path], str]
+) -> None:
     """Check that a file, folder or checkpoint may be written to `out`.
 
     Args:
         out: file or folder to write.
         overwrite: whether an earlier output may be replaced.
-        foreign: returns why an existing path is not an output of this kind, such as
-            "holds notes.txt"; empty if it is one. No option replaces a foreign path.
+        foreign: function that returns why an existing path is not an earlier output,
+            such as "contains notes.txt", or an empty text if it is one. A foreign path
+            is never replaced.
 
     Raises:
-        ConfigError: If `out` exists, and is foreign or may not be replaced.
+        ConfigError: If `out` exists, and either is foreign or may not be replaced.
     """
     if not out.exists() and not out.is_symlink():
         return
@@ -186,9 +192,9 @@ def refuse_taken(out: Path, overwrite: bool, foreign: Callable[[Path], str]) -> 
 
 
 def new_folder(path: Path) -> Path:
-    """Return a new empty folder next to `path`, to fill and pass to `take_place`.
+    """Create an empty folder next to `path`, to fill and then pass to `replace_folder`.
 
-    A folder of an interrupted process is removed.
+    The folder that an interrupted process left is replaced.
     """
     partial = path.with_name(f".{path.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
@@ -198,9 +204,9 @@ def new_folder(path: Path) -> Path:
 
 @contextmanager
 def building(path: Path) -> Iterator[Path]:
-    """Yield a new empty folder next to `path`, to fill and pass to `take_place`.
+    """Yield a new empty folder next to `path`, to fill and then pass to `replace_folder`.
 
-    It is removed at the end if it was not passed.
+    If it was not passed to `replace_folder`, the folder is removed at the end.
     """
     partial = new_folder(path.with_name(f"{path.name}.building"))
     try:
@@ -209,11 +215,11 @@ def building(path: Path) -> Iterator[Path]:
         shutil.rmtree(partial, ignore_errors=True)
 
 
-def take_place(partial: Path, path: Path, last: str = "") -> None:
+def replace_folder(partial: Path, path: Path, last: str = "") -> None:
     """Replace the folder at `path` by a complete one; see `restore`.
 
-    The files move into an existing empty folder, because it may be a link or the user's
-    working directory.
+    If `path` is an empty folder, the files are moved into it, because the folder may be
+    a link or the user's working directory.
 
     Args:
         partial: the complete folder, next to `path`.
@@ -234,7 +240,7 @@ def take_place(partial: Path, path: Path, last: str = "") -> None:
 
 
 def restore(path: Path) -> None:
-    """Undo an interrupted `take_place`, which had renamed the old folder."""
+    """Restore the old folder that an interrupted `replace_folder` had renamed."""
     dropped = _dropped(path)
     if dropped.exists() and not path.exists():
         with suppress(FileNotFoundError):  # another process has restored it
@@ -246,13 +252,13 @@ def _dropped(path: Path) -> Path:
 
 
 def seal(content: Mapping[str, Any]) -> str:
-    """Return plain data as JSON, with its SHA-256 under the key `SEAL`."""
+    """Return plain data as JSON, with the data's SHA-256 under the key `SEAL`."""
     content = {name: value for name, value in content.items() if name != SEAL}
     return json.dumps({**content, SEAL: text_digest(content)}, indent=1)
 
 
 def unseal(text: str | bytes) -> dict[str, Any]:
-    """Return the data in a text of `seal`, without the digest.
+    """Return the data in a text from `seal`, without the digest.
 
     Raises:
         ValueError: If the text is not a JSON object, or does not match its digest.
@@ -273,11 +279,11 @@ def text_digest(content: Any) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Shard:
-    """Part of some work that one of several machines does, written as 2/5.
+    """Fraction of some work, for one of several machines, written as 2/5.
 
     Args:
-        index: number of the shard, from 1 to `of`.
-        of: number of all shards.
+        index: number of this shard, from 1 to `of`.
+        of: total number of shards.
 
     Raises:
         ConfigError: If `index` is out of range.
@@ -289,7 +295,7 @@ class Shard:
     def __post_init__(self) -> None:
         """Check the range of the index."""
         if not 1 <= self.index <= self.of:
-            raise ConfigError(f"Expected `shard` I/N with 1 ≤ I ≤ N, got {self}.")
+            raise ConfigError(f"Expected `shard` as I/N with 1 ≤ I ≤ N, got {self}.")
 
     def __str__(self) -> str:
         """Return the shard as on the command line, such as 2/5."""
@@ -297,7 +303,7 @@ class Shard:
 
 
 def read_shard(text: str) -> Shard | None:
-    """Return the shard of a text such as 2/5, or None (all work) if it is empty.
+    """Return the shard that a text such as 2/5 names; None (all work) if it is empty.
 
     Raises:
         ConfigError: If the text has another form, or the index is out of range.
@@ -306,7 +312,7 @@ def read_shard(text: str) -> Shard | None:
         return None
     numbers = re.fullmatch(r"(\d{1,6})/(\d{1,6})", text)
     if numbers is None:
-        raise ConfigError(f"Expected `shard` I/N, such as 2/5, got {text!r}.")
+        raise ConfigError(f"Expected `shard` as I/N, such as 2/5, got {text!r}.")
     return Shard(index=int(numbers[1]), of=int(numbers[2]))
 
 
@@ -319,11 +325,11 @@ def check_workers(jobs: int, backend: str, scheduler: str) -> None:
         scheduler: address of a Dask cluster's scheduler; empty without a cluster.
 
     Raises:
-        ConfigError: If `jobs` is out of range, or only one of the backend dask and an
-            address is given.
+        ConfigError: If `jobs` is out of range, or the backend is dask without an
+            address, or an address is given for another backend.
     """
     expect(1 <= jobs <= MAX_JOBS, f"`jobs` in 1–{MAX_JOBS}, got {jobs}.")
     expect(
         (backend == "dask") == bool(scheduler),
-        "`backend` dask and `scheduler` together, got one of the two. Pass both.",
+        "`backend` dask and `scheduler` together, got only one of them. Set both.",
     )

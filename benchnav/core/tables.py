@@ -11,14 +11,16 @@ import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-# Shown for a missing number or name.
+# Text for a missing number or name.
 NOTHING = "–"
 
-# Width without a terminal, enough for any table.
+# Width in characters if the output is not a terminal; it is enough for any table.
 _UNLIMITED_WIDTH = 400
-_MAX_LIST_WIDTH = 56  # up to which the lines of a list in a cell are not broken
+# Maximum width in characters of a list in a cell whose lines are not broken.
+_MAX_LIST_WIDTH = 56
 
-# Longer texts precede the characters that they start with.
+# LaTeX code by text. The order matters: "λ̄" must precede "λ", or only its first
+# character would match.
 _LATEX = {
     "λ̄": r"$\bar{\lambda}$",
     "λ̂": r"$\hat{\lambda}$",
@@ -59,7 +61,7 @@ _LATEX |= {
     superscript: rf"\textsuperscript{{{digit}}}"
     for digit, superscript in enumerate("⁰¹²³⁴⁵⁶⁷⁸⁹")
 }
-# Subscript digits, with dots between them.
+# Subscript digits, and dots between these digits.
 _SUBSCRIPT = re.compile("[₀-₉]+(?:\\.[₀-₉]+)?")
 _NORMAL_DIGITS = str.maketrans("₀₁₂₃₄₅₆₇₈₉", "0123456789")
 _ESCAPED = re.compile("|".join([_SUBSCRIPT.pattern, *map(re.escape, _LATEX)]))
@@ -80,21 +82,23 @@ class Table:
     Args:
         headings: one heading per column, labels first. Only a terminal keeps a line
             break in a heading.
-        rows: rows with one cell per column. LaTeX sets brackets at the end of a cell in
-            a smaller font.
-        labels: number of leading columns that are labels.
-        numbers: whether the other columns contain numbers, which are aligned right.
+        rows: rows with one cell per column. In LaTeX, a bracket at the end of a cell is
+            set in a smaller font.
+        n_labels: number of leading columns that are labels.
+        numbers: whether the columns after the labels contain numbers, which are aligned
+            right.
         title: title above the table, only in a terminal.
         notes: lines below the table.
         bold_note: meaning of bold cells.
         explained: meanings of columns, as (heading, sentence).
-        groups: titles above equally many columns that are not labels, only in LaTeX.
-        rules: indices of rows with a rule above them, only in LaTeX.
+        groups: titles that each span the same number of columns after the labels; only
+            in LaTeX.
+        rules: indices of rows that have a horizontal line above; only in LaTeX.
     """
 
     headings: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
-    labels: int = 1
+    n_labels: int = 1
     numbers: bool = False
     title: str = ""
     notes: tuple[str, ...] = ()
@@ -107,9 +111,9 @@ class Table:
 def to_markdown(table: Table) -> str:
     """Return a table in Markdown, with notes and meanings of columns below it."""
     headings = [markdown(_one_line(heading)) for heading in table.headings]
-    label_rules = "---|" * table.labels
+    label_rules = "---|" * table.n_labels
     rule = "---:|" if table.numbers else "---|"
-    value_rules = rule * (len(headings) - table.labels)
+    value_rules = rule * (len(headings) - table.n_labels)
     lines = [_markdown_row(headings), f"|{label_rules}{value_rules}"]
     lines += [_markdown_row(map(_markdown_cell, row)) for row in table.rows]
     notes = [*table.notes]
@@ -130,11 +134,13 @@ def to_latex(
     wide: bool = True,
     size: str = "scriptsize",
 ) -> str:
-    """Return a LaTeX environment with notes below its tables; it needs `booktabs`.
+    """Return a LaTeX environment with stacked tables and notes below them.
+
+    It needs the package `booktabs`.
 
     Args:
-        tables: tables to stack vertically. Labels are aligned left, other columns
-            centred.
+        tables: tables to stack vertically. Columns of labels are aligned left, the
+            other columns are centred.
         caption: caption of the environment.
         label: name for cross-references, without "tab:".
         wide: whether the environment spans the page instead of a column.
@@ -158,15 +164,15 @@ def to_latex(
 
 
 def _tabular(table: Table) -> str:
-    n_values = len(table.headings) - table.labels
-    alignment = "l" * table.labels + "c" * n_values
+    n_values = len(table.headings) - table.n_labels
+    alignment = "l" * table.n_labels + "c" * n_values
     lines = [rf"  \begin{{tabular}}{{{alignment}}}", r"    \toprule"]
     if table.groups:
         width = n_values // len(table.groups)
         group = rf"\multicolumn{{{width}}}{{c}}"
         titles = [f"{group}{{{latex(title)}}}" for title in table.groups]
-        ends = range(table.labels + width, len(table.headings) + 1, width)
-        lines.append(_latex_row([*[""] * table.labels, *titles]))
+        ends = range(table.n_labels + width, len(table.headings) + 1, width)
+        lines.append(_latex_row([*[""] * table.n_labels, *titles]))
         rules = [rf"\cmidrule(lr){{{end - width + 1}-{end}}}" for end in ends]
         lines.append(f"    {' '.join(rules)}")
     headings = [latex(_one_line(heading)) for heading in table.headings]
@@ -179,7 +185,7 @@ def _tabular(table: Table) -> str:
 
 
 def _latex_cell(cell: str) -> str:
-    """Return a cell for LaTeX; brackets at its end are smaller and never bold."""
+    """Return a cell for LaTeX; a bracket at its end is smaller and never bold."""
     value, bracket = cell, ""
     if cell.endswith(")") and " (" in cell:
         value, _, bracket = cell.rpartition(" (")
@@ -207,7 +213,7 @@ def _one_line(heading: str) -> str:
 
 
 def latex(text: str) -> str:
-    """Escape text for LaTeX; a hyphen before a separate number becomes a minus."""
+    """Escape text for LaTeX; the hyphen of a negative number becomes a minus."""
     return _ESCAPED.sub(_latex_of, _MINUS.sub("−", text))
 
 
@@ -226,9 +232,9 @@ def to_terminal(table: Table, width: int | None = None, styled: bool = False) ->
 
     Args:
         table: table to write.
-        width: columns of the terminal; None for no limit.
-        styled: whether to set bold cells in bold and to show the colour of codes such
-            as #00ff00. Otherwise, an asterisk follows bold cells.
+        width: width of the terminal in characters; None for no limit.
+        styled: whether to set bold cells in bold, and to show the colour next to codes
+            such as #00ff00. Otherwise, an asterisk follows bold cells.
     """
     from rich import box
     from rich.console import Console
@@ -248,8 +254,8 @@ def to_terminal(table: Table, width: int | None = None, styled: bool = False) ->
         padding=(0, 0 if table.numbers else 1, 0, 0),
     )
     for column, heading in enumerate(table.headings):
-        is_number = table.numbers and column >= table.labels
-        # The lines of a list are not broken, unless they are too long.
+        is_number = table.numbers and column >= table.n_labels
+        # The lines of a list are not broken, unless one is longer than the maximum.
         cells = [row[column] for row in table.rows]
         lines = [line for cell in cells for line in cell.splitlines()]
         is_list = len(lines) > len(cells) and max(map(len, lines)) <= _MAX_LIST_WIDTH
@@ -280,7 +286,7 @@ def to_terminal(table: Table, width: int | None = None, styled: bool = False) ->
 
 
 def print_table(table: Table) -> None:
-    """Print a table at the width of the terminal, or without limit elsewhere."""
+    """Print a table at the terminal's width; no limit if the output is not a terminal."""
     is_terminal = sys.stdout.isatty()
     width = shutil.get_terminal_size().columns if is_terminal else None
     print(to_terminal(table, width, styled=is_terminal).rstrip())

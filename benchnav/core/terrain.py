@@ -25,8 +25,8 @@ class Observation(Batch):
         elevation_m: elevation in metres, shape [B, H, W].
         slope_deg: inclination in degrees by Horn's method, shape [B, H, W].
         grid: size and resolution of the maps.
-        layers: optional layers by name, such as `vegetation_m`; float32, NaN where
-            missing, each of shape [B, H, W].
+        layers: optional layers by name, such as `vegetation_m`, each float32 of shape
+            [B, H, W]; NaN in cells without a value.
     """
 
     rgb: Tensor
@@ -58,14 +58,15 @@ class Terrain(Batch):
             unlabelled, shape [B, H, W].
         elevation_m: elevation in metres, shape [B, H, W].
         slope_deg: inclination in degrees, shape [B, H, W].
-        truth: true distribution of λ in each cell, for its class and slope, with the
-            soft spots of the class; parameters of shape [B, K, H, W]. Means are NaN in
-            unlabelled cells.
-        traversability: one realisation of λ, shape [B, H, W].
+        truth: true distribution of λ in each cell, given its class and slope; it
+            includes the soft spots of the class. Parameters have shape [B, K, H, W].
+            Means are NaN in unlabelled cells.
+        traversability: one realisation of λ, in [0, 1], shape [B, H, W].
         grid: size and resolution of the maps.
-        look_alikes: returns the best prediction of λ from colour. In each cell it mixes
-            the distributions of the look-alike classes, weighted by their frequency.
-            None if no classes are look-alikes; the best prediction is then `truth`.
+        look_alikes: function of the terrain that returns the best prediction of λ from
+            colour: in each cell, the mixture of the distributions of the look-alike
+            classes, weighted by their frequencies. If None, no classes are look-alikes,
+            and the best prediction is `truth`.
         layers: optional layers by name, as in `Observation`.
     """
 
@@ -106,8 +107,8 @@ def take_cells(observation: Observation, rows: Any, columns: Any) -> Observation
 
     Args:
         observation: maps of shape [B, H, W].
-        rows: slice or indices; indices of rows and columns broadcast to [h, w].
-        columns: slice or indices.
+        rows: slice or indices of rows; indices of rows and columns broadcast to [h, w].
+        columns: slice or indices of columns.
 
     Returns:
         An observation with maps of shape [B, h, w].
@@ -138,5 +139,6 @@ def _check_shapes(
     for name, values in layers.items():
         expect(
             name not in maps and name != "rgb" and values.dtype == torch.float32,
-            f"layer `{name}` as float32 with a unique name, got {values.dtype}.",
+            f"layer `{name}` as float32 with a unique name other than `rgb`, got "
+            f"{values.dtype}.",
         )

@@ -1,19 +1,19 @@
 """Record of the files, packages and environment variables that custom parts use.
 
 The source of a part, and the modules that it imports by name, are known before a run.
-Files that it opens, and modules whose names it composes at run time, are seen only
-during the run. Once a custom part is used, this process records:
+Files that the part opens, and modules whose names it composes at run time, are known
+only during the run. From the first use of a custom part on, this process records:
 
-- files that Python opens for reading and modules that are imported, by an audit hook;
-- files that BenchNav's own functions read for a part outside Python (HDF5, Parquet,
-  rasters), by `note_file`;
-- variables that code of the part itself reads from `os.environ`.
+- files that Python opens for reading, and imported modules, by an audit hook;
+- files that BenchNav reads for a part with other libraries (HDF5, Parquet, rasters),
+  which the hook does not detect, by `note_file`;
+- environment variables that the part's own code reads from `os.environ`.
 
-An event counts for every source file on the stack that a function of BenchNav called.
-Not recorded: files that other libraries open outside Python (`h5py`, `pyarrow`, GDAL,
-SQLite), actions of other processes and threads of a part, listings of folders, clocks,
-networks, and copies of all of `os.environ`. `benchnav.core.ownership` excludes the
-standard library, installed packages and temporary files.
+An event is recorded for each source file of the user on the call stack that BenchNav
+called, even indirectly. Not recorded are files that the part opens with other libraries
+(`h5py`, `pyarrow`, GDAL, SQLite), actions in other processes and threads, listings of
+folders, clocks, networks, and copies of all of `os.environ`. `benchnav.core.ownership`
+excludes the standard library, installed packages and temporary files.
 """
 
 import hashlib
@@ -40,29 +40,29 @@ from benchnav.core.ownership import (
 )
 from benchnav.core.sources import digest_of_path, imported_names, imported_sources
 
-# Digest of the content, or version, by "file PATH", "package NAME" or "variable NAME".
+# Digest or version by entry. An entry is "file PATH", "package NAME" or "variable NAME".
 Touches = dict[str, str]
 
-# Variables that BenchNav sets for its workers.
+# Environment variables that BenchNav sets for its workers.
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
-# Records by the source file that the event counts for.
+# Records of events, by path of the user's source file.
 _files: dict[str, dict[str, str]] = {}  # digests at the last reading, by absolute path
 _modules: dict[str, set[str]] = {}  # names of modules
-_variables: dict[str, dict[str, str]] = {}  # digests of values by name
-_written: dict[str, set[str]] = {}  # files that were also opened for writing: output
-# Digests by path, time of change and size.
+_variables: dict[str, dict[str, str]] = {}  # digests of values, by name of the variable
+_written: dict[str, set[str]] = {}  # files opened for writing, which count as output
+# Digests of files by path, time of the last change in ns and size in bytes.
 _digests: dict[tuple[str, int, int], str] = {}
 _state = threading.local()
 _watching = False
 
 
 def watch(part_folder: Path | None = None) -> None:
-    """Start recording in this process, until the process ends.
+    """Start to record in this process, until the process ends.
 
     Args:
-        part_folder: folder of an installed package whose code is a part; otherwise, its
-            code counts as a library.
+        part_folder: folder of an installed package that contains a part. From now on,
+            code in this folder counts as the user's, unlike that of other packages.
     """
     global _watching
     if part_folder is not None:
@@ -75,7 +75,7 @@ def watch(part_folder: Path | None = None) -> None:
 
 
 def note_file(path: Path | str) -> None:
-    """Record that a part reads a file that Python's audit hook does not see."""
+    """Record that a part reads a file, for readers that the audit hook does not detect."""
     if _watching:
         _note_read(os.fspath(path))
 
@@ -87,9 +87,9 @@ def touches_of(targets: Iterable[Callable[..., Any]]) -> Touches:
         targets: classes and functions of custom parts.
 
     Returns:
-        Digests of files and variables at the last reading, empty for missing ones, and
-        versions of packages. Packages are those that the parts import and their loaded
-        requirements.
+        Digests of files and variables at the last reading, empty if the file or
+        variable was missing; and versions of the packages that the parts import and of
+        the loaded requirements of these packages.
     """
     sources: dict[str, tuple[str, bytes]] = {}
     for target in targets:
@@ -98,7 +98,7 @@ def touches_of(targets: Iterable[Callable[..., Any]]) -> Touches:
     names: set[str] = set()
     for source, (package, content) in sources.items():
         names |= {*imported_names(content, package), *_modules.get(source, ())}
-        # The key of a unit already covers sources that are imported by name.
+        # The key of a unit already depends on sources that are imported by name.
         read_paths = set(_files.get(source, ()))
         for path in read_paths - _written.get(source, set()) - set(sources):
             touches[f"file {_relative(path)}"] = _files[source][path]
@@ -114,7 +114,7 @@ def touches_of(targets: Iterable[Callable[..., Any]]) -> Touches:
 
 
 def merge(records: Mapping[str, Mapping[str, Any]]) -> None:
-    """Add the records of another process, as `snapshot` returns them."""
+    """Add the records of another process, as returned by its `snapshot`."""
     for source, files in records["files"].items():
         _files.setdefault(source, {}).update(files)
     for source, variables in records["variables"].items():
@@ -134,19 +134,21 @@ def snapshot() -> dict[str, Any]:
     }
 
 
-def changes_since(touches: Mapping[str, str]) -> list[str]:
-    """Return the entries of a record that have changed since, in words.
+def changed_entries(touches: Mapping[str, str]) -> list[str]:
+    """Return the entries of a record whose digest or version has changed, as texts.
 
     Args:
-        touches: from `touches_of`, of any process on this machine.
+        touches: record from `touches_of`, in any process on this machine.
     """
-    return unlike(touches, {name: _now(name) for name in touches})
+    return differing_entries(
+        touches, {entry: _present_digest(entry) for entry in touches}
+    )
 
 
-def unlike(a: Mapping[str, str], b: Mapping[str, str]) -> list[str]:
-    """Return the entries that differ between two records, among those in both.
+def differing_entries(a: Mapping[str, str], b: Mapping[str, str]) -> list[str]:
+    """Return the entries that are in two records and differ, as texts.
 
-    Entries of packages include both versions.
+    The text for a package includes both versions.
     """
     lines = []
     for name, digest in a.items():
@@ -159,8 +161,8 @@ def unlike(a: Mapping[str, str], b: Mapping[str, str]) -> list[str]:
     return lines
 
 
-def _now(entry: str) -> str:
-    """Return the present digest or version of an entry, empty if missing."""
+def _present_digest(entry: str) -> str:
+    """Return the present digest or version of an entry; empty if it is missing."""
     kind, _, name = entry.partition(" ")
     if kind == "file":
         return digest_of_path(Path(name))
@@ -173,9 +175,9 @@ def _now(entry: str) -> str:
 
 
 def _relative(path: str) -> str:
-    """Return a path relative to the working folder if it lies below.
+    """Return a path relative to the working folder if that folder contains it.
 
-    Run folders can then be moved together with the files.
+    Run folders can then be moved together with the files that they refer to.
     """
     cwd = os.getcwd()
     return os.path.relpath(path, cwd) if path.startswith(f"{cwd}{os.sep}") else path
@@ -185,7 +187,7 @@ def _relative(path: str) -> str:
 
 
 def _hook(event: str, arguments: tuple[Any, ...]) -> None:
-    """Record opened files and imported modules, except those of this function."""
+    """Record opened files and imported modules, as an audit hook of Python."""
     if event not in ("open", "import") or getattr(_state, "is_noting", False):
         return
     if event == "import":
@@ -227,20 +229,20 @@ def _note_read(path: str) -> None:
 
 
 def _watched(import_module: Callable[..., ModuleType]) -> Callable[..., ModuleType]:
-    """Return `import_module` with a record of the name; it raises no audit event."""
+    """Return `import_module` with a record of the module, since it has no audit event."""
 
     @wraps(import_module)
-    def watched(name: str, package: str | None = None) -> ModuleType:
+    def import_and_record(name: str, package: str | None = None) -> ModuleType:
         module = import_module(name, package)
         for source in _calling_sources():
             _modules.setdefault(source, set()).add(module.__name__)
         return module
 
-    return watched
+    return import_and_record
 
 
 class _WatchedEnviron(type(os.environ)):  # type: ignore[misc]
-    """`os.environ` with a record of variables that parts read, except in full copies."""
+    """`os.environ` that records variables that parts read, except in full copies."""
 
     def __getitem__(self, key: str) -> str:
         """Return the value of a variable."""
@@ -261,14 +263,14 @@ class _WatchedEnviron(type(os.environ)):  # type: ignore[misc]
                     _variables.setdefault(source, {})[key] = digest
 
     def __iter__(self) -> Iterator[str]:
-        """Iterate over names; values that the same instruction reads belong to a copy."""
+        """Iterate over names, and note the instruction, which may copy all variables."""
         frame = _caller()
         _state.copying = None if frame is None else _instruction(frame)
         return super().__iter__()
 
 
 def _caller() -> FrameType | None:
-    """Return the frame that reads `os.environ`, outside the standard library."""
+    """Return the innermost frame outside the standard library that reads `os.environ`."""
     frame: FrameType | None = sys._getframe(2)
     while frame is not None and is_standard(frame.f_code.co_filename):
         frame = frame.f_back
@@ -284,7 +286,10 @@ def _copying() -> tuple[int, int] | None:
 
 
 def _calling_sources() -> set[str]:
-    """Return the user's source files on the stack that BenchNav called, even indirectly."""
+    """Return the user's source files on the call stack that BenchNav called.
+
+    Indirect calls count, too.
+    """
     sources: set[str] = set()
     since_ours: set[str] = set()
     frame: FrameType | None = sys._getframe(1)
@@ -311,7 +316,7 @@ def _digest_of_value(name: str, value: str | None) -> str:
 def _sources(target: Callable[..., Any]) -> dict[str, tuple[str, bytes]]:
     """Return package and content of a part's source files and their imports, by path.
 
-    Only files of the user are included.
+    Only the user's files are included.
     """
     sources: dict[str, tuple[str, bytes]] = {}
     kinds: tuple[Any, ...] = (inspect.unwrap(target),)
@@ -338,6 +343,6 @@ def _sources(target: Callable[..., Any]) -> dict[str, tuple[str, bytes]]:
 
 
 def _content(name: str) -> bytes:
-    """Return the source, empty if there is no file, as for cells of a notebook."""
+    """Return a file's content; empty without a file, as for cells of a notebook."""
     path = Path(name)
     return path.read_bytes() if path.is_file() else b""

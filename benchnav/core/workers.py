@@ -26,8 +26,9 @@ from benchnav.core.errors import BenchnavError, ConfigError, quiet
 from benchnav.core.touched import THREADS
 
 _POLL_S = 0.5
-_REACH_S = 5  # time limit of a connection to the scheduler
-_WORKERS_S = 10  # time limit of workers to appear or return a result
+_CONNECTION_S = 5  # time limit for the connection to a scheduler
+# Time limit for a cluster's first worker, and time between checks of local workers.
+_WORKERS_S = 10
 
 Result = TypeVar("Result")
 
@@ -38,16 +39,17 @@ def run_calls(
     """Run calls in parallel and yield their results in order of completion.
 
     The first error ends the iteration. Worker processes remain for some minutes, so
-    that later calls start quickly. Those of this machine run a call in the current
-    working directory; calls contain all other state of this process that they need.
+    that later calls start quickly. Worker processes of this machine run a call in the
+    current working directory. A call contains all other state of this process that it
+    needs.
 
     Args:
-        calls: functions without arguments, such as `functools.partial`; sent to other
-            processes with cloudpickle.
-        jobs: number of worker processes on this machine; 1 runs the calls sequentially
-            in this process.
-        scheduler: address of a Dask cluster's scheduler, whose workers replace those of
-            this machine; empty without a cluster.
+        calls: functions without arguments, such as `functools.partial` objects, which
+            are sent to other processes with cloudpickle.
+        jobs: number of worker processes on this machine. If 1, this process runs the
+            calls sequentially.
+        scheduler: address of a Dask cluster's scheduler. The cluster's workers then run
+            the calls instead of this machine's; empty without a cluster.
 
     Raises:
         ConfigError: If the cluster cannot be reached, or has no worker.
@@ -68,8 +70,8 @@ def end_with(parent: int) -> None:
     Further calls in the same process have no effect.
 
     Args:
-        parent: ID of the process that started this one. A worker cannot read it: if the
-            parent is killed during start-up, the worker has another parent already.
+        parent: ID of the process that started this one. `os.getppid` may return another
+            ID here, if the parent was killed during the start-up of this process.
     """
 
     def watch() -> None:
@@ -83,22 +85,24 @@ def end_with(parent: int) -> None:
 def _run_in_processes(
     calls: Sequence[Callable[[], Result]], jobs: int
 ) -> Iterator[Result]:
-    # By default, each process would start one thread per processor.
+    # One thread per worker; by default, each would start one thread per processor.
     threads = {name: os.environ.get(name, "1") for name in THREADS}
     executor = get_reusable_executor(
         jobs, timeout=300, initializer=end_with, initargs=(os.getpid(),), env=threads
     )
-    # A worker whose memory has grown is replaced, which needs no action of users.
+    # The executor replaces a worker whose memory has grown, with a warning that needs no
+    # action of users.
     warnings.filterwarnings(
         "ignore", message="A worker stopped while some jobs were given"
     )
-    # `concurrent.futures.wait` would leave a future locked after an interruption.
+    # Finished futures arrive in a queue, because an interruption of
+    # `concurrent.futures.wait` would leave a future locked.
     remaining = (partial(_call_in, os.getcwd(), call) for call in calls)
     pending = set[Future[Result]]()
     done = SimpleQueue[Future[Result]]()
     try:
         while True:
-            # Only a few at a time, so that results do not accumulate.
+            # Submit only a few calls at a time, so that results do not accumulate.
             next_calls = islice(remaining, jobs + 1 - len(pending))
             pending |= _submit(executor, next_calls, done.put)
             if not pending:
@@ -108,12 +112,12 @@ def _run_in_processes(
             yield future.result()
     except BrokenProcessPool as error:
         raise BenchnavError(
-            "A worker was killed, perhaps for lack of memory. Finished work is kept: "
-            "give the same command again, if necessary with fewer `jobs`."
+            "A worker was killed, perhaps for lack of memory. Finished work is kept. Run "
+            "the same command again, if necessary with fewer `jobs`."
         ) from error
     finally:
-        # Their results are not needed. The executor's own method to end processes fails
-        # while it sends a call.
+        # Pending results are not needed. The executor's own method to end its processes
+        # fails while the executor sends a call.
         if pending:
             for process in list(executor._processes.values()):
                 kill_process_tree(process)
@@ -121,16 +125,16 @@ def _run_in_processes(
 
 
 def _call_in(folder: str, call: Callable[[], Result]) -> Result:
-    """Return the result of a call in a working directory."""
+    """Run a call in a working directory, and return its result."""
     with chdir(folder):
         return call()
 
 
 def _wait_for_one(executor: Any, done: SimpleQueue[Future[Result]]) -> Future[Result]:
-    """Return the next future that is done.
+    """Wait for the next future that is done, and return it.
 
-    The executor usually detects a killed worker. On a loaded machine, it was observed
-    to wait for results after its last worker had ended, which this function detects.
+    The executor usually detects a killed worker. On a loaded machine, however, it was
+    observed to wait after its last worker had ended. This function detects that.
 
     Raises:
         BrokenProcessPool: If no worker is alive.
@@ -154,10 +158,10 @@ def _submit(
 ) -> set[Future[Result]]:
     """Submit calls and return their futures, each with a callback on completion.
 
-    Processes that start for them inherit that interruptions are blocked. Only this
-    process reacts to an interruption, which would otherwise break their imports.
+    Interruptions are blocked meanwhile, and new worker processes inherit this. An
+    interruption would break their imports; only this process reacts to it.
     """
-    # The tracker's start ends the blocking, so it comes first.
+    # Start the resource tracker first, because its start ends the blocking.
     resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -176,20 +180,20 @@ def _run_on_cluster(
         from distributed import CancelledError, KilledWorker, as_completed
 
         try:
-            # All at once, so that workers that join later also receive calls.
+            # Submit all calls at once, so that workers that join later receive some.
             futures = (client.submit(call, pure=False) for call in calls)
             for future in as_completed(futures, client.loop):
                 yield future.result()
         except CancelledError as error:
             raise BenchnavError(
-                f"The scheduler at {scheduler} was lost. Finished work is kept: give "
-                "the same command again."
+                f"The connection to the scheduler at {scheduler} was lost. Finished work "
+                "is kept. Run the same command again."
             ) from error
         except KilledWorker as error:
             raise BenchnavError(
-                "A task was dropped; it killed several workers, the last at "
-                f"{error.last_worker.address}, perhaps for lack of memory. Finished "
-                "work is kept. See the logs of the workers."
+                "The cluster dropped a task after several workers were killed, the last "
+                f"one at {error.last_worker.address}, perhaps for lack of memory. "
+                "Finished work is kept. See the logs of the workers."
             ) from error
 
 
@@ -208,8 +212,8 @@ def connected(scheduler: str) -> Iterator[Any]:
         from distributed import Client
     except ImportError as error:
         raise ConfigError(
-            f"Expected Dask for a cluster, got: {error}. Install it: pip install "
-            "'benchnav[dask]'"
+            f"Expected Dask to be installed for a cluster, got: {error}. Run: pip "
+            "install 'benchnav[dask]'"
         ) from error
     address = urlparse(scheduler)
     try:
@@ -217,25 +221,28 @@ def connected(scheduler: str) -> Iterator[Any]:
     except ValueError:  # the port is not numeric
         has_host = False
     if not has_host or address.scheme not in ("tcp", "tls"):
-        raise ConfigError(f"Expected `scheduler` tcp://HOST:PORT, got {scheduler!r}.")
+        raise ConfigError(
+            f"Expected `scheduler` as tcp://HOST:PORT or tls://HOST:PORT, got "
+            f"{scheduler!r}."
+        )
     with ExitStack() as stack:
         stack.enter_context(quiet("distributed", "distributed.client"))
         try:
             client = stack.enter_context(
-                Client(scheduler, timeout=_REACH_S, set_as_default=False)
+                Client(scheduler, timeout=_CONNECTION_S, set_as_default=False)
             )
         except (OSError, ValueError) as error:
             raise ConfigError(
                 "Expected `scheduler` to be the address of a running Dask scheduler, "
-                f"got {scheduler} and no answer within {_REACH_S} s. Start one with "
-                "`dask scheduler`."
+                f"got {scheduler}, which did not answer within {_CONNECTION_S} s. Start "
+                "a scheduler with `dask scheduler`."
             ) from error
         try:
             client.wait_for_workers(1, timeout=_WORKERS_S)
         except TimeoutError as error:
             raise ConfigError(
-                f"Expected a cluster with workers, got {scheduler} without any for "
-                f"{_WORKERS_S} s. Start some with "
+                f"Expected a cluster with workers, got {scheduler}, which had no worker "
+                f"for {_WORKERS_S} s. Start workers with "
                 f"`dask worker {scheduler} --nworkers N --nthreads 1`."
             ) from error
         yield client

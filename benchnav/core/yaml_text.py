@@ -1,8 +1,8 @@
-"""Plain data from YAML that users write, with errors of one line.
+"""Plain data from YAML that users write, with error messages of one line.
 
-YAML allows duplicate keys, a list that contains itself, and a page whose aliases stand
-for a billion values. Such text is rejected before any value is built. Numbers follow
-YAML 1.2, so that 1e-3 is a number, and a date is text.
+YAML allows duplicate keys, a list that contains itself, and short text whose aliases
+expand to a billion values. Such text is rejected before any value is built. As in YAML
+1.2, 1e-3 is a number and a date is text.
 """
 
 import re
@@ -14,9 +14,9 @@ from typing import Any
 
 from benchnav.core.errors import ConfigError, check_text
 
-MAX_DEPTH = 100  # of nested mappings and lists
-MAX_DIGITS = 100
-MAX_VALUES = 100_000  # with aliases expanded
+MAX_DEPTH = 100  # maximum number of levels of nested mappings and lists
+MAX_DIGITS = 100  # maximum number of digits of an integer
+MAX_VALUES = 100_000  # maximum number of values, with aliases expanded
 
 _TAG = "tag:yaml.org,2002:"
 _NOT_PLAIN = ("timestamp", "binary", "set", "omap", "pairs")
@@ -32,11 +32,11 @@ _FLOAT = re.compile(
 
 
 def load_yaml(text: str, source: str = "") -> Any:
-    """Return the value of YAML, in which 1e-3 is a number.
+    """Return the plain data that a YAML text contains.
 
     Args:
-        text: the YAML.
-        source: path or name of the text, for messages.
+        text: text in YAML.
+        source: path or name of the text, for messages; may be empty.
 
     Raises:
         ConfigError: If `text` is invalid YAML, or has a duplicate key, an alias within
@@ -50,7 +50,7 @@ def load_yaml(text: str, source: str = "") -> Any:
         return None if node is None else loader.construct_document(node)
     except ConfigError:
         raise
-    # `!!int many` raises ValueError, `!!bool perhaps` KeyError.
+    # For example, `!!int many` raises a ValueError, and `!!bool perhaps` a KeyError.
     except (yaml.YAMLError, ValueError, KeyError) as error:
         mark = getattr(error, "problem_mark", None)
         problem = getattr(error, "problem", None)
@@ -58,7 +58,7 @@ def load_yaml(text: str, source: str = "") -> Any:
 
 
 def read_yaml(path: Path) -> Any:
-    """Return the value of a YAML file; see `load_yaml`.
+    """Return the plain data that a YAML file contains; see `load_yaml`.
 
     Raises:
         ConfigError: If the file cannot be read, or `load_yaml` rejects its text.
@@ -73,7 +73,7 @@ def read_yaml(path: Path) -> Any:
 
 
 def check_yaml(text: str) -> None:
-    """Check valid YAML for the limits of `load_yaml`; invalid YAML passes.
+    """Check that YAML is within the limits of `load_yaml`; accept invalid YAML.
 
     Raises:
         ConfigError: If `text` has a duplicate key, an alias within its own anchor, or
@@ -118,10 +118,10 @@ def _check_nesting(text: str, source: str) -> None:
     """
     import yaml
 
-    open_anchors: list[str | None] = []  # of the collections around an event
-    starts: list[int] = []  # number of values before each of these
+    open_anchors: list[str | None] = []  # anchors of the collections around an event
+    starts: list[int] = []  # number of values before each of these collections
     n_values = 0
-    sizes = Counter[str]()  # of anchored values, with aliases expanded
+    sizes = Counter[str]()  # number of values per anchor, with aliases expanded
     for event in yaml.parse(text, Loader=_loader()):
         if isinstance(event, yaml.AliasEvent):
             if event.anchor in open_anchors:
@@ -156,7 +156,7 @@ def _check_nesting(text: str, source: str) -> None:
 
 
 def _nodes(root: Any) -> Iterator[Any]:
-    """Iterate over all nodes below a root and the root, each once."""
+    """Iterate over a root node and all nodes below it, each once."""
     import yaml
 
     seen = set()
@@ -179,7 +179,7 @@ def _check_keys(loader: Any, mapping: Any, text: str, source: str) -> None:
     keys = set()
     for node, _ in mapping.value:
         if not isinstance(node, yaml.ScalarNode):
-            continue  # the loader rejects it
+            continue  # the loader rejects keys that are not scalars
         is_merge = node.tag == f"{_TAG}merge"
         key = node.value if is_merge else loader.construct_object(node)
         if key in keys:
@@ -195,7 +195,7 @@ def _error(text: str, source: str, problem: str, mark: Any) -> ConfigError:
 
 @cache
 def _loader() -> Any:
-    """Return the loader class of plain data, as `jsonargparse` reads options."""
+    """Return the class of loaders of plain data; it reads numbers as jsonargparse does."""
     import yaml
 
     base = getattr(yaml, "CSafeLoader", yaml.SafeLoader)

@@ -1,7 +1,7 @@
 """Metrics of episodes.
 
-Each metric is one column of the table of episodes, with the texts that tables, tests
-and reports show.
+Each metric defines one column of the table of episodes, and the texts that tables and
+reports show for it.
 """
 
 from benchnav.core.public_names import face

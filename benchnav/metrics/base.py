@@ -11,7 +11,7 @@ from numbers import Real
 
 import numpy as np
 
-from benchnav.core.errors import BenchnavError, out_of_memory
+from benchnav.core.errors import BenchnavError, out_of_memory_error
 from benchnav.core.quantity import Better, Quantity
 from benchnav.core.settings import fault
 from benchnav.core.specified import Specified
@@ -26,10 +26,11 @@ class LearningRecord:
         revisions: number of times that the planner received an updated map.
         seen_cells: number of cells whose appearance was observed.
         sensed_cells: number of cells whose λ was measured.
-        ahead: RMSE of the posterior mean E[λ], and mean log score of the belief, over
-            the cells ahead of the robot; NaN at steps without an update, shape [N, 2].
-        step_s: wall time of sensing and belief update per step, in seconds; NaN if no
-            step was planned.
+        ahead: RMSE of the posterior mean E[λ] and mean log score of the belief at each
+            step, over the cells ahead of the robot, shape [N, 2]; NaN at steps without
+            an update.
+        step_s: mean wall time per step of sensing and belief update, in seconds; NaN if
+            no step was planned.
     """
 
     revisions: int
@@ -47,26 +48,26 @@ class Episode:
         states: states of the robot from the start to the end, shape [N + 1, S].
         actions: commanded action of each step, shape [N, A].
         action_names: names of the A action dimensions, such as `speed_mps`.
-        speed_mps: speed that each action gives on terrain of λ = 1, in m/s, shape [N].
-        turn_rate_radps: turn rate that each action gives on terrain of λ = 1, in rad/s,
-            shape [N].
+        speed_mps: speed at each action on terrain with λ = 1, in m/s, shape [N].
+        turn_rate_radps: turn rate at each action on terrain with λ = 1, in rad/s, shape
+            [N].
         traversability: observed λ of each step, in [0, 1], shape [N].
         outcome: name of the outcome, such as `success` or `immobilised`.
         dt_s: time step in seconds.
         time_budget_s: time budget T in seconds.
         reference_time_s: minimum travel time over the grid at 1 m/s, in seconds; NaN if
-            the dataset lacks it.
+            the dataset does not contain it.
         goal_m: position of the goal (x, y) in metres, shape [2].
         goal_radius_m: distance in metres within which a robot has reached the goal.
-        stuck_traversability: λ_stuck; a step with λ at or below it counts as stuck.
+        stuck_traversability: λ_stuck; a step with λ ≤ λ_stuck counts as stuck.
         robot: transition function F.
         planning_s: wall time of planning in each step, in seconds: the time of a batch
             divided by its number of episodes, shape [N].
         preparing_s: wall time of the planner's preparation, in seconds: the time of a
             batch divided by its number of episodes.
         learning: record of learning; None if the robot does not learn.
-        rejected_draws: number of λ fields without a feasible path that were rejected
-            before the one of this episode.
+        rejected_draws: number of λ fields that were rejected before the λ field of this
+            episode was drawn, because they had no feasible path.
         lower_bound_s: lower bound of the time to the goal, in seconds; infinite if the
             goal is unreachable, NaN if unknown.
     """
@@ -92,7 +93,7 @@ class Episode:
     lower_bound_s: float = math.nan
 
     def __post_init__(self) -> None:
-        """Make the arrays read-only, so that no metric changes what others receive."""
+        """Make the arrays read-only, so that no metric changes another metric's input."""
         for field in fields(self):
             value = getattr(self, field.name)
             if isinstance(value, np.ndarray):
@@ -133,7 +134,7 @@ class Episode:
 
 
 class MetricError(BenchnavError):
-    """A metric raised, or returned an invalid value."""
+    """A metric raised an exception, or returned an invalid value."""
 
 
 class Metric(Specified, ABC):
@@ -145,17 +146,19 @@ class Metric(Specified, ABC):
     Attributes:
         name: identifier in suites and commands.
         column: column in tables of episodes. Columns of wall times must begin with
-            `planning_` or `learning_`; comparisons of repeated runs ignore them.
-        suffix: unit at the end of the column's name, such as `_s`.
-        words: name in sentences; if empty, `name` with spaces.
-        unit: unit of differences, margins and tables.
+            `planning_` or `learning_`; comparisons of repeated runs ignore these
+            columns.
+        suffix: unit at the end of the column's name, such as `_s`; may be empty.
+        words: name in sentences; if empty, `name` with spaces instead of underscores.
+        unit: unit of differences, margins and tables; may be empty.
         scale: factor from the column's unit to `unit`.
-        heading: heading of its column in the report; if empty, its words and unit.
-        meaning: phrase that defines one value.
+        heading: heading of the metric's column in the report; if empty, `words` and
+            `unit`.
+        meaning: phrase that defines one value, without a full stop.
         better: better direction, `higher`, `lower` or `neither`.
         of_arrivals: whether conditions are compared only over the episodes in which
             both reached the goal.
-        min_steps: minimum number of steps; the value of a shorter episode is NaN.
+        min_steps: minimum number of steps, ≥ 0; the value of a shorter episode is NaN.
     """
 
     name: str
@@ -182,7 +185,7 @@ class Metric(Specified, ABC):
         """
 
     def value(self, episode: Episode) -> float:
-        """Compute the value; NaN for an episode with fewer than `min_steps` steps."""
+        """Compute the value of one episode; NaN if it has fewer than `min_steps` steps."""
         return self.compute(episode) if episode.steps >= self.min_steps else math.nan
 
     @property
@@ -197,7 +200,7 @@ class Metric(Specified, ABC):
 
 
 class Recorded(Metric):
-    """A metric that reads the attribute of the episode named like the column."""
+    """A metric whose value is the episode's attribute with the name of the column."""
 
     min_steps = 0
 
@@ -208,7 +211,7 @@ class Recorded(Metric):
 
 
 def measure(metric: Metric, episode: Episode) -> float:
-    """Compute a metric that a user may have written, and check its value.
+    """Compute a metric, which may be custom, for an episode, and check the value.
 
     Args:
         metric: metric, shipped or custom.
@@ -219,20 +222,21 @@ def measure(metric: Metric, episode: Episode) -> float:
         or the metric returns NaN.
 
     Raises:
-        MetricError: If the metric raises, or returns an invalid value.
+        MetricError: If the metric raises an exception, or returns an invalid value.
     """
     try:
         value = (
             metric.compute(episode) if episode.steps >= metric.min_steps else math.nan
         )
     except Exception as error:
-        raise out_of_memory(error) or _no_number(metric, fault(error)) from error
+        metric_error = _invalid_value(metric, fault(error))
+        raise out_of_memory_error(error) or metric_error from error
     if not isinstance(value, Real | np.bool_) or math.isinf(value):
-        raise _no_number(metric, repr(value))
+        raise _invalid_value(metric, repr(value))
     return float(value)
 
 
-def _no_number(metric: Metric, got: str) -> MetricError:
+def _invalid_value(metric: Metric, got: str) -> MetricError:
     return MetricError(
         f"Expected a finite number or NaN from metric {metric.name!r}, got {got}. "
         "Return NaN where the value is undefined."

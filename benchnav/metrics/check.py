@@ -1,4 +1,4 @@
-"""Validation of a metric before a run: its attributes, and short sample episodes."""
+"""Validation of a metric before a run: check of its attributes, and sample episodes."""
 
 import math
 from typing import get_args
@@ -39,11 +39,11 @@ def attribute_faults(metric: Metric) -> list[str]:
         "suffix",
         f"as the end of column {metric.column!r}",
     )
-    expect(metric.better in get_args(Better), "better", "as higher, lower or neither")
+    is_direction = metric.better in get_args(Better)
+    expect(is_direction, "better", "as 'higher', 'lower' or 'neither'")
     expect(0 < metric.scale < math.inf, "scale", "above 0 and finite")
-    expect(
-        isinstance(metric.min_steps, int) and metric.min_steps >= 0, "min_steps", "≥ 0"
-    )
+    is_count = isinstance(metric.min_steps, int) and metric.min_steps >= 0
+    expect(is_count, "min_steps", "as a whole number ≥ 0")
     return faults
 
 
@@ -54,7 +54,7 @@ def sample_episodes(robot: Robot) -> list[Episode]:
         robot: transition function F.
 
     Returns:
-        A success with a record of learning, a failure without motion, and a failure of
+        A success of a robot that learns, a failure without motion, and a failure after
         one step.
     """
     traversability = 0.5 + 0.4 * np.sin(np.arange(_STEPS))
@@ -84,7 +84,7 @@ def _simulate(
     actions = low + (high - low) * torch.linspace(0.9, 0.4, steps)[:, None]
     fractions = torch.tensor(traversability, dtype=actions.dtype)
     states = [robot.initial_state(torch.tensor([[2.0, 3.0, 0.1]]))]
-    commanded = []  # motion on terrain of λ = 1
+    commanded = []  # change of the state in each step on terrain with λ = 1
     for action, fraction in zip(actions, fractions, strict=True):
         state = states[-1]
         commanded.append(robot(state, action[None], torch.ones(1)) - state)

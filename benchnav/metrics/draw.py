@@ -4,11 +4,12 @@ from benchnav.metrics.base import Recorded
 
 
 class RejectedDraws(Recorded):
-    """Number of λ fields that were rejected before the one of the episode."""
+    """Number of λ fields that were rejected before that of the episode was drawn."""
 
     name = column = "rejected_draws"
     meaning = (
-        "draws of λ that were rejected because no feasible path joined start and goal"
+        "number of λ fields that were rejected because no feasible path connected "
+        "start and goal"
     )
 
 
@@ -20,6 +21,6 @@ class LowerBound(Recorded):
     suffix = "_s"
     unit = "s"
     meaning = (
-        "lower bound of the time to the goal, infinite if it is unreachable; "
-        "of planners that are given λ, in worlds with one λ field per episode"
+        "lower bound of the time to the goal, infinite if the goal is unreachable; only "
+        "for planners that receive the true λ, in worlds with one λ field per episode"
     )

@@ -1,4 +1,4 @@
-"""Energy along the driven path, from the power that a drive draws under slip."""
+"""Energy along the driven path, from the power that a robot's drive draws under slip."""
 
 import numpy as np
 
@@ -10,13 +10,14 @@ class Energy(Metric):
     """Energy E = ∫ P/λ dt that the drive draws along the path.
 
     Wheels that turn at the commanded speed u and push with a force F draw the power
-    F·u. The robot moves at v = λ·u, since slip is 1 − λ. The power P = F·v = λ·F·u
-    moves the robot, and slip dissipates the remainder. A drive with constant P thus
-    draws P/λ. Its power is limited to P/`min_traversability`: lower λ count as
-    `min_traversability`. Steps whose action commands no motion draw no power.
+    F·u. The robot moves at v = λ·u, because slip is 1 − λ. The power P = F·v = λ·F·u
+    moves the robot, and slip dissipates the remaining power. A drive with constant P
+    thus draws P/λ. A λ below `min_traversability` counts as `min_traversability`, which
+    limits the power. In steps whose action commands no motion, the drive draws no
+    power.
 
     Args:
-        power_w: P, the constant power that moves the robot over terrain, in watts.
+        power_w: constant power P that moves the robot over terrain, in watts, > 0.
         min_traversability: lower limit of λ in P/λ, in (0, 1].
     """
 
@@ -25,7 +26,7 @@ class Energy(Metric):
     suffix = "_j"
     unit = "J"
     meaning = (
-        "energy ∫ P/λ dt that the drive draws along the path, λ at least "
+        "energy ∫ P/λ dt that the drive draws along the path, with λ limited to at least "
         "`min_traversability`"
     )
     better = "lower"
@@ -35,7 +36,7 @@ class Energy(Metric):
         """Validate the options."""
         expect(
             0 < power_w < np.inf,
-            f"`power_w` of metric 'energy' above 0 and finite, got {power_w}.",
+            f"`power_w` of metric 'energy' > 0 and finite, got {power_w}.",
         )
         expect(
             0 < min_traversability <= 1,

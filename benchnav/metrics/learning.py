@@ -48,16 +48,21 @@ class SensedCells(_LearningMetric):
 
 
 class _Ahead(_LearningMetric):
-    """Mean of one column of `LearningRecord.ahead` over the updates of an episode."""
+    """Mean of one column of `LearningRecord.ahead` over the updates of an episode.
+
+    Attributes:
+        index: index of the column.
+    """
 
     index: int
 
     def of(self, record: LearningRecord) -> float:
-        """Return the mean; NaN without an update."""
+        """Return the mean; NaN if the belief was never updated."""
         updates = record.ahead[~np.isnan(record.ahead[:, 0])]
         if not len(updates):
             return math.nan
-        # Average both columns: the mean of a single column sums in a different order.
+        # Average both columns together: the mean of a single column would add values in
+        # a different order.
         return updates.mean(0)[self.index]
 
 
@@ -81,7 +86,10 @@ class AheadLogScore(_Ahead):
     heading = "log score ahead"
     better = "higher"
     index = 1
-    meaning = "mean log score of the belief over these cells, at least −10 per cell"
+    meaning = (
+        "mean log score of the belief over the cells ahead of the robot whose λ was not "
+        "measured, with at least −10 per cell"
+    )
 
 
 class LearningTime(_LearningMetric):
@@ -93,8 +101,8 @@ class LearningTime(_LearningMetric):
     heading = "belief [ms]"
     better = "lower"
     meaning = (
-        "wall time per step of sensing and belief update, "
-        "that of a batch divided by its episodes"
+        "wall time per step of sensing and belief update, where the time of a batch is "
+        "divided by its number of episodes"
     )
 
     def of(self, record: LearningRecord) -> float:

@@ -25,7 +25,7 @@ class Traversability(Metric):
 
 
 class StuckFraction(Metric):
-    """Fraction of steps with an observed λ at most λ_stuck."""
+    """Fraction of steps with an observed λ ≤ λ_stuck."""
 
     name = column = "stuck_share"
     unit = "points"

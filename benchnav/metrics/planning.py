@@ -1,4 +1,4 @@
-"""Metrics of planning time: the wall time of a batch divided by its episodes."""
+"""Metrics of planning time: the wall time of a batch divided by its number of episodes."""
 
 import numpy as np
 
@@ -6,7 +6,11 @@ from benchnav.metrics.base import Episode, Metric
 
 
 class _LaterSteps(Metric):
-    """A percentile of the planning times from the second step on."""
+    """A percentile of an episode's planning times, from the second step on.
+
+    Attributes:
+        percent: percentile, in [0, 100].
+    """
 
     unit = "ms"
     better = "lower"
@@ -25,8 +29,8 @@ class PlanningTime(_LaterSteps):
     column = "planning_ms"
     percent = 50
     meaning = (
-        "median planning time per step, from the second step on, "
-        "that of a batch divided by its episodes"
+        "median planning time per step, from the second step on, where the time of a "
+        "batch is divided by its number of episodes"
     )
 
 
@@ -37,8 +41,8 @@ class HighPlanningTime(_LaterSteps):
     column = "planning_ms_p95"
     percent = 95
     meaning = (
-        "95th percentile of the planning time per step, from the second step on, "
-        "that of a batch divided by its episodes"
+        "95th percentile of the planning time per step, from the second step on, where "
+        "the time of a batch is divided by its number of episodes"
     )
 
 
@@ -50,8 +54,8 @@ class StartTime(Metric):
     unit = "ms"
     better = "lower"
     meaning = (
-        "time of preparation, compilation and the first step, "
-        "that of a batch divided by its episodes"
+        "time of preparation, compilation and the first step, where the time of a batch "
+        "is divided by its number of episodes"
     )
 
     def compute(self, episode: Episode) -> float:

@@ -1,4 +1,4 @@
-"""The metrics of every run, in the order of its columns; a suite adds others."""
+"""The metrics of every run, in the order of columns; a suite may add other metrics."""
 
 from collections.abc import Mapping
 

@@ -21,7 +21,7 @@ class Success(Recorded):
 
 
 class TotalTime(Metric):
-    """T_total: time to the goal; the time budget T for a failure."""
+    """T_total: the time to the goal, or the time budget T for a failure."""
 
     name = words = "T_total"
     column = "total_time_s"
@@ -57,11 +57,11 @@ class ReferenceTime(Recorded):
 
 
 class TimeRatio(Metric):
-    """Time of a success over the reference time at the robot's top speed."""
+    """Time of a success divided by the reference time at the robot's top speed."""
 
     name = column = "time_ratio"
     better = "lower"
-    meaning = "time of a success over the reference time at the robot's top speed"
+    meaning = "time of a success divided by the reference time at the robot's top speed"
     min_steps = 0
 
     def compute(self, episode: Episode) -> float:

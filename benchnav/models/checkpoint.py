@@ -31,13 +31,13 @@ from benchnav.core.sources import digest_of_path
 from benchnav.core.store import (
     building,
     check_output,
-    real_place,
-    refuse_taken,
+    check_replaceable,
+    replace_folder,
     replacing,
+    resolve_link,
     restore,
     seal,
     sole_writer,
-    take_place,
     unseal,
     write_text,
 )
@@ -193,7 +193,7 @@ def save_checkpoint(folder: str | Path, checkpoint: Checkpoint) -> None:
     """
     with sole_writer(Path(folder), str(folder)), open_place(folder) as (path, partial):
         _write(partial, checkpoint, path.name)
-        take_place(partial, path, last=CONFIG)
+        replace_folder(partial, path, last=CONFIG)
 
 
 @contextmanager
@@ -206,15 +206,15 @@ def open_place(folder: str | Path) -> Iterator[tuple[Path, Path]]:
     """
     check_output(str(folder))
     # a/../b is b, whether or not there is an a.
-    path = real_place(Path(os.path.normpath(folder)))
+    path = resolve_link(Path(os.path.normpath(folder)))
     restore(path)
-    refuse_taken(path, True, _foreign)
+    check_replaceable(path, True, _foreign)
     with building(path) as partial:
         yield path, partial
 
 
 def _foreign(path: Path) -> str:
-    """Return why a path is not a checkpoint, empty if it is; for `refuse_taken`."""
+    """Return why a path is not a checkpoint, empty if it is; for `check_replaceable`."""
     is_checkpoint = (path / CONFIG).is_file()
     return "" if is_checkpoint else "is something else than a checkpoint"
 

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from benchnav.core.batch import map_tensors
 from benchnav.core.distribution import TraversabilityDistribution, tail_of
-from benchnav.core.errors import ConfigError, expect, out_of_memory, quiet
+from benchnav.core.errors import ConfigError, expect, out_of_memory_error, quiet
 from benchnav.core.grid import Grid
 from benchnav.core.pooled import pool
 from benchnav.core.settings import one_line
@@ -172,7 +172,7 @@ def export_onnx(
                 dynamic_shapes=(tuple(sizes),),
             )
     except Exception as error:  # of various types
-        raise out_of_memory(error) or ConfigError(
+        raise out_of_memory_error(error) or ConfigError(
             "Expected a network that PyTorch writes as ONNX, got "
             f"{type(model).__name__}: {one_line(error.__cause__ or error)[:300]}"
         ) from error

@@ -19,7 +19,12 @@ from torch import nn
 from benchnav.core import registry
 from benchnav.core.command import tell
 from benchnav.core.describe import describe, name_object
-from benchnav.core.errors import CheckpointError, ConfigError, expect, out_of_memory
+from benchnav.core.errors import (
+    CheckpointError,
+    ConfigError,
+    expect,
+    out_of_memory_error,
+)
 from benchnav.core.ground import GroundStatistics
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.registry import Found, Part
@@ -330,7 +335,7 @@ def open_checkpoint(
     except CheckpointError:
         raise
     except Exception as error:  # a user's class may raise anything
-        raise out_of_memory(error) or CheckpointError(
+        raise out_of_memory_error(error) or CheckpointError(
             "Expected tensors that fit the checkpoint's settings, got: "
             f"{str(error)[:300]}. Train the model again."
         ) from error

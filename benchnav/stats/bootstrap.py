@@ -8,23 +8,23 @@ from functools import lru_cache
 
 import numpy as np
 
-LEAST_MAPS = 8  # minimum for an interval that assumes no distribution
+LEAST_MAPS = 8  # minimum number of maps for an interval over maps
 _RESAMPLES = 2_000
 
 
 @lru_cache(maxsize=4)
-def bootstrap_counts(maps: int, added: int = 0) -> np.ndarray:
-    """Return the frequency of each map in 2 000 samples of M maps.
+def bootstrap_counts(maps: int, pseudo_maps: int = 0) -> np.ndarray:
+    """Return the frequency of each map in 2 000 samples of M maps with replacement.
 
     Args:
         maps: number of maps M.
-        added: number of pseudo-maps from which samples are also drawn.
+        pseudo_maps: number of pseudo-maps from which samples are also drawn.
 
     Returns:
         Whole numbers that sum to M in each row, float64, read-only, shape
-        [2000, M + added].
+        [2000, M + `pseudo_maps`].
     """
-    population = maps + added
+    population = maps + pseudo_maps
     probabilities = np.full(population, 1 / population)
     generator = np.random.default_rng(0)
     counts = generator.multinomial(maps, probabilities, _RESAMPLES).astype(float)
@@ -36,7 +36,7 @@ def percentile_interval(values: np.ndarray) -> tuple[float, float]:
     """Return the ends of the 95 % percentile interval; NaN if any value is not finite.
 
     Args:
-        values: value of each sample, shape [R].
+        values: value in each of R bootstrap samples, shape [R].
     """
     if not np.isfinite(values).all():
         return np.nan, np.nan

@@ -7,13 +7,13 @@ Letters in shapes: N episodes; M maps.
 
 import numpy as np
 
-# Tolerance relative to the scale of the summed values: well above rounding errors, and
-# well below a time step.
+# Tolerance relative to the largest summed value: well above rounding errors, and well
+# below a time step.
 _ROUNDING = 1e-9
 
 
 def alike(values: np.ndarray, scale: float) -> np.ndarray:
-    """Return values with equal magnitudes where these differed only by rounding.
+    """Return values whose magnitudes are equal if they differed only by rounding.
 
     Rank and sign tests depend on which values are 0 and which are tied. Sums of times
     have rounding errors, which break ties and depend on the order of episodes.
@@ -75,7 +75,8 @@ def by_map(
     Args:
         values: value of each episode, shape [N].
         maps: label of each episode's map, shape [N].
-        scale: as in `sums_by_map`.
+        scale: largest magnitude that the values were computed from; if None, the
+            largest magnitude of the values themselves.
 
     Returns:
         Shape [M], float64, in the order of sorted labels.

@@ -23,25 +23,28 @@ Interval = tuple[float, float, float]
 
 
 def gain_by_map(rows: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
-    """Return differences of success counts, and numbers of episodes, each shape [M]."""
+    """Return differences of success counts, and counts of episodes, each shape [M]."""
     first = rows["success"].astype(int)
     second = rows["success_other"].astype(int)
-    gain = first - second
-    by_unit = gain.groupby(rows["group"].to_numpy())
+    differences = first - second
+    by_unit = differences.groupby(rows["group"].to_numpy())
     gains = by_unit.sum().to_numpy()
     n_episodes = by_unit.size().to_numpy()
     return gains, n_episodes
 
 
 def mean_differences(rows: pd.DataFrame, column: str = "total_time_s") -> np.ndarray:
-    """Return `by_map` of the difference in a column, shape [M]."""
+    """Return one difference in a column per map, shape [M].
+
+    Their mean over maps is the mean difference over episodes; see `by_map`.
+    """
     return by_map(*_differences(rows, column))
 
 
 def summed_differences(rows: pd.DataFrame, column: str = "total_time_s") -> np.ndarray:
-    """Return `sums_by_map` of the difference in a column, for sign and rank tests.
+    """Return each map's scaled sum of the differences in a column, shape [M].
 
-    The result has shape [M].
+    Sign and rank tests take these sums; see `sums_by_map`.
     """
     return sums_by_map(*_differences(rows, column))
 
@@ -49,7 +52,10 @@ def summed_differences(rows: pd.DataFrame, column: str = "total_time_s") -> np.n
 def _differences(
     rows: pd.DataFrame, column: str
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return differences by episode, their maps, and the largest magnitude of values."""
+    """Return differences by episode, their maps, and the largest compared magnitude.
+
+    It is the largest magnitude in the columns of both conditions.
+    """
     paired = rows[[column, f"{column}_other"]].to_numpy(dtype=float)
     differences = paired[:, 0] - paired[:, 1]
     maps = rows["group"].to_numpy()
@@ -62,22 +68,23 @@ def interval_of(rows: pd.DataFrame, column: str, confidence: float = 0.95) -> In
 
     Args:
         rows: paired episodes; see the module.
-        column: column to compare. `success` has the interval of `success_interval`,
-            `total_time_s` that of `time_difference`, any other Student's interval.
+        column: column to compare. The interval is that of `success_interval` for
+            `success`, that of `time_difference` for `total_time_s`, and Student's for
+            any other column.
         confidence: nominal coverage.
 
     Returns:
-        Difference and ends in the column's unit; the ends are NaN if there are too few
-        maps.
+        Difference and both ends in the column's unit. The ends are NaN if there are too
+        few maps.
     """
     if column == "total_time_s" and len(rows):
         return time_difference(rows, confidence)
     if column == "success":
-        gain, draws = gain_by_map(rows)
-        if len(gain) < 2:
-            difference = float(gain.sum() / max(len(rows), 1))
+        gains, n_episodes = gain_by_map(rows)
+        if len(gains) < 2:
+            difference = float(gains.sum() / max(len(rows), 1))
             return difference, np.nan, np.nan
-        interval = success_interval(gain, draws, confidence)
+        interval = success_interval(gains, n_episodes, confidence)
     else:
         differences = mean_differences(rows, column)
         interval = mean_interval(differences, confidence)
@@ -94,8 +101,8 @@ def difference_p(rows: pd.DataFrame, column: str, direction: str = "") -> float:
         direction: `higher` or `lower` for a one-sided test; two-sided if empty.
     """
     if column == "success":
-        gain, _ = gain_by_map(rows)
-        return sign_flip_p(gain.astype(int), direction)
+        gains, _ = gain_by_map(rows)
+        return sign_flip_p(gains.astype(int), direction)
     return mean_flip_p(summed_differences(rows, column), direction)
 
 
@@ -107,24 +114,25 @@ def time_difference(rows: pd.DataFrame, confidence: float = 0.95) -> Interval:
         confidence: nominal coverage.
 
     Returns:
-        Difference and ends in seconds.
+        Difference and both ends in seconds.
     """
-    maps_of_success = []
-    success_s = []
-    budget_s = []
+    maps_with_success = []
+    times_of_success_s = []
+    budgets_s = []
     for suffix in ("", "_other"):
         success = rows[f"success{suffix}"].astype(bool)
-        maps_of_success.append(set(rows.loc[success, "group"]))
-        success_s.append(rows.loc[success, f"total_time_s{suffix}"])
-        budget_s.append(rows[f"time_budget_s{suffix}"])
-    times_s = pd.concat(success_s)
-    # Without any success, a failure costs at most the whole T.
+        maps_with_success.append(set(rows.loc[success, "group"]))
+        times_of_success_s.append(rows.loc[success, f"total_time_s{suffix}"])
+        budgets_s.append(rows[f"time_budget_s{suffix}"])
+    times_s = pd.concat(times_of_success_s)
+    # If no episode succeeded, assume that a success takes no time, so that a failure
+    # costs the whole T.
     mean_time_s = times_s.mean() if len(times_s) else 0.0
-    mean_budget_s = pd.concat(budget_s).mean()
-    gain, draws = gain_by_map(rows)
-    _, low, high = success_interval(gain, draws, confidence)
+    mean_budget_s = pd.concat(budgets_s).mean()
+    gains, n_episodes = gain_by_map(rows)
+    _, low, high = success_interval(gains, n_episodes, confidence)
     failed = rows["success_other"].astype(float) - rows["success"]
-    common_maps = set.intersection(*maps_of_success)
+    common_maps = set.intersection(*maps_with_success)
     mean, low_s, high_s = total_time_interval(
         mean_differences(rows),
         by_map(failed.to_numpy(), rows["group"].to_numpy()),
@@ -137,7 +145,7 @@ def time_difference(rows: pd.DataFrame, confidence: float = 0.95) -> Interval:
 
 
 def budgets_differ(rows: pd.DataFrame) -> bool:
-    """Return whether T of the two conditions differs on any map."""
+    """Return whether the time budgets T of the two conditions differ in any episode."""
     first = rows["time_budget_s"]
     second = rows["time_budget_s_other"]
     # T of an episode that began at its goal is NaN.
@@ -145,7 +153,7 @@ def budgets_differ(rows: pd.DataFrame) -> bool:
     return not np.allclose(first[is_known], second[is_known], rtol=1e-6)
 
 
-def in_budgets(rows: pd.DataFrame) -> pd.DataFrame:
+def as_fractions_of_budget(rows: pd.DataFrame) -> pd.DataFrame:
     """Return the rows with times as fractions of each condition's T."""
     fractions: dict[str, pd.Series | float] = {}
     for suffix in ("", "_other"):

@@ -1,9 +1,10 @@
 """Randomisation tests of paired differences, by sign flips or exchanges on each map.
 
-Under H₀ the two contestants are exchangeable on each map. With up to 13 maps, all
-assignments are counted; with more, 9 999 random ones with a fixed seed. Maps are first
-sorted by their values, so that p depends neither on the order of maps nor on the order
-of the contestants. Maps without a difference do not count.
+Under H₀ the two contestants are exchangeable on each map. An assignment exchanges them
+on some of the maps. With up to 13 maps, all assignments are counted; with more maps,
+9 999 random assignments with a fixed seed. Maps are first sorted by their values, so
+that p depends neither on the order of maps nor on the order of the contestants. Maps
+without a difference do not count.
 Sources: Fisher (1935), "The Design of Experiments", 21; Phipson and Smyth (2010),
 "Permutation p-values should never be zero", for counting the observed assignment.
 Letters in shapes: M maps; P parts of a difference; R assignments.
@@ -15,24 +16,24 @@ from functools import lru_cache
 import numpy as np
 from scipy.stats import binom, rankdata, wilcoxon
 
-# Largest number of maps with an exact test.
-_EXACT = 13
-# Number of random assignments if there are more maps.
-_DRAWN = 9_999
-# Tolerance relative to the largest difference, within which an assignment ties with the
-# observed one and is counted.
+# Maximum number of maps for an exact test.
+_MAX_EXACT_MAPS = 13
+# Number of random assignments for a larger number of maps.
+_N_RANDOM = 9_999
+# Tolerance relative to the largest difference. If the difference of an assignment is
+# within it of the observed difference, the two are tied, and the assignment counts.
 _ROUNDING = 1e-9
 
 
 @lru_cache(maxsize=2)
 def _signs(maps: int) -> np.ndarray:
-    """Return signs ±1 of all assignments, or of random ones for many maps, [R, M]."""
-    if maps <= _EXACT:
+    """Return signs ±1 of all assignments or, for many maps, of random ones, [R, M]."""
+    if maps <= _MAX_EXACT_MAPS:
         assignments = np.arange(2**maps)[:, None]
         bits = assignments >> np.arange(maps) & 1
     else:
         generator = np.random.default_rng(0)
-        bits = generator.integers(0, 2, (_DRAWN, maps), dtype=np.int8)
+        bits = generator.integers(0, 2, (_N_RANDOM, maps), dtype=np.int8)
     return 1.0 - 2.0 * bits
 
 
@@ -42,17 +43,18 @@ def exchange_p(
     difference: Callable[..., np.ndarray],
     direction: str = "",
 ) -> float:
-    """Return the p-value of no difference in a function of sums over maps.
+    """Return the p-value of H₀: a function of sums over maps does not differ.
 
-    It is the fraction of assignments whose difference is at least the observed one.
+    p is the fraction of assignments whose difference is at least the observed one.
 
     Args:
         first: parts of the first contestant by map, shape [M, P].
         second: parts of the second contestant by map, shape [M, P].
-        difference: antisymmetric function of two sums of parts, each of shape [..., P];
-            returns shape [...].
-        direction: alternative for the first contestant, `higher` or `lower`; two-sided
-            if empty.
+        difference: function of the sums of the first and of the second contestant, each
+            of shape [..., P], that returns their difference, shape [...]. It changes
+            only its sign if the contestants are exchanged.
+        direction: `higher` or `lower`, the alternative for the first contestant in a
+            one-sided test; two-sided if empty.
     """
     gap = first - second
     total = (first + second).sum(0)
@@ -71,15 +73,15 @@ def exchange_p(
     elif direction == "lower":
         observed = -observed
     beyond = int((differences >= observed - tolerance).sum())
-    if len(gap) <= _EXACT:
+    if len(gap) <= _MAX_EXACT_MAPS:
         return beyond / len(differences)
     return (1 + beyond) / (1 + len(differences))
 
 
 def _half(total: np.ndarray, gap: np.ndarray) -> np.ndarray:
-    """Return (total + gap) / 2, with rounding errors about 0 set to 0.
+    """Return (total + gap) / 2; values that differ from 0 only by rounding become 0.
 
-    A function such as a root would amplify them.
+    A function such as a root would amplify these rounding errors.
     """
     half = (total + gap) / 2
     tolerance = 1e-12 * np.abs(total)
@@ -87,11 +89,11 @@ def _half(total: np.ndarray, gap: np.ndarray) -> np.ndarray:
 
 
 def mean_flip_p(differences: np.ndarray, direction: str = "") -> float:
-    """Return the p-value of the hypothesis that the mean difference is 0.
+    """Return the p-value of H₀: the mean difference is 0.
 
     Args:
-        differences: difference on each map, with exact ties (see `by_map.alike`), shape
-            [M].
+        differences: difference on each map, where tied values must be exactly equal
+            (see `by_map.alike`), shape [M].
         direction: `higher` or `lower` for a one-sided test; two-sided if empty.
     """
 
@@ -102,31 +104,32 @@ def mean_flip_p(differences: np.ndarray, direction: str = "") -> float:
     return exchange_p(column, 0 * column, difference, direction)
 
 
-def sign_flip_p(gain: np.ndarray, direction: str = "") -> float:
-    """Return the exact p-value of no difference in counts, for any number of maps.
+def sign_flip_p(gains: np.ndarray, direction: str = "") -> float:
+    """Return the exact p-value of H₀: counts do not differ.
 
-    Among n maps with the same absolute gain, the number with a positive sign is
-    binomial. The distribution of the sum is thus a convolution of one binomial per
-    absolute gain. With one episode per map, the test is the exact McNemar test.
+    Among n maps with the same absolute gain, the number of positive gains has a
+    binomial distribution. The distribution of the sum of gains is therefore the
+    convolution of one binomial distribution per absolute gain, for any number of maps.
+    With one episode per map, the test is the exact McNemar test.
 
     Args:
-        gain: count of the first condition minus count of the second on each map, such
+        gains: count of the first condition minus count of the second on each map, such
             as numbers of successes; whole numbers, shape [M].
         direction: `higher` or `lower` for a one-sided test; two-sided if empty.
     """
-    divisor = max(np.gcd.reduce(gain), 1)
-    gain = gain // divisor  # repeated episodes count once
-    nonzero_gain = np.abs(gain[gain != 0])
-    sizes, counts = np.unique(nonzero_gain, return_counts=True)
+    divisor = max(np.gcd.reduce(gains), 1)
+    gains = gains // divisor  # repeated episodes count once
+    nonzero_gains = np.abs(gains[gains != 0])
+    sizes, counts = np.unique(nonzero_gains, return_counts=True)
     probabilities = np.ones(1)
     for size, count in zip(sizes, counts, strict=True):
         n_positive = np.arange(count + 1)
         spread = np.zeros(2 * size * count + 1)
         spread[:: 2 * size] = binom.pmf(n_positive, count, 0.5)
         probabilities = np.convolve(probabilities, spread)
-    total = np.abs(gain).sum()
+    total = np.abs(gains).sum()
     sums = np.arange(-total, total + 1)
-    observed = gain.sum()
+    observed = gains.sum()
     if direction == "higher":
         is_extreme = sums >= observed
     elif direction == "lower":
@@ -140,16 +143,16 @@ def sign_flip_p(gain: np.ndarray, direction: str = "") -> float:
 def signed_rank_p(differences: np.ndarray) -> float:
     """Return the two-sided p-value of Wilcoxon's signed-rank test; 1 if no map differs.
 
-    If at most 13 maps differ, the test is exact even with ties: all sign assignments of
-    the ranks are counted. SciPy returns the same p, but is slower, since it calls a
-    function for each assignment.
+    If at most 13 maps differ, the test is exact even with ties: all signs of the ranks
+    are counted. SciPy returns the same p, but is slower, because it calls a function
+    for each assignment of signs.
 
     Args:
-        differences: difference on each map, with exact ties as from
-            `by_map.sums_by_map`, shape [M].
+        differences: difference on each map, where tied values must be exactly equal, as
+            those from `by_map.sums_by_map` are, shape [M].
     """
     differing = differences[differences != 0]
-    if len(differing) > _EXACT:
+    if len(differing) > _MAX_EXACT_MAPS:
         return float(wilcoxon(differing).pvalue)
     ranks = rankdata(np.abs(differing))
     # Ranks of ties are multiples of 1/2.

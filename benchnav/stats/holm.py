@@ -1,4 +1,4 @@
-"""Correction of p-values for multiple tests, and the level of significance."""
+"""Correction of p-values for multiple tests, and the level of significance, `ALPHA`."""
 
 import numpy as np
 
@@ -8,8 +8,8 @@ ALPHA = 0.05
 def holm(p: np.ndarray) -> np.ndarray:
     """Correct p-values for multiple tests.
 
-    statsmodels' `multipletests` returns the same, but runs the garbage collector at
-    each call, which takes longer than the tests.
+    statsmodels' `multipletests` returns the same values, but runs the garbage collector
+    at each call, which takes longer than the tests.
     Source: Holm (1979), "A simple sequentially rejective multiple test procedure".
 
     Args:

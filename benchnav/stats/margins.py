@@ -12,8 +12,8 @@ from collections.abc import Callable
 import numpy as np
 from scipy.optimize import brentq
 
-# Largest confidence in the search for p.
-_MAX = 1 - 1e-12
+# Maximum confidence in the search for p.
+_MAX_CONFIDENCE = 1 - 1e-12
 
 
 def margin_p(
@@ -25,11 +25,11 @@ def margin_p(
     """Return the p-value of a hypothesis with a margin; 1 if there is no interval.
 
     Args:
-        interval: function that takes the confidence, and returns the difference and the
-            ends of its interval.
+        interval: function of the confidence that returns the difference and the lower
+            and upper end of its interval.
         kind: `non-inferiority`, `superiority` or `equivalence`.
-        direction: the better direction, `higher` or `lower`; empty for equivalence.
-        margin: above 0, in the unit of the difference.
+        direction: better direction, `higher` or `lower`; empty for equivalence.
+        margin: margin > 0, in the unit of the difference.
     """
     sides = {"higher": [-1.0], "lower": [1.0]}.get(direction, [-1.0, 1.0])
     bound = -margin if kind == "superiority" else margin
@@ -39,27 +39,30 @@ def margin_p(
 def _side_p(
     interval: Callable[[float], tuple[float, float, float]], margin: float, side: float
 ) -> float:
-    """Return the p-value of H₀: the difference is beyond the margin on one side.
+    """Return the p-value of H₀: the difference exceeds the margin on one side.
 
-    Beyond means below −margin (side −1) or above margin (side 1). p is the level at
-    which the end of the one-sided interval equals the margin.
+    The difference is below −margin for side −1, or above margin for side 1. p is the
+    level at which the end of the one-sided interval equals the margin.
     """
 
-    def end(signed: float) -> float:
-        """Return the end on the margin's side, or the opposite end if `signed` < 0."""
-        _, low, high = interval(abs(signed))
-        is_upper = (side > 0) == (signed >= 0)
+    def end(signed_confidence: float) -> float:
+        """Return the interval's end on the margin's side, times the side.
+
+        A negative confidence means the opposite end.
+        """
+        _, low, high = interval(abs(signed_confidence))
+        is_upper = (side > 0) == (signed_confidence >= 0)
         value = high if is_upper else low
         return side * value
 
-    def excess(signed: float) -> float:
-        return end(signed) - margin
+    def excess(signed_confidence: float) -> float:
+        return end(signed_confidence) - margin
 
     if np.isnan(end(0.5)):
         return 1.0
-    if end(_MAX) < margin:
-        return (1 - _MAX) / 2
-    if end(-_MAX) > margin:
+    if end(_MAX_CONFIDENCE) < margin:
+        return (1 - _MAX_CONFIDENCE) / 2
+    if end(-_MAX_CONFIDENCE) > margin:
         return 1.0
-    signed = float(brentq(excess, -_MAX, _MAX))
-    return (1 - signed) / 2
+    signed_confidence = float(brentq(excess, -_MAX_CONFIDENCE, _MAX_CONFIDENCE))
+    return (1 - signed_confidence) / 2

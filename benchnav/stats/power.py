@@ -19,14 +19,14 @@ def smallest_difference(std: float, maps: int, alpha: float) -> float:
     """Return the minimum detectable difference at a power of `POWER`.
 
     Args:
-        std: standard deviation over maps of the difference, in its unit.
+        std: standard deviation of the difference over maps, in the difference's unit.
         maps: number of maps.
-        alpha: level of significance; with Holm's correction over K pairs, the level of
-            its first step, 0.05/K.
+        alpha: level of significance. With Holm's correction over K pairs, it is 0.05/K,
+            the level of the first step.
 
     Returns:
-        A difference in the unit of `std`; infinite if no sign-flip test of this number
-        of maps can reach `alpha`.
+        Difference in the unit of `std`; infinite if no sign-flip test of this number of
+        maps can reach `alpha`.
     """
     if 2.0 ** (1 - maps) >= alpha:
         return math.inf
@@ -37,9 +37,9 @@ def maps_needed(std: float, difference: float, alpha: float) -> int:
     """Return the minimum number of maps to detect a difference at a power of `POWER`.
 
     Args:
-        std: as in `smallest_difference`.
-        difference: above 0, in the unit of `std`.
-        alpha: as in `smallest_difference`.
+        std: standard deviation of the difference over maps, in the difference's unit.
+        difference: difference to detect, > 0, in the unit of `std`.
+        alpha: level of significance, as in `smallest_difference`.
     """
     root = _quantiles(alpha) * std / difference
     return math.ceil(root**2)

@@ -3,11 +3,13 @@
 A score is any function of sums over maps, such as a mean, root, ratio or distance. The
 statistical unit is the map, or the group of maps if a dataset has groups.
 
-- Intervals are percentile bootstrap intervals over maps, sorted by their sums.
+- Intervals are percentile bootstrap intervals over maps. Maps are sorted by their sums,
+  so that an interval does not depend on the order of maps.
 - Tests exchange the two contestants on each map (`flips.exchange_p`).
-- Holm's correction covers all pairs of competing contestants, for each score.
+- For each score, Holm's correction covers all pairs of competing contestants.
 
-Letters in shapes: M maps; C columns of a sum, such as classes, else 1; P parts.
+Letters in shapes: M maps; C columns of a sum, such as classes, or 1; P columns of all
+sums of a score.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -33,14 +35,15 @@ class Score:
     """A function of sums over maps.
 
     Args:
-        name: name of its columns.
+        name: name of the score's columns.
         parts: names of the sums from which the score is computed.
-        of: function with one argument per part, each of shape [..., C]; returns values
-            of shape [...].
+        of: function of these sums, each of shape [..., C], that returns the score,
+            shape [...].
         better: better direction; empty if no direction is better.
-        target: if given, contestants are compared by the distance of their score to
-            this value, and a lower distance is better.
-        heading: heading of its column in tables, in two lines.
+        target: ideal value of the score. Contestants are then compared by the distance
+            of their scores to it, and a lower distance is better. If None, they are
+            compared by the scores themselves.
+        heading: heading of the score's column in tables, in two lines.
         meaning: definition of the column's values.
     """
 
@@ -71,9 +74,10 @@ class Score:
     def split(
         self, sums: Sums
     ) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
-        """Return the parts as a table of shape [M, P], and the score of its sums.
+        """Return the score's sums by map as a table, and the score as a function.
 
-        The score is a function of sums of shape [..., P]; it returns shape [...].
+        The table has shape [M, P]. The function takes its sums over maps, of shape
+        [..., P], and returns scores of shape [...].
         """
         columns = []
         for part in self.parts:
@@ -95,12 +99,13 @@ def summarise(scores: Sequence[Score], sums: Mapping[str, Sums]) -> pd.DataFrame
 
     Args:
         scores: scores to compute.
-        sums: sums by contestant and part, over M maps, each of shape [M] or [M, C].
+        sums: sums by contestant and name, with one value per map, each of shape [M] or
+            [M, C].
 
     Returns:
-        One row per contestant: `units`, M; and for each score that its sums define,
-        `NAME` with its 95 % interval `NAME_low`, `NAME_high`, which is NaN with fewer
-        than `bootstrap.LEAST_MAPS` maps.
+        One row per contestant: `units`, the number of maps M; and for each score whose
+        parts the contestant has, `NAME` with its 95 % interval `NAME_low`, `NAME_high`.
+        The interval is NaN if there are fewer than `bootstrap.LEAST_MAPS` maps.
     """
     rows = {}
     for contestant, contestant_sums in sums.items():
@@ -127,16 +132,17 @@ def compare_pairs(
 
     Args:
         scores: scores to compare.
-        sums: as in `summarise`, over the same M maps for each contestant.
+        sums: sums by contestant and name, as in `summarise`, over the same M maps.
         competing: contestants whose pairs are covered by Holm's correction.
-        same: name of a sum in which the maps of a pair must agree, such as the number
-            of cells.
+        same: name of a sum that must be equal for both contestants of a pair on all
+            maps, such as the number of cells.
 
     Returns:
-        One row per pair and score: `measure`, the score's name; `one`, `other`;
-        `difference` of the compared quantity, `one` minus `other`, with its 95 %
-        interval `low`, `high`; `p`; and `p_holm`, for competing contestants only. Pairs
-        that lack the score or differ in `same` are omitted.
+        One row per pair and score: `measure`, the score's name; `one` and `other`, the
+        contestants; `difference` of the compared quantity, `one` minus `other`, with
+        its 95 % interval `low`, `high`; `p`; and `p_holm`, which is NaN unless both
+        contestants compete. Pairs without the score, or with different values of
+        `same`, are omitted.
     """
     records = []
     for first, second in combinations(sums, 2):
@@ -150,8 +156,8 @@ def compare_pairs(
                 records.append({**labels, **row})
     table = pd.DataFrame(records, columns=_PAIR)
     table = table.astype(dict.fromkeys(_PAIR[3:], float))
-    compete = table["one"].isin(competing) & table["other"].isin(competing)
-    for _, rows in table[compete].groupby("measure"):
+    is_competing = table["one"].isin(competing) & table["other"].isin(competing)
+    for _, rows in table[is_competing].groupby("measure"):
         table.loc[rows.index, "p_holm"] = holm(rows["p"].to_numpy())
     return table
 
@@ -178,7 +184,7 @@ def _compare(score: Score, first: Sums, second: Sums) -> dict[str, float]:
 
 
 def _defined(scores: Sequence[Score], *sums: Sums) -> list[Score]:
-    """Return the scores whose parts are in the sums of all contestants."""
+    """Return the scores whose parts are in all of `sums`, one mapping per contestant."""
     names = set.intersection(*(set(parts) for parts in sums))
     return [score for score in scores if names.issuperset(score.parts)]
 
@@ -194,7 +200,7 @@ def _bootstrap(
 
 
 def _order_of_pairs(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return an order of maps that does not change if the two contestants are swapped."""
+    """Return an order of maps that stays the same if the contestants are swapped."""
     total = first + second
     key = np.hstack([total, first - second])
     swapped_key = np.hstack([total, second - first])
@@ -217,9 +223,10 @@ def against_best(
 
     Returns:
         One row per contestant and score: `measure`, the score's name; `best`, the best
-        contestant; except for the best, `difference` to the best, `low`, `high` and
-        `p_holm` as in `compare_pairs`; `alike`, true if the contestant is not
-        significantly worse; and `marked`, true if it is alike and another is not.
+        contestant; `difference` to the best contestant, with `low`, `high` and `p_holm`
+        as in `compare_pairs`, all NaN in the row of the best contestant; `alike`, true
+        if the contestant is not significantly worse; and `marked`, true if it is
+        `alike` and another contestant is not.
     """
     swapped = pairs.assign(
         one=pairs["other"],
@@ -238,7 +245,7 @@ def against_best(
         if values.empty:
             continue
         loss = -values if score.better == "higher" else values
-        best = loss.sort_index().idxmin()  # if several are equal, the first by name
+        best = loss.sort_index().idxmin()  # of equal contestants, the first by name
         is_to_best = (ordered["measure"] == score.name) & (ordered["other"] == best)
         rows = ordered[is_to_best].set_index("one")
         rows = rows[list(_TO_BEST)].reindex(loss.index)

@@ -1,4 +1,4 @@
-"""Tables of comparisons: columns, and formats of numbers."""
+"""Tables of comparisons: columns, and number formats."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,12 +16,12 @@ class Column:
     """A column of a table.
 
     Args:
-        heading: heading; a line break in it is shown only in a terminal.
-        cell: function from a row to its text.
+        heading: heading of the column; only a terminal shows line breaks in it.
+        cell: function from a row to the text of the row's cell.
         meaning: definition of the column, printed below the table; if empty, nothing is
             printed.
-        title: text before the meaning if it covers several columns; if empty, the
-            heading.
+        title: text before the meaning, if the meaning covers several columns; if empty,
+            the heading.
     """
 
     heading: str
@@ -35,7 +35,7 @@ def table_of(rows: Iterable[Row], columns: Sequence[Column], **options: Any) -> 
 
     Args:
         rows: values of each row by name.
-        columns: columns of the table; columns of labels come first.
+        columns: columns of the table, with columns of labels first.
         **options: other fields of `Table`.
     """
     texts = [tuple(column.cell(row) for column in columns) for row in rows]
@@ -53,7 +53,7 @@ def table_of(rows: Iterable[Row], columns: Sequence[Column], **options: Any) -> 
 
 
 def labels_of(*names: str) -> list[Column]:
-    """Return columns that show values as text, with their names as headings."""
+    """Return columns that show values as text, with the values' names as headings."""
     return [Column(name, cell_of(name)) for name in names]
 
 
@@ -68,7 +68,7 @@ def cell_of(name: str, write: Callable[[Any], str] = str) -> Callable[[Row], str
 
 
 def p_value(p: float) -> str:
-    """Format a p-value; random sign flips give no p below 0.0001."""
+    """Format a p-value; the minimum p of random sign flips is 0.0001."""
     return "≤ 0.0001" if p <= 1e-4 else f"{p:.2g}"
 
 

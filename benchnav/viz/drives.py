@@ -1,4 +1,4 @@
-"""Driven paths and positions on maps: paths, and marks of start, goal, robot and end.
+"""Drawing of driven paths on maps, with marks of start, goal, robot and outcome.
 
 Letters in shapes: N positions.
 """
@@ -22,13 +22,14 @@ def _polygon(*corners: tuple[float, float]) -> MarkerPath:
     return MarkerPath([*corners, corners[0]], closed=True)
 
 
-# Shapes indicate in greyscale how an episode ended; the arrowhead points along x.
+# Shapes of marks, which distinguish outcomes even in greyscale. The arrowhead points
+# along x.
 _TICK = _polygon(
     (-1, 0.05), (-0.62, 0.43), (-0.25, 0.05), (0.66, 0.95), (1, 0.6), (-0.25, -0.75)
 )
 _HOURGLASS = _polygon((-0.8, 1), (0.8, 1), (-0.8, -1), (0.8, -1))
 _ARROWHEAD = _polygon((1, 0), (-0.8, 0.7), (-0.4, 0), (-0.8, -0.7))
-# Marks at a position on a map, as keywords of `Axes.plot`.
+# Marks at a position on a map, by name, as keywords of `Axes.plot`.
 _WHITE_EDGED: dict[str, Any] = {"ls": "none", "mec": "white", "mew": 0.8, "zorder": 3}
 _END: dict[str, Any] = {**_WHITE_EDGED, "color": "black", "ms": 6, "zorder": 4}
 MARKS: dict[str, dict[str, Any]] = {
@@ -47,7 +48,7 @@ MARKS: dict[str, dict[str, Any]] = {
     "out of time": {**_END, "marker": _HOURGLASS},
     "failed": {**_END, "marker": "s", "ms": 5},
 }
-# Name in `MARKS` by outcome; `failed` for all others.
+# Name in `MARKS` by outcome; all other outcomes have the mark `failed`.
 _END_MARKS = {
     "success": "success",
     "immobilised": "immobilised",
@@ -60,10 +61,11 @@ class Drive:
     """A driven path up to a point in time.
 
     Args:
-        track: positions in metres, shape [N, 2].
-        goal_m: position of the goal (x, y) in metres.
-        outcome: outcome of the episode; empty before its end.
-        heading_rad: heading of the robot, before the end.
+        track: positions (x, y) in metres, shape [N, 2].
+        goal_m: position (x, y) of the goal in metres, shape [2].
+        outcome: outcome of the episode; empty before the end of the episode.
+        heading_rad: heading of the robot in radians from +x towards +y; used only before
+            the end of the episode.
     """
 
     track: np.ndarray
@@ -83,12 +85,12 @@ def draw_drive(
     """Draw a driven path with start, goal, and the robot or the mark of the outcome.
 
     Args:
-        panel: panel in metres.
+        panel: panel with axes in metres.
         drive: driven path.
         width: width of the path in points.
-        scale: factor of the sizes of marks.
+        scale: factor by which the sizes of marks are multiplied.
         colour: colour of the path.
-        **style: style of the path, as in `Axes.plot`.
+        **style: further keywords of `Axes.plot` for the path.
     """
     path_style = {"label": "_driven"} | style
     draw_path(panel, drive.track, width, colour, **path_style)
@@ -101,7 +103,7 @@ def draw_drive(
     drawn = mark(panel, end_mark(drive.outcome), end, scale, clip_on=False)
     from_goal = end - drive.goal_m
     if drive.outcome == "success" and from_goal.any():
-        # Shift the mark away from the goal, which it would cover.
+        # Shift the mark away from the goal's mark, so as not to cover it.
         size_in = 0.9 * drawn.get_markersize() / 72
         right_in, up_in = size_in * from_goal / np.linalg.norm(from_goal)
         figure = panel.get_figure(root=True)
@@ -116,11 +118,11 @@ def draw_path(
     """Draw a path over a map, with a white edge; return the edge and the path.
 
     Args:
-        panel: panel in metres.
-        track: positions in metres, shape [N, 2].
-        width: width in points.
+        panel: panel with axes in metres.
+        track: positions (x, y) in metres, shape [N, 2].
+        width: width of the path in points, without the edge.
         colour: colour of the path.
-        **style: style of the path, as in `Axes.plot`.
+        **style: further keywords of `Axes.plot` for the path.
     """
     cap: dict[str, Any] = {"solid_capstyle": "round"}
     edge = panel.plot(*track.T, color="white", lw=width + 1.4, zorder=1.9, **cap)
@@ -134,27 +136,28 @@ def mark(
     """Draw a mark at a position on a map, and return it.
 
     Args:
-        panel: panel in metres.
+        panel: panel with axes in metres.
         name: name in `MARKS`.
-        position_m: position (x, y) in metres.
-        scale: factor of the mark's size.
-        **style: overriding style, as in `Axes.plot`; by default `label` is the name.
+        position_m: position (x, y) in metres, shape [2].
+        scale: factor by which the mark's size is multiplied.
+        **style: keywords of `Axes.plot` that replace those in `MARKS`; the default of
+            `label` is the name.
     """
-    (drawn,) = panel.plot(*position_m, **_looks(name, scale) | style)
+    (drawn,) = panel.plot(*position_m, **_mark_style(name, scale) | style)
     return drawn
 
 
 def mark_handle(name: str, scale: float = 1.0, **style: Any) -> Line2D:
-    """Return the entry of a legend for a mark."""
-    return Line2D([], [], **_looks(name, scale) | style)
+    """Return a legend entry for a mark; the arguments are those of `mark`."""
+    return Line2D([], [], **_mark_style(name, scale) | style)
 
 
-def _looks(name: str, scale: float) -> dict[str, Any]:
+def _mark_style(name: str, scale: float) -> dict[str, Any]:
     return MARKS[name] | {"label": name, "ms": scale * MARKS[name]["ms"]}
 
 
 def end_mark(outcome: str) -> str:
-    """Return the name in `MARKS` for an outcome as in tables of episodes."""
+    """Return the name in `MARKS` for an outcome, as named in tables of episodes."""
     return _END_MARKS.get(outcome, "failed")
 
 
@@ -166,35 +169,39 @@ def mark_ends(
 ) -> None:
     """Mark the outcomes of several episodes on one map.
 
-    Marks that would overlap are arranged on a circle, each with a line to its end.
+    Marks that would overlap are arranged on a circle, each with a line to the end of
+    its path.
 
     Args:
-        panel: panel in metres.
-        tracks: driven path of each episode, positions in metres, shape [N, 2].
+        panel: panel with axes in metres.
+        tracks: driven path of each episode, positions (x, y) in metres, shape [N, 2].
         outcomes: outcome of each episode.
         colours: colour of each mark.
     """
     ends = np.array([track[-1] for track in tracks], np.float64).reshape(-1, 2)
     figure = panel.get_figure(root=True)
     assert figure is not None
-    figure.draw_without_rendering()  # fixes the size of a point on the map
+    figure.draw_without_rendering()  # fixes the scale from metres to points
     pixels = panel.transData.transform([(0, 0), (1, 0)])
     metre_px = pixels[1, 0] - pixels[0, 0]
     metre_pt = metre_px * 72 / figure.dpi
     spacing_m = 1.3 * MARKS["immobilised"]["ms"] / metre_pt
-    look: dict[str, Any] = {"label": "_end", "clip_on": False}
-    dot: dict[str, Any] = {"ms": 2.4, "mec": "white", "mew": 0.5, "zorder": 3.7}
+    mark_style: dict[str, Any] = {"label": "_end", "clip_on": False}
+    dot_style: dict[str, Any] = {"ms": 2.4, "mec": "white", "mew": 0.5, "zorder": 3.7}
     for index, position in enumerate(_spread(ends, spacing_m)):
         colour = colours[index]
         end = ends[index]
         if (position != end).any():
             draw_path(panel, np.stack((end, position)), 0.7, colour, zorder=3.6)
-            panel.plot(*end, "o", color=colour, **dot)
-        mark(panel, end_mark(outcomes[index]), position, color=colour, **look)
+            panel.plot(*end, "o", color=colour, **dot_style)
+        mark(panel, end_mark(outcomes[index]), position, color=colour, **mark_style)
 
 
 def _spread(positions: np.ndarray, spacing_m: float) -> np.ndarray:
-    """Return positions of shape [N, 2], those closer than a spacing on circles."""
+    """Return positions, shape [N, 2], where those closer than a spacing are moved apart.
+
+    Each group of close positions is arranged on a circle.
+    """
     distances = np.linalg.norm(positions[:, None] - positions, axis=-1)
     _, labels = connected_components(distances < spacing_m)
     spread = positions.copy()
@@ -212,5 +219,5 @@ def _spread(positions: np.ndarray, spacing_m: float) -> np.ndarray:
 
 
 def robot_marker(heading_rad: float) -> MarkerStyle:
-    """Return an arrowhead along a heading, as the `marker` of a line."""
+    """Return an arrowhead along a heading, for the argument `marker` of a line."""
     return MarkerStyle(_ARROWHEAD, transform=Affine2D().rotate(float(heading_rad)))

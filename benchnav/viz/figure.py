@@ -1,7 +1,7 @@
-"""The base class of figures: an object with requirements, a caption and a drawing.
+"""The base class of figures, which draw `data` and describe the drawing in a caption.
 
 A figure does not write files. All figures of a kind have the same type of `data`; for
-those of runs, it is `benchnav.eval.figures.RunData`.
+figures of runs, it is `benchnav.eval.figures.RunData`.
 """
 
 from abc import ABC, abstractmethod
@@ -17,15 +17,15 @@ if TYPE_CHECKING:
     import matplotlib.figure
 
 
-_DPI = 200  # default resolution of a saved figure
+_DPI = 200  # default resolution of a saved figure, in dots per inch
 
 
 class Figure(Specified, ABC):
-    """A figure.
+    """A figure, which checks whether it applies to some data, and draws them.
 
     Attributes:
-        name: name of its files.
-        title: heading above it on a page; if empty, there is no heading.
+        name: name of the figure's files, without a suffix.
+        title: heading above the figure on a page; if empty, there is no heading.
         text: caption in sentences, if it does not depend on the data.
         trim: whether to cut white borders, as for maps, whose aspect ratio is fixed.
     """
@@ -36,19 +36,19 @@ class Figure(Specified, ABC):
     trim: bool = False
 
     def variants(self, data: Any) -> Sequence[Self]:
-        """Return the figures to draw, with distinct names; by default, only itself."""
+        """Return the figures to draw, with distinct names; by default, only this one."""
         return [self] if self.needs(data) else []
 
     def variant(self, **changes: Any) -> Self:
-        """Return a copy with other attributes, such as its `name`."""
+        """Return a copy with changed attributes, such as `name`."""
         variant = copy(self)
         vars(variant).update(changes)
         return variant
 
     def numbered(self, count: int) -> list[Self]:
-        """Return `count` variants with their `index`, from 0.
+        """Return `count` variants, whose attribute `index` counts from 0.
 
-        If there are several, their names end in a number, from 1.
+        If there are several variants, their names end in a number, from 1.
         """
         if count == 1:
             return [self.variant(index=0)]
@@ -62,12 +62,12 @@ class Figure(Specified, ABC):
         return True
 
     def caption(self, data: Any) -> str:
-        """Return the caption in sentences; `text` unless it depends on the data."""
+        """Return the caption in sentences; by default, `text`."""
         return self.text
 
     @abstractmethod
     def draw(self, data: Any) -> "matplotlib.figure.Figure":
-        """Draw the figure; sizes, colours and names are in `benchnav.viz`."""
+        """Draw the figure; `benchnav.viz` has sizes, colours and names to use."""
 
     def __call__(self, data: Any) -> "matplotlib.figure.Figure":
         """Draw the figure in the common style."""
@@ -76,7 +76,7 @@ class Figure(Specified, ABC):
         with styled():
             drawing = self.draw(data)
         drawing.set_dpi(_DPI)
-        # Notebooks show an object by this method, whatever backend is active.
+        # Notebooks call this method to show an object, with any Matplotlib backend.
         vars(drawing)["_repr_png_"] = partial(_png, drawing)
         return drawing
 
@@ -88,5 +88,5 @@ def _png(drawing: "matplotlib.figure.Figure") -> bytes:
 
 
 def applicable(figures: Sequence[Figure], data: Any) -> list[Figure]:
-    """Return all variants of the figures that the data allow."""
+    """Return all variants of the figures that apply to the data."""
     return [variant for figure in figures for variant in figure.variants(data)]

@@ -1,4 +1,4 @@
-"""Maps in metres: colours, marks, paths, and kinds of terrain.
+"""Drawing of maps in metres: colours, regions, lines, legends and scale bars.
 
 Letters in shapes: H×W cells; N positions; M lines; C colours.
 """
@@ -20,31 +20,32 @@ from benchnav.viz.style import SKY, bytes_of
 
 TRAVERSABILITY_COLOURS = "viridis"
 LAMBDA: dict[str, Any] = {"cmap": TRAVERSABILITY_COLOURS, "vmin": 0, "vmax": 1}
-SPREAD_COLOURS = "magma"  # certain cells are dark
+SPREAD_COLOURS = "magma"  # colour map of spreads; cells with a small spread are dark
 MAX_SPREAD = 0.5  # maximum standard deviation of a quantity in [0, 1]
-MISSING = "0.7"  # cells without a value
-# Dark red differs from all colours of λ, for all kinds of colour vision.
+MISSING = "0.7"  # colour of cells without a value
+# Colour of immobilising cells. With any kind of colour vision, dark red differs from all
+# colours of λ.
 IMMOBILISING = "#a00000"
-SOFT = "white"
-CLOSED = "0.25"  # non-free cells
+SOFT = "white"  # colour of soft spots
+CLOSED = "0.25"  # colour of non-free cells
 UNSEEN, VEIL = "0.6", 0.55  # colour over unobserved cells, and its opacity
-ROBOT = "#ff7800"  # not a colour of λ
-FOOTPRINT = ROBOT  # outline of the sensors' range
-SEEN, SENSED = "0.9", SKY
-_LAYER_COLOURS, _DIRECTION_COLOURS = "YlGnBu", "twilight"
-_HATCH_CELLS = 4  # distance of hatching lines
-_LENGTHS_M = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500)  # of scale bars
-_SCALE_FRACTION = 0.35  # maximum length of a scale bar over the map's width
+ROBOT = "#ff7800"  # differs from all colours of λ
+FOOTPRINT = ROBOT  # colour of the outline of the sensors' range
+SEEN, SENSED = "0.9", SKY  # colours of observed cells, and of cells with measured λ
+_LAYER_COLOURS, _DIRECTION_COLOURS = "YlGnBu", "twilight"  # colour maps
+_HATCH_CELLS = 4  # distance between hatching lines, in cells
+_LENGTHS_M = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500)  # lengths of scale bars
+_SCALE_FRACTION = 0.35  # maximum length of a scale bar divided by the map's width
 
 
 def show_map(panel: Axes, values: Any, extent_m: Iterable[float], **style: Any) -> Any:
-    """Draw a map with its first row at the bottom, over the whole panel in metres.
+    """Draw a map that fills a panel, with axes in metres and the first row at the bottom.
 
     Args:
         panel: panel to draw on.
         values: values of shape [H, W], or colours of shape [H, W, 3].
-        extent_m: width and height in metres.
-        **style: style, as in `Axes.imshow`.
+        extent_m: width and height of the map in metres.
+        **style: further keywords of `Axes.imshow`.
 
     Returns:
         The image.
@@ -67,9 +68,9 @@ def draw_bar(
     Args:
         figure: figure with the panels.
         label: label of the bar.
-        panels: panels that it belongs to; if None, all.
+        panels: panels that the bar belongs to; if None, all panels.
         scale: name of the colour map, and the maximum value; the minimum is 0.
-        **style: style, as in `Figure.colorbar`.
+        **style: further keywords of `Figure.colorbar`.
     """
     colours, maximum = scale
     mappable = ScalarMappable(Normalize(0, maximum), colours)
@@ -88,9 +89,9 @@ def overlay(
     """Draw a region of a map in a single colour, and return the image.
 
     Args:
-        panel: panel in metres.
-        region: bool, shape [H, W].
-        extent_m: width and height in metres.
+        panel: panel with axes in metres.
+        region: mask of the region, bool, shape [H, W].
+        extent_m: width and height of the map in metres.
         colour: colour of the region.
         opacity: opacity of the colour, in [0, 1].
     """
@@ -106,12 +107,18 @@ def frame_map(panel: Axes) -> None:
 
 
 def name_terrain(panel: Axes, label: str, **look: Any) -> None:
-    """Add a kind of terrain to the legend, since images have no entry."""
+    """Add an entry for a kind of terrain to the legend, since images add none.
+
+    Args:
+        panel: panel to which the legend belongs.
+        label: text of the entry.
+        **look: keywords of `Axes.fill` for the entry's patch.
+    """
     panel.fill([], [], label=label, **look)
 
 
 def name_immobilising(panel: Axes, immobilising: np.ndarray) -> None:
-    """Add immobilising cells to the legend, if a map has any."""
+    """Add an entry for immobilising cells to the legend, if a mask contains any."""
     if immobilising.any():
         name_terrain(panel, "immobilises a robot", color=IMMOBILISING)
 
@@ -127,7 +134,7 @@ def draw_scale(panel: Axes, extent_m: tuple[float, float], size: float = 7.0) ->
     """Draw a scale bar below a map without axes.
 
     Args:
-        panel: panel in metres.
+        panel: panel with axes in metres.
         extent_m: width and height of the map in metres.
         size: size of the text in points.
     """
@@ -143,11 +150,11 @@ def hatching(region: np.ndarray, resolution_m: float) -> np.ndarray:
     """Compute the lines that hatch a region: diagonals of its cells.
 
     Args:
-        region: bool, shape [H, W].
+        region: mask of the region, bool, shape [H, W].
         resolution_m: edge length of a cell in metres.
 
     Returns:
-        Ends (x, y) of each line in metres, float32, shape [M, 2, 2].
+        Both ends (x, y) of each line in metres, float32, shape [M, 2, 2].
     """
     rows, columns = np.nonzero(region)
     is_drawn = (rows - columns) % _HATCH_CELLS == 0
@@ -162,11 +169,11 @@ def draw_lines(
     """Draw lines on a map.
 
     Args:
-        panel: panel in metres.
-        lines: ends (x, y) of each line in metres, shape [M, 2, 2].
+        panel: panel with axes in metres.
+        lines: both ends (x, y) of each line in metres, shape [M, 2, 2].
         colour: colour of the lines.
-        width: width in points.
-        edge: colour of a wider line below each; if None, there is no edge.
+        width: width of the lines in points.
+        edge: colour of a wider line below each line; if None, lines have no edge.
     """
     segments = list(lines)
     if edge is not None:
@@ -177,14 +184,14 @@ def draw_lines(
 
 
 def layer_scale(name: str, values: np.ndarray) -> dict[str, Any]:
-    """Return the colour scale of a layer, as keywords of `imshow`.
+    """Return the colour scale of a layer, as keywords of `Axes.imshow`.
 
-    It ranges from 0, or the minimum if that is lower, to the maximum; that of an
-    azimuth is cyclic.
+    The scale ranges from 0, or from the minimum if it is below 0, to the maximum. The
+    scale of an azimuth is cyclic, from 0 to 360.
 
     Args:
-        name: name of the layer; azimuths end in `_azimuth_deg`.
-        values: values of any shape, NaN for unknown ones.
+        name: name of the layer; names of azimuths end in `_azimuth_deg`.
+        values: values of the layer, NaN in cells without a value, any shape.
     """
     if is_azimuth(name):
         return {"cmap": with_missing(_DIRECTION_COLOURS), "vmin": 0.0, "vmax": 360.0}
@@ -200,7 +207,7 @@ def with_missing(colours: str | np.ndarray) -> Colormap:
     """Return a colour map with grey for masked cells.
 
     Args:
-        colours: name of a colour map, or its colours of shape [C, 3].
+        colours: name of a colour map, or the colours of a new one, shape [C, 3].
     """
     if isinstance(colours, str):
         return matplotlib.colormaps[colours].with_extremes(bad=MISSING)
@@ -208,17 +215,30 @@ def with_missing(colours: str | np.ndarray) -> Colormap:
 
 
 def missing_handle() -> Patch:
-    """Return the entry of a legend for cells without a value."""
+    """Return the legend entry for cells without a value."""
     return Patch(facecolor=MISSING, label="unknown")
 
 
 def shades(values: np.ndarray, colours: str = TRAVERSABILITY_COLOURS) -> np.ndarray:
-    """Return colours of values in [0, 1], uint8, from any shape to [..., 3]."""
+    """Return red, green and blue of values in [0, 1], uint8.
+
+    Args:
+        values: values in [0, 1], any shape.
+        colours: name of a colour map.
+
+    Returns:
+        Colours; their shape is that of `values` with a further dimension of length 3.
+    """
     return _bytes(matplotlib.colormaps[colours](values))
 
 
 def layer_colours(name: str, layer: np.ndarray) -> np.ndarray:
-    """Return colours of a layer, uint8, from shape [H, W] to [H, W, 3]; NaN is grey."""
+    """Return red, green and blue of a layer, uint8, shape [H, W, 3]; NaN is grey.
+
+    Args:
+        name: name of the layer, which determines its colour scale.
+        layer: values of the layer, shape [H, W].
+    """
     scale = layer_scale(name, layer)
     shown = layer % 360 if is_azimuth(name) else layer
     low = scale["vmin"]
@@ -234,8 +254,8 @@ def veiled(colours: np.ndarray, seen: np.ndarray) -> np.ndarray:
     """Return colours blended with grey in unobserved cells, uint8, shape [H, W, 3].
 
     Args:
-        colours: uint8, shape [H, W, 3].
-        seen: observed cells, bool, shape [H, W].
+        colours: red, green and blue, uint8, shape [H, W, 3].
+        seen: mask of observed cells, bool, shape [H, W].
     """
     grey = np.array(bytes_of(UNSEEN)[:3])
     blended = (1 - VEIL) * colours + VEIL * grey
@@ -244,11 +264,11 @@ def veiled(colours: np.ndarray, seen: np.ndarray) -> np.ndarray:
 
 
 def field_colours(field: np.ndarray, immobilising: np.ndarray) -> np.ndarray:
-    """Return colours of λ, with immobilising cells in dark red.
+    """Return the colours of a λ field, with immobilising cells in dark red.
 
     Args:
         field: λ in [0, 1], shape [H, W].
-        immobilising: bool, shape [H, W].
+        immobilising: mask of immobilising cells, bool, shape [H, W].
 
     Returns:
         Red, green and blue, uint8, shape [H, W, 3].

@@ -1,4 +1,4 @@
-"""Panels of numbers: grids of panels, curves over a swept value, and intervals."""
+"""Panels that show numbers: grids of panels, curves over a swept value, intervals."""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -29,9 +29,10 @@ def line_looks(
     """Return the style of each line, as keywords of `Axes.plot`.
 
     Args:
-        names: names of the lines; equal names have the same style.
-        colours: colour of each name; if empty, `LINE_COLOURS` in turn.
-        dashed: whether lines also differ in their dashes instead of their markers.
+        names: names of the lines; lines of the same name have the same style.
+        colours: colour of each distinct name; if empty, `LINE_COLOURS` in turn.
+        dashed: whether lines differ in their dashes, in addition to colours, instead of
+            in their markers.
     """
     looks: dict[str, dict[str, Any]] = {}
     for index, name in enumerate(dict.fromkeys(names)):
@@ -60,14 +61,14 @@ def panel_grid(
         titles: titles of the stacks.
         across: maximum number of stacks next to each other.
         high_in: height of a stack in inches.
-        ends_in: height of everything else, such as the legend, in inches.
-        width_in: width of the figure in inches; if 0, one column of a page for a single
-            stack across, else both columns.
-        layers: panels of a stack.
-        **shared: as in `Figure.subplots`.
+        ends_in: height of everything except the stacks, such as the legend, in inches.
+        width_in: width of the figure in inches. If 0, the width is that of one column of
+            a page if stacks are only above each other, else of both columns.
+        layers: number of panels in a stack.
+        **shared: keywords of Matplotlib's `Figure.subplots`, such as `sharex`.
 
     Returns:
-        The figure, and the panels of each stack, downward.
+        The figure, and the panels of each stack from top to bottom.
     """
     across = max(1, min(across, len(titles)))
     if not width_in:
@@ -91,16 +92,16 @@ def draw_estimates(
     label: str = "",
     bars: bool = False,
 ) -> None:
-    """Draw estimates as a line with the band of their intervals.
+    """Draw estimates as a line, and their intervals as a band or bars.
 
     Args:
         panel: panel to draw on.
         x: swept values, shape [N].
         y: estimates, shape [N].
-        low: lower ends of the intervals, NaN for no interval, shape [N].
+        low: lower ends of the intervals, NaN for points without an interval, shape [N].
         high: upper ends of the intervals, shape [N].
-        look: keywords of `Axes.plot`.
-        label: entry of the legend; if empty, the line has no entry.
+        look: keywords of `Axes.plot` for the line, including `color`.
+        label: text of the legend entry; if empty, the line has no entry.
         bars: whether intervals are bars instead of a band.
     """
     if bars:
@@ -113,7 +114,16 @@ def draw_estimates(
 def draw_interval(
     panel: Axes, low: float, high: float, height: float, colour: Any, width: float = 1.2
 ) -> None:
-    """Draw an interval as a horizontal line at a height, `width` points thick."""
+    """Draw an interval as a horizontal line.
+
+    Args:
+        panel: panel to draw on.
+        low: lower end of the interval.
+        high: upper end of the interval.
+        height: position of the line along y.
+        colour: colour of the line.
+        width: width of the line in points.
+    """
     style: dict[str, Any] = {"color": colour, "lw": width, "zorder": 2}
     panel.plot([low, high], [height, height], solid_capstyle="butt", **style)
 
@@ -123,11 +133,12 @@ class Curves:
     """Curves over a swept value, with a panel for each group of lines and measure.
 
     Args:
-        table: one row per point: `panel`, the title of its group; `line`, its name;
-            `x`; and a column for each measure, with columns that end in `_low` and
-            `_high` if it has an interval.
-        measures: label by column.
-        looks: style by line, as from `line_looks`.
+        table: one row per point of a line: `panel`, the title of the line's group;
+            `line`, the line's name; `x`, the swept value; a column for each measure;
+            and, if the measure has an interval, its ends in the columns that end in
+            `_low` and `_high`.
+        measures: label of each measure, by column.
+        looks: style of each line by name, as from `line_looks`.
         x_label: label of the x-axis.
         across: maximum number of groups next to each other.
         high_in: height of a panel in inches.
@@ -147,8 +158,8 @@ class Curves:
     def draw(self) -> tuple[Figure, dict[tuple[str, str], Axes]]:
         """Draw the curves.
 
-        Measures of a single group are side by side with their labels as titles; those
-        of several groups are stacked.
+        If there is a single group, its measures are side by side, with their labels as
+        titles. If there are several groups, the measures of a group are stacked.
 
         Returns:
             The figure, without a legend, and its panels by group and measure.
@@ -195,7 +206,14 @@ class Curves:
 def draw_baseline(
     panel: Axes, value: float, label: str, horizontal: bool = True
 ) -> None:
-    """Draw a reference value, such as that of a calibrated model, as a dashed line."""
+    """Draw a reference value as a dashed line.
+
+    Args:
+        panel: panel to draw on.
+        value: reference value, such as that of a calibrated model.
+        label: text of the legend entry.
+        horizontal: whether the value is one of y instead of x.
+    """
     draw_line = panel.axhline if horizontal else panel.axvline
     draw_line(value, color="0.4", lw=0.8, ls="--", zorder=1, label=label)
 
@@ -204,8 +222,8 @@ def ticks_of(panel: Axes, axis: Literal["x", "y"], max_intervals: int = 4) -> No
     """Place ticks of an axis at multiples of 1, 2 or 5 times a power of ten.
 
     Args:
-        panel: panel of the axis.
-        axis: axis.
+        panel: panel to which the axis belongs.
+        axis: name of the axis.
         max_intervals: maximum number of intervals between ticks.
     """
     panel.locator_params(axis=axis, nbins=max_intervals, steps=[1, 2, 5, 10])

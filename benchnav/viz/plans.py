@@ -1,4 +1,4 @@
-"""Plans, driven paths and the sensors' range on a map in metres.
+"""Drawing of plans, driven paths and the sensors' range on a map in metres.
 
 Letters in shapes: N positions.
 """
@@ -13,7 +13,7 @@ from matplotlib.patheffects import AbstractPathEffect, Normal, withStroke
 
 from benchnav.viz.maps import FOOTPRINT, TRAVERSABILITY_COLOURS
 
-_LINE_WIDTH = 0.4  # of the thinnest line of a plan
+_LINE_WIDTH = 0.4  # width of the thinnest line of a plan, in points
 
 
 class LayerStyle(NamedTuple):
@@ -23,9 +23,9 @@ class LayerStyle(NamedTuple):
         label: entry of the legend.
         colour: red, green, blue and opacity, in hexadecimal digits.
         width: width relative to the thinnest line.
-        dashes: dashes of the line, if the format supports them.
-        effects: effects of the line, if the format supports them, such as a white edge
-            on dark terrain.
+        dashes: dashes of the line; a file format without dashes draws a solid line.
+        effects: effects of the line, such as a white edge; omitted in file formats that
+            do not support them.
     """
 
     label: str
@@ -36,7 +36,7 @@ class LayerStyle(NamedTuple):
 
 
 _EDGED = (withStroke(linewidth=2.2, foreground="white"), Normal())
-# From the bottom layer to the top one.
+# Styles by name of the layer, from the bottom layer to the top layer.
 STYLES: Mapping[str, LayerStyle] = {
     "tree": LayerStyle("tree", "#3c3c3c8c", 1),
     "samples": LayerStyle("samples", "#78b4ff6e", 1),
@@ -49,8 +49,9 @@ def draw_plan(panel: Axes, lines: Mapping[str, Sequence[np.ndarray]]) -> None:
     """Draw a plan on a map.
 
     Args:
-        panel: panel in metres.
-        lines: lines of each layer of `STYLES`, each of shape [N, 2].
+        panel: panel with axes in metres.
+        lines: lines by name of a layer in `STYLES`, each line of N positions (x, y) in
+            metres, shape [N, 2].
     """
     for name, style in STYLES.items():
         segments = list(lines.get(name, ()))
@@ -70,9 +71,10 @@ def driven_colours(
     """Return a driven path in the colours of observed λ, for a map and a colour bar.
 
     Args:
-        track: positions in metres, shape [N, 2].
-        traversability: λ between positions, shape [N − 1] or longer.
-        width: width in points.
+        track: positions (x, y) in metres, shape [N, 2].
+        traversability: observed λ between consecutive positions, in [0, 1]; the first
+            N − 1 values are used.
+        width: width of the path in points.
     """
     segments = list(np.stack((track[:-1], track[1:]), axis=1))
     style: dict[str, Any] = {"linewidths": width, "capstyle": "round", "zorder": 2.5}
@@ -86,10 +88,11 @@ def draw_footprint(panel: Axes, outline_m: np.ndarray) -> None:
     """Draw the outline of the sensors' range on a map.
 
     Args:
-        panel: panel in metres.
-        outline_m: lines in metres, separated by NaN, shape [N, 2].
+        panel: panel with axes in metres.
+        outline_m: positions (x, y) of all lines in metres, with NaN between two lines,
+            shape [N, 2].
     """
     edge = [withStroke(linewidth=1.1, foreground="black"), Normal()]
     style: dict[str, Any] = {"lw": 0.6, "path_effects": edge, "zorder": 2.2}
-    # A single line with gaps, so that no segment's edge covers another segment.
+    # Draw a single line with gaps: separate lines' edges would cover other lines.
     panel.plot(*outline_m.T, color=FOOTPRINT, label="footprint of the sensors", **style)

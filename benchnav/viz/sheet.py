@@ -27,13 +27,13 @@ from benchnav.viz.maps import (
 )
 from benchnav.viz.style import TEXT, TWO_COLUMNS_IN, legend_outside, styled
 
-_PAGE = 9.4  # maximum height
+_MAX_HEIGHT = 9.4  # maximum height of a sheet
 _DPI = 300.0
-_SIDES, _ENDS = 0.7, 1.5  # width and height of a sheet without its maps
-LINE, LETTER = 0.135, 0.054  # height of a line and mean width of a letter
-_COLUMN = 1.15  # minimum width of a column
-_BAR_GAP = 0.08  # between a column and its colour bar
-_TITLE_LETTERS = 20  # of a layer's name per line, which fit in a column
+_SIDES, _ENDS = 0.7, 1.5  # width and height of everything in a sheet except maps
+LINE, LETTER = 0.135, 0.054  # height of a line of text, and mean width of a letter
+_MIN_COLUMN = 1.15  # minimum width of a column
+_BAR_GAP = 0.08  # distance between a column and its colour bar
+_TITLE_LETTERS = 20  # number of letters per line of a column's title
 FRACTIONS: dict[str, Any] = {**LAMBDA, "cmap": with_missing("viridis")}
 
 
@@ -41,12 +41,13 @@ class SheetColumn(NamedTuple):
     """A column of a sheet of maps.
 
     Args:
-        name: prefix of its panels' labels, `NAME ROW`, and of its bar's, `NAME bar`.
+        name: name of the column. The axes' labels, by which tests find them, are
+            `NAME ROW` for a panel and `NAME bar` for the colour bar.
         title: heading of the column.
         layers: map of each row, shape [R, H, W], or colours of shape [R, H, W, 3].
-        shades: keywords of `imshow`.
+        shades: keywords of `Axes.imshow` for the colours.
         unit: label below the colour bar; if None, there is no bar.
-        extend: ends at which values may exceed the bar: neither, max or both.
+        extend: ends of the bar that values may exceed: `neither`, `max` or `both`.
         max_intervals: maximum number of intervals between the bar's ticks.
     """
 
@@ -65,7 +66,7 @@ def layer_column(name: str, values: np.ndarray, unit: str) -> SheetColumn:
     Args:
         name: name of the layer.
         values: values of the layer, shape [R, H, W].
-        unit: unit of the values; `1` for values without a unit.
+        unit: unit of the values; "1" for values without a unit.
     """
     words = name.removesuffix(f"_{unit}").replace("_", " ")
     unit_text = {"1": "", "deg": " [°]"}.get(unit, f" [{unit}]")
@@ -88,40 +89,40 @@ def sheet_of_maps(
     """Draw a sheet of maps: one row per map and one column per layer.
 
     Args:
-        columns: columns of R rows each.
+        columns: columns of the sheet, each with R maps.
         rows: names of the R rows.
         extent_m: size of a map along x and y, in metres.
         heading: heading of the sheet.
-        classes: entries of the legend below the maps.
-        marks: entries of a legend next to the heading.
+        classes: entries of the legend of terrain classes below the maps; may be empty.
+        marks: entries of a legend next to the heading; may be empty.
 
     Returns:
-        A figure as wide as a page; narrower if panels shrink to fit its height, wider
-        if there are many columns.
+        A figure as wide as a page. It is narrower if panels shrink to fit the page's
+        height, and wider if there are many columns.
     """
     ratio = extent_m[1] / extent_m[0]
     n_rows = len(rows)
     n_columns = len(columns)
-    max_width = max((TWO_COLUMNS_IN - _SIDES) / n_columns, _COLUMN)
-    max_height = max((_PAGE - _ENDS) / n_rows, 0.8)
-    high = min(max_width * ratio, 2.0, max_height)
-    width = n_columns * max(high / ratio, _COLUMN) + _SIDES
+    max_panel_width = max((TWO_COLUMNS_IN - _SIDES) / n_columns, _MIN_COLUMN)
+    max_panel_height = max((_MAX_HEIGHT - _ENDS) / n_rows, 0.8)
+    panel_height = min(max_panel_width * ratio, 2.0, max_panel_height)
+    width = n_columns * max(panel_height / ratio, _MIN_COLUMN) + _SIDES
     letters = max((len(str(patch.get_label())) for patch in classes), default=0)
     legend_columns = max(1, int(width / (0.4 + LETTER * letters)))
     legend_lines = -(-len(classes) // legend_columns)
     ends = _ENDS + LINE * legend_lines
-    height = n_rows * max(high, 0.5) + ends
+    height = n_rows * max(panel_height, 0.5) + ends
     figure = Figure(figsize=(width, height), dpi=_DPI, layout="constrained")
     shared: dict[str, Any] = {"sharex": True, "sharey": True}
     panels = figure.subplots(n_rows, n_columns, squeeze=False, **shared)
-    for column, below in zip(columns, panels.T, strict=True):
-        image = _draw_column(column, below, extent_m)
+    for column, column_panels in zip(columns, panels.T, strict=True):
+        image = _draw_column(column, column_panels, extent_m)
         if column.unit is not None:
             # Matplotlib expects the gap as a fraction of the height of all maps.
             gap = _BAR_GAP / (height - ends)
-            _draw_bar(figure, column, image, list(below), gap)
-    _set_ticks(panels[0, 0].xaxis, high / ratio)
-    _set_ticks(panels[0, 0].yaxis, high)
+            _draw_bar(figure, column, image, list(column_panels), gap)
+    _set_ticks(panels[0, 0].xaxis, panel_height / ratio)
+    _set_ticks(panels[0, 0].yaxis, panel_height)
     for panel, name in zip(panels[:, 0], rows, strict=True):
         panel.set_ylabel(name, size=TEXT)
     panels[-1, n_columns // 2].set_xlabel("x [m]", size=TEXT)
@@ -137,7 +138,7 @@ def sheet_of_maps(
 def _draw_column(
     column: SheetColumn, panels: Sequence[Axes], extent_m: tuple[float, float]
 ) -> Any:
-    """Draw the maps of a column, downward; return the last image."""
+    """Draw the maps of a column from top to bottom; return the last image."""
     for row, panel in enumerate(panels):
         panel.set(label=f"{column.name} {row}", facecolor=MISSING)
         image = show_map(panel, column.layers[row], extent_m, **column.shades)
@@ -149,7 +150,15 @@ def _draw_column(
 def _draw_bar(
     figure: Figure, column: SheetColumn, image: Any, panels: list[Axes], gap: float
 ) -> None:
-    """Draw the colour bar of an image below the panels of its column."""
+    """Draw the colour bar of a column below the column's panels.
+
+    Args:
+        figure: figure with the panels.
+        column: the column.
+        image: image of any of the column's maps.
+        panels: panels of the column.
+        gap: distance from the panels, as a fraction of their total height.
+    """
     ticks = MaxNLocator(column.max_intervals, steps=[1, 2, 2.5, 5, 10])
     bar = figure.colorbar(
         image,
@@ -167,9 +176,9 @@ def _draw_bar(
 
 
 def _set_ticks(axis: Axis, length_in: float) -> None:
-    """Place the ticks of an axis with a length in inches."""
+    """Place the ticks of an axis whose length is `length_in` inches."""
     max_intervals = min(max(int(length_in / 0.2), 1), 4)
-    # Omit a tick at the end: its number would touch the first of the next panel.
+    # Omit a tick at the upper end, whose number would touch that of the next panel.
     locator = MaxNLocator(max_intervals, steps=[1, 2, 5, 10], prune="upper")
     axis.set_major_locator(locator)
 
@@ -182,7 +191,12 @@ def _add_legend(
 
 
 def class_patches(names: Sequence[str], colours: np.ndarray) -> list[Artist]:
-    """Return entries of a legend for classes with colours of shape [C, 3]."""
+    """Return legend entries of terrain classes.
+
+    Args:
+        names: names of the C classes.
+        colours: colours of the classes, shape [C, 3].
+    """
     return [
         Patch(facecolor=colour, ec="0.3", lw=0.4, label=name)
         for colour, name in zip(colours, names, strict=True)
@@ -190,7 +204,7 @@ def class_patches(names: Sequence[str], colours: np.ndarray) -> list[Artist]:
 
 
 def class_scale(colours: np.ndarray) -> dict[str, Any]:
-    """Return the colour scale of class ids, as keywords of `imshow`.
+    """Return the colour scale of class indices, as keywords of `Axes.imshow`.
 
     Masked cells have no class.
 

@@ -1,7 +1,7 @@
 """Common style of all figures: sizes, colours, names, layout, and saving.
 
-Sizes are in inches and points as printed. Colours are distinct for all kinds of colour
-vision. Source: Okabe and Ito (2008), "Color universal design".
+Lengths are in inches and text sizes in points, as printed. Colours can be distinguished
+with any kind of colour vision. Source: Okabe and Ito (2008), "Color universal design".
 """
 
 import itertools
@@ -20,13 +20,13 @@ from matplotlib.transforms import Bbox, ScaledTranslation
 
 from benchnav.core.store import replacing
 
-# Widths of a journal's column and of a page.
+# Widths of one column and of both columns of a journal's page.
 ONE_COLUMN_IN = 88 / 25.4
 TWO_COLUMNS_IN = 180 / 25.4
-TEXT, TITLE = 7.0, 8.0
-_STRIP_IN = 0.2  # height of a mark above a figure
-_MIN_WIDTH_IN = 4.4  # of a figure with a legend of several columns
-DPI = 200
+TEXT, TITLE = 7.0, 8.0  # text sizes
+_STRIP_IN = 0.2  # height of the strip with a mark above a figure
+_MIN_WIDTH_IN = 4.4  # minimum width of a figure with a legend of several columns
+DPI = 200  # default resolution of saved figures, in dots per inch
 
 _STYLE: dict[Any, Any] = {
     **dict.fromkeys(("font.size", "axes.titlesize", "figure.titlesize"), TITLE),
@@ -45,9 +45,9 @@ _STYLE: dict[Any, Any] = {
     "legend.handlelength": 2.2,
     "legend.columnspacing": 1.4,
 }
-# Type 42 embeds whole fonts, which publishers require; composed images would be
-# resampled in a PDF.
-_SAVED: dict[Any, Any] = {"pdf.fonttype": 42, "image.composite_image": False}
+# Settings for saving. Type 42 embeds complete fonts, which publishers require. Images
+# that are composed into one would be resampled in a PDF.
+_SAVE_STYLE: dict[Any, Any] = {"pdf.fonttype": 42, "image.composite_image": False}
 
 BLUE = "#0072B2"
 ORANGE = "#D55E00"
@@ -55,10 +55,9 @@ GREEN = "#009E73"
 PINK = "#CC79A7"
 AMBER = "#E69F00"
 SKY = "#56B4E9"
-# The last, yellow, is invisible as a line on white.
 COLOURS = (BLUE, ORANGE, GREEN, PINK, AMBER, SKY, "#000000", "#F0E442")
-LINE_COLOURS = COLOURS[:-1]
-BLIND = "0.45"
+LINE_COLOURS = COLOURS[:-1]  # without yellow, which is invisible as a line on white
+BLIND = "0.45"  # grey of the blind baseline
 
 MARKERS = "osD^vP*X<"
 # Dashes distinguish overlapping paths and curves in greyscale.
@@ -69,6 +68,7 @@ LINE_STYLES: tuple[Any, ...] = (
     (0, (5, 1.2, 1, 1.2)),
     (0, (5, 1.2, 1, 1.2, 1, 1.2)),
 )
+# Name and colour of each shipped planner.
 _PLANNERS = {
     "astar_dwa": ("A*+DWA", BLUE),
     "astar_mppi": ("A*+MPPI", PINK),
@@ -79,7 +79,7 @@ _PLANNERS = {
     "straight": ("straight", BLIND),
 }
 
-# Name of each shipped risk measure without and with a number.
+# Displayed name of each shipped risk measure without and with a number.
 _RISKS = {
     "mean": ("mean", "mean:{}"),
     "cvar": ("CVaR", "CVaR{lowered}"),
@@ -94,12 +94,12 @@ _LOWERED = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 
 
 def styled() -> Any:
-    """Return the common style, as a context manager or decorator of a function."""
+    """Return the common style, as a context manager or a function decorator."""
     return matplotlib.rc_context(_STYLE)
 
 
 def planner_name(planner: str) -> str:
-    """Return a planner's name in figures, from its label; options are unchanged."""
+    """Return a planner's displayed name for its label; options are unchanged."""
     name = re.split("[ :]", planner)[0]
     if name not in _PLANNERS:
         return planner
@@ -110,8 +110,8 @@ def risk_name(risk: str) -> str:
     """Return the displayed name of a risk setting: `cvar:0.95` becomes CVaR₀.₉₅.
 
     Args:
-        risk: label of a risk setting. Labels other than a shipped measure with at most
-            one number are unchanged.
+        risk: label of a risk setting. A label other than a shipped risk measure with at
+            most one number is returned unchanged.
     """
     measure, colon, number = risk.partition(":")
     if colon and not _NUMBER.fullmatch(number):
@@ -126,7 +126,8 @@ def planner_colours(planners: Sequence[str]) -> dict[str, str]:
     """Return colours of planners by label; shipped planners have fixed colours.
 
     Args:
-        planners: labels; custom planners have the remaining colours in turn.
+        planners: labels of planners. Custom planners have the remaining colours in
+            turn.
     """
     colours = {
         planner: _PLANNERS[planner][1] for planner in planners if planner in _PLANNERS
@@ -142,17 +143,17 @@ def condition_colours(
     """Return the colour of each condition of a figure.
 
     Args:
-        planners: planner of each condition. If all differ, each condition has its
-            planner's colour. Otherwise conditions have colours of the palette in turn,
-            except for the blind baseline, which is grey.
-        palette: colours, which repeat if there are too few.
+        planners: label of each condition's planner. If all planners differ, each
+            condition has the colour of its planner. Otherwise conditions have colours
+            of the palette in turn, except for the blind baseline, which is grey.
+        palette: colours; they repeat if there are more conditions.
     """
     by_planner = planner_colours(planners)
-    own_colours = [by_planner[planner] for planner in planners]
+    planner_colour = [by_planner[planner] for planner in planners]
     if len(by_planner) == len(planners):
-        return own_colours
-    turn = itertools.cycle(palette)
-    return [BLIND if colour == BLIND else next(turn) for colour in own_colours]
+        return planner_colour
+    cycle = itertools.cycle(palette)
+    return [BLIND if colour == BLIND else next(cycle) for colour in planner_colour]
 
 
 def bytes_of(colour: Any) -> tuple[int, ...]:
@@ -161,7 +162,7 @@ def bytes_of(colour: Any) -> tuple[int, ...]:
 
 
 def line_style(index: int) -> Any:
-    """Return the dashes of a line by its index among several."""
+    """Return the dashes of a line from its index in a figure; dashes repeat."""
     return LINE_STYLES[index % len(LINE_STYLES)]
 
 
@@ -174,11 +175,11 @@ def stack_panels(
         figure: empty figure.
         count: number of stacks.
         across: number of stacks next to each other, at most `count`.
-        layers: panels of a stack.
-        **shared: as in `Figure.subplots`.
+        layers: number of panels in a stack.
+        **shared: keywords of Matplotlib's `Figure.subplots`, such as `sharex`.
 
     Returns:
-        The panels of each stack, downward.
+        The panels of each stack, from top to bottom.
     """
     n_rows = -(-count // across)
     panels = figure.subplots(layers * n_rows, across, squeeze=False, **shared)
@@ -198,20 +199,20 @@ def legend_outside(
 ) -> Legend:
     """Add a legend outside the panels: each label of the panels once, then `handles`.
 
-    If the figure has a common label of its x-axes, choose a side above the panels;
-    below them, the two would overlap.
+    If the figure has a common label for all x-axes, choose a side above the panels.
+    Below the panels, the legend and the label would overlap.
 
     Args:
         figure: figure with all its panels.
-        handles: further entries.
-        columns: columns of the legend of a figure as wide as a page; a narrower one has
-            half of them.
+        handles: further entries of the legend.
+        columns: number of the legend's columns in a figure as wide as a page; a
+            narrower figure has half as many.
         side: side of the figure, as in Matplotlib's `loc`.
     """
     labelled: dict[str, Artist] = {}
     for panel in figure.axes:
-        of_panel, labels = panel.get_legend_handles_labels()
-        for handle, label in zip(of_panel, labels, strict=True):
+        panel_handles, labels = panel.get_legend_handles_labels()
+        for handle, label in zip(panel_handles, labels, strict=True):
             labelled.setdefault(label, handle)
     if figure.get_figwidth() < TWO_COLUMNS_IN:
         columns = -(-columns // 2)
@@ -220,7 +221,12 @@ def legend_outside(
 
 
 def page_width(count: int, across: int) -> float:
-    """Return a figure's width in inches for `count` panels, `across` per page width."""
+    """Return a figure's width in inches for some panels.
+
+    Args:
+        count: number of panels.
+        across: number of panels that are as wide as a page.
+    """
     fraction = min(count, across) / across
     return max(TWO_COLUMNS_IN * fraction, _MIN_WIDTH_IN)
 
@@ -238,10 +244,10 @@ def save(
     Args:
         figure: figure to write.
         path: path of the file.
-        kind: format: png, pdf, svg or jpg.
-        dpi: dots per inch; by default, those of the figure.
+        kind: file format: png, pdf, svg or jpg.
+        dpi: dots per inch; by default, the figure's own.
         trim: whether to cut white borders.
-        strip_in: height of a strip above the figure to include, in inches.
+        strip_in: height in inches of a strip above the figure that the file includes.
     """
     area: dict[str, Any] = {"bbox_inches": None, "pad_inches": 0}
     if trim:
@@ -250,7 +256,7 @@ def save(
         width_in = figure.get_figwidth()
         height_in = figure.get_figheight() + strip_in
         area["bbox_inches"] = Bbox.from_extents(0, 0, width_in, height_in)
-    with matplotlib.rc_context(_SAVED):
+    with matplotlib.rc_context(_SAVE_STYLE):
         figure.savefig(path, format=kind, dpi=dpi, **area)
 
 
@@ -262,11 +268,11 @@ def save_twice(
     Args:
         figure: figure to write.
         path: path of the PNG; its folder is created.
-        trim: whether to cut white borders; without it, the figure keeps its width.
+        trim: whether to cut white borders; if false, the figure keeps its width.
         dpi: dots per inch.
-        mark: line in a strip above the figure; if empty, there is no strip.
+        mark: line of text in a strip above the figure; if empty, there is no strip.
     """
-    # Compute the layout only once, so that both files have the same.
+    # Compute the layout only once, so that both files have the same layout.
     figure.set_dpi(dpi)
     engine = figure.get_layout_engine()
     if engine is not None:

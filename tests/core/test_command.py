@@ -225,7 +225,10 @@ def test_each_program_prints_its_help_when_bare(program: str) -> None:
         ),
         (["go", "--options", "3"], "Expected --options as a mapping, got '3'."),
         (["go", "--risks", "{a: b}"], "Expected --risks as a list, each text, got"),
-        (["go", "more"], "Expected no more arguments, got 'more'. See `x go --help`."),
+        (
+            ["go", "more"],
+            "Expected no further arguments, got 'more'. See `x go --help`.",
+        ),
         (["work"], "Expected PLACE, got none. See `x work --help`."),
         (
             ["go", "--config", "nope.yaml"],
@@ -261,7 +264,10 @@ def test_mistakes_on_the_line_are_told_in_the_users_words(
             "depth: {epochs: x}\n",
             "Expected `depth.epochs` of s.yaml as a whole number, got 'x'.",
         ),
-        ("- a\n", "Expected s.yaml to contain settings as `name: value`, got list."),
+        (
+            "- a\n",
+            "Expected s.yaml to contain settings as `name: value`, got a value of type list.",
+        ),
         ("a: [1\n", "Expected YAML, got s.yaml, line 2: did not find"),
     ],
 )

@@ -193,7 +193,7 @@ def test_large_maps_are_worked_on_in_pieces_without_seams(
 
     whole = maps()
     # four rows
-    monkeypatch.setattr("benchnav.core.mixture._NUMBERS_AT_ONCE", 7 * 20 * 4)
+    monkeypatch.setattr("benchnav.core.mixture._CHUNK_NUMBERS_ON_CPU", 7 * 20 * 4)
     pieces = maps()
     for one, other in zip(whole, pieces, strict=True):
         torch.testing.assert_close(one, other, atol=2e-7, rtol=0)

@@ -158,6 +158,6 @@ def test_a_class_is_described_with_its_defaults() -> None:
 
 def test_an_object_of_another_kind_is_rejected() -> None:
     with pytest.raises(
-        ConfigError, match=r"to be a subclass of benchnav\.planning\.Planner, got CVaR"
+        ConfigError, match=r"to be an instance of benchnav\.planning\.Planner, got CVaR"
     ):
         describe("planner", CVaR())

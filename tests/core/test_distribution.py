@@ -206,7 +206,7 @@ def test_the_integrals_of_a_cell_are_its_own_however_many_others_there_are(
     law, observed = Hidden(law), torch.full(law.shape, 0.4, dtype=torch.float64)
     whole = law.cvar(0.9), law.mean(), law.expected_time(0.05), law.crps(observed)
     for cells in (1, 14, 40):  # of rows, of a few rows, and of more than a map
-        monkeypatch.setattr("benchnav.core.distribution._CELLS_AT_ONCE", cells)
+        monkeypatch.setattr("benchnav.core.distribution._CHUNK_CELLS_ON_CPU", cells)
         pieces = law.cvar(0.9), law.mean(), law.expected_time(0.05), law.crps(observed)
         for found, wanted in zip(pieces, whole, strict=True):
             torch.testing.assert_close(found, wanted, rtol=0, atol=1e-12)

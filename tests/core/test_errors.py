@@ -13,7 +13,7 @@ from benchnav.core.errors import (
     CheckpointError,
     ConfigError,
     OutOfMemoryError,
-    out_of_memory,
+    out_of_memory_error,
 )
 from benchnav.core.settings import call
 from benchnav.eval.folder.run_folder import damaged
@@ -69,13 +69,15 @@ def test_a_command_says_that_memory_ran_out(
 def test_a_fault_of_ours_stays_a_traceback() -> None:
     with pytest.raises(RuntimeError, match="out of bounds"):
         run("x", "Does.", {"f": Command(faulty, ("work",))}, ["f", "a"])
-    assert out_of_memory(RuntimeError("index out of bounds")) is None
-    assert out_of_memory(ValueError("not enough memory")) is None
+    assert out_of_memory_error(RuntimeError("index out of bounds")) is None
+    assert out_of_memory_error(ValueError("not enough memory")) is None
     cycle = ValueError("a")
     cycle.__cause__ = ValueError("b")
     cycle.__cause__.__cause__ = cycle
-    assert out_of_memory(cycle) is None
-    assert out_of_memory(ConfigError("Expected `jobs` in 1–10000, got 0.")) is None
+    assert out_of_memory_error(cycle) is None
+    assert (
+        out_of_memory_error(ConfigError("Expected `jobs` in 1–10000, got 0.")) is None
+    )
 
 
 def test_neither_part_nor_file_nor_checkpoint_is_blamed(

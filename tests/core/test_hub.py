@@ -153,7 +153,7 @@ def test_a_dataset_is_downloaded_once_and_read_without_a_connection(
         tmp_path, "benchnav-datagen", "show", "me/ground@main", HF_ENDPOINT=address
     )
     assert done.returncode == 0, done.stderr
-    assert f"me/ground@main is {COMMIT} now and may move" in done.stderr
+    assert f"me/ground@main is commit {COMMIT} now and may change" in done.stderr
     # data alone is downloaded
     assert not any("evil.py" in path for path in handler.asked)
     local = run(tmp_path, "benchnav-datagen", "show", str(dataset_path))
@@ -195,7 +195,9 @@ def test_what_a_hub_lacks_is_one_line(
         tmp_path, "benchnav-datagen", "show", "me/none@main", HF_HUB_OFFLINE="1"
     )
     assert offline.returncode == 2
-    assert "Try again with a connection, or name a local folder." in offline.stderr
+    assert (
+        "Try again with a network connection, or name a local folder." in offline.stderr
+    )
 
 
 FIND = """

@@ -614,7 +614,7 @@ def test_bad_arguments_are_refused() -> None:
     for level in (-0.1, 1.0, math.nan):
         with pytest.raises(ConfigError, match="level"):
             mixture.cvar(level)
-    with pytest.raises(ConfigError, match="one shape"):
+    with pytest.raises(ConfigError, match="the same shape"):
         TraversabilityMixture(
             torch.ones(1, 2, 3), torch.ones(1, 2, 3), torch.ones(1, 2, 4)
         )
@@ -631,7 +631,7 @@ def test_rows_at_a_time_change_no_bit(
     )
     whole = mixture.cvar(0.7), mixture.var(0.6), mixture.mean()
     for numbers in (1, 2 * mixture.weights.numel() // shape[-2]):
-        monkeypatch.setattr("benchnav.core.mixture._NUMBERS_AT_ONCE", numbers)
+        monkeypatch.setattr("benchnav.core.mixture._CHUNK_NUMBERS_ON_CPU", numbers)
         for found, wanted in zip(
             (mixture.cvar(0.7), mixture.var(0.6), mixture.mean()), whole, strict=True
         ):

@@ -156,5 +156,5 @@ def test_one_is_itself_and_none_or_unlike_ones_are_refused() -> None:
         mixture(3, 0.1, 0.2, dtype=torch.float32),
         MEMBERS[0].to("meta"),
     ):
-        with pytest.raises(ConfigError, match="one shape, dtype and device"):
+        with pytest.raises(ConfigError, match="same shape, dtype and device"):
             pool([MEMBERS[0], other])

@@ -165,13 +165,16 @@ SPACED = tuple(np.linspace(0, 1, 80).tolist())
 @pytest.mark.parametrize(
     ("levels", "expected"),
     [
-        (LEVELS[:60], "64 or more, got 60"),
+        (LEVELS[:60], "at least 64 `levels` that ascend from 0 to 1, got 60"),
         (LEVELS[1:], "ascend from 0 to 1"),
         (LEVELS[:-1], "ascend from 0 to 1"),
         ((*LEVELS[:-2], 1.0, 0.999), "ascend from 0 to 1"),
         ((0.0, *LEVELS), "ascend from 0 to 1"),
         ((math.nan, *LEVELS), "ascend from 0 to 1"),
-        (SPACED, "at most 0.01 apart up to 0.1, where risk is, got 0.0127"),
+        (
+            SPACED,
+            "at most 0.01 apart up to 0.1, the tail that risk depends on, got a step of 0.0127",
+        ),
     ],
 )
 def test_levels_that_are_none_are_refused(

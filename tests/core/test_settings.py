@@ -57,7 +57,7 @@ FULL = {
 
 
 def rover(data: Any, now: Any = None) -> Any:
-    return read(Rover, data, of("rover"), now=now)
+    return read(Rover, data, of("rover"), present=now)
 
 
 def test_plain_data_becomes_nested_dataclasses_and_comes_back() -> None:
@@ -100,7 +100,7 @@ def test_what_is_not_given_stays_as_it_is_in_the_value_that_is_changed() -> None
         ({"spare": {"radius_m": 1, "kind": "sotf"}}, "Expected `spare.kind` of rover as 'rigid' or 'soft', got 'sotf'. Did you mean 'soft'?"),
         ({"spare": [1]}, "Expected `spare` of rover as a mapping or null, got [1]."),
         ({"speeds": {"slow": {"radius": 1}}}, "Expected keys of `speeds.slow` of rover among radius_m, kind, got 'radius'. Did you mean 'radius_m'?"),
-        ({"speeds": {1: {"radius_m": 1}}}, "Expected names in `speeds` of rover, got [1]. Quote numbers."),
+        ({"speeds": {1: {"radius_m": 1}}}, "Expected keys of `speeds` of rover as text, got [1]. Put numbers in quotes."),
         ({"path": [1]}, "Expected `path` of rover as a list [a number, a number], got [1]."),
         ({"path": [1, True]}, "Expected `path` of rover as a list [a number, a number], got [1, True]."),
         ({"notes": 3}, "Expected `notes` of rover as a mapping, got 3."),
@@ -122,12 +122,12 @@ def test_only_a_mapping_is_a_dataclass_even_where_all_has_defaults(value: Any) -
 
     for now in (NO_DEFAULT, Easy(a=2)):
         with pytest.raises(ConfigError, match=r"^Expected easy as a mapping, got"):
-            read(Easy, value, of("easy"), now=now)
+            read(Easy, value, of("easy"), present=now)
         if value is not None:
             with pytest.raises(
                 ConfigError, match=r"^Expected easy as a mapping or null, got"
             ):
-                read(Easy | None, value, of("easy"), now=now)
+                read(Easy | None, value, of("easy"), present=now)
 
 
 def test_a_default_of_none_may_be_given_whatever_the_type_says() -> None:

@@ -195,7 +195,7 @@ def test_a_part_of_a_module_is_its_package_and_what_that_imports(
 
 def test_files_that_a_part_lists_are_in_its_digest(part: Path) -> None:
     part.write_text("class Planner:\n    files = ('weights.bin', 'tables')\n")
-    assert "got 'weights.bin', which does not exist" in refusal(lambda: digest(part))
+    assert "got 'weights.bin', which does not" in refusal(lambda: digest(part))
     (part.parent / "weights.bin").write_bytes(b"1")
     (part.parent / "tables").mkdir()
     seen = {digest(part)}
@@ -253,7 +253,7 @@ def test_a_folder_that_holds_the_working_folder_is_refused(
     asked = Part(
         part=f"{part}:Planner", label="", kind="planner", options={"weights": folder}
     )
-    assert f"got {folder!r}, which contains the working folder" in refusal(
+    assert f"contains the working folder, got {folder!r}" in refusal(
         lambda: option_files(asked)
     )
 
@@ -279,7 +279,7 @@ def test_a_name_of_an_earlier_version_is_answered_with_that_of_today(
         assert "\n" not in str(caught.value)
     assert "old_part.py could not be imported" in str(
         caught.value
-    ) or "module old_part" in str(caught.value)
+    ) or "got old_part: " in str(caught.value)
 
 
 def test_the_new_names_can_be_imported() -> None:
@@ -308,12 +308,12 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     (place / "drawing.py").write_text("colour = 'blue'\n")
     monkeypatch.setattr(sources, "PACKAGE", place)
     yield place
-    sources._module.cache_clear()
+    sources._digest_and_imports.cache_clear()
 
 
 def digests() -> dict[str, str]:
-    sources._module.cache_clear()  # as a new process
-    return sources.package_modules(["benchnav.unit"])
+    sources._digest_and_imports.cache_clear()  # as a new process
+    return sources.digests_of_package_modules(["benchnav.unit"])
 
 
 def test_modules_of_the_package_are_those_that_a_unit_imports(package: Path) -> None:

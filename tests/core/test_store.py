@@ -12,10 +12,10 @@ import pytest
 from benchnav.core.errors import BenchnavError, ConfigError
 from benchnav.core.store import (
     building,
-    refuse_taken,
+    check_replaceable,
+    replace_folder,
     replacing,
     sole_writer,
-    take_place,
     write_text,
 )
 
@@ -185,19 +185,19 @@ def test_a_place_is_taken_by_what_is_no_output_always_and_else_unless_it_is_to_b
 
     out = tmp_path / "out"
     for overwrite in (False, True):
-        refuse_taken(out, overwrite, foreign)
+        check_replaceable(out, overwrite, foreign)
     out.mkdir()
-    refuse_taken(out, False, foreign)  # an empty folder is no loss
+    check_replaceable(out, False, foreign)  # an empty folder is no loss
     (out / "made").touch()
-    refuse_taken(out, True, foreign)
+    check_replaceable(out, True, foreign)
     with pytest.raises(ConfigError, match=r"exists\. Pass --overwrite"):
-        refuse_taken(out, False, foreign)
+        check_replaceable(out, False, foreign)
     (out / "notes").touch()
     for overwrite in (False, True):
         with pytest.raises(
             ConfigError, match=r"out, which holds notes\. Choose another"
         ):
-            refuse_taken(out, overwrite, foreign)
+            check_replaceable(out, overwrite, foreign)
 
 
 def test_a_folder_that_is_built_takes_its_place_or_goes(tmp_path: Path) -> None:
@@ -216,5 +216,5 @@ def test_a_folder_that_is_built_takes_its_place_or_goes(tmp_path: Path) -> None:
         with building(out) as again:
             assert list(again.iterdir()) == []
             (again / "whole").touch()
-            take_place(again, out)
+            replace_folder(again, out)
     assert [path.name for path in tmp_path.rglob("*")] == ["out", "whole"]

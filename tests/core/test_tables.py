@@ -7,7 +7,7 @@ from benchnav.core.tables import Bold, Table, latex, to_latex, to_markdown, to_t
 
 TABLE = Table(
     headings=("planner", "λ̄ [%]", "failures"),
-    labels=1,
+    n_labels=1,
     rows=(("my_planner¹", "5.0 ± 1.0", "2 stuck"), ("[bold] a|b & 50%", "–", "–")),
     notes=("¹ follows λ̂ & C:\\{x}",),
 )
@@ -78,7 +78,7 @@ def test_terminal_shows_brackets_and_notes_and_breaks_only_where_it_has_to() -> 
     narrow = to_terminal(TABLE, width=30)
     assert max(map(cell_len, narrow.splitlines())) <= 30
     assert "…" not in narrow
-    wide = Table(headings=("x" * 150,), labels=1, rows=(("y",),), notes=("n" * 300,))
+    wide = Table(headings=("x" * 150,), n_labels=1, rows=(("y",),), notes=("n" * 300,))
     assert "n" * 300 in to_terminal(wide)
 
 

@@ -161,7 +161,7 @@ def test_a_cluster_makes_the_calls() -> None:
 def test_a_cluster_that_is_not_there_is_one_line(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(workers, "_REACH_S", 0.2)
+    monkeypatch.setattr(workers, "_CONNECTION_S", 0.2)
     for scheduler, message in (
         ("127.0.0.1:8786", "tcp://HOST:PORT"),
         ("tcp://127.0.0.1:9", "no answer"),

@@ -429,7 +429,7 @@ def test_faults_of_consecutive_maps_are_one_line(datagen: Call, capsys) -> None:
             "class_periods_m: [0.000000001]",
             "class_periods_m",
         ),
-        ("  train:", "  1:", "Quote numbers"),
+        ("  train:", "  1:", "Put numbers in quotes"),
         ("  train:", "  test:", "not nested"),
         ("classes: default", "classes: []", "`classes`"),
         ("goal_m: [12, 12]", "goal_m: [4.1, 4.1]", "another cell"),

@@ -347,7 +347,7 @@ def test_a_gpu_takes_all_cells_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
         pieces.append(len(tail))
         return search(cells, tail)
 
-    monkeypatch.setattr(mixture, "_NUMBERS_AT_ONCE", 32)
+    monkeypatch.setattr(mixture, "_CHUNK_NUMBERS_ON_CPU", 32)
     monkeypatch.setattr(mixture, "value_at_risk", counted)
     here = made.var(0.9)
     assert len(pieces) > 1

@@ -504,7 +504,7 @@ def test_the_world_may_resample_λ_where_nothing_is_learnt_of_it(
         ({"belief": "copla"}, "Did you mean 'copula'"),
         ({"model": "oracel"}, "Did you mean 'oracle'"),
         ({"risk": "cvr"}, "Did you mean 'cvar'"),
-        ({"belief": Contact()}, "to be a subclass of benchnav.planning.Belief"),
+        ({"belief": Contact()}, "to be an instance of benchnav.planning.Belief"),
         ({"unseen": "black"}, "unseen"),
         ({"replan_every_s": 0.0}, "replan_every_s"),
         ({"crop_cells": 1}, "crop_cells"),

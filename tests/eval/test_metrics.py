@@ -323,7 +323,7 @@ def own_metric(folder: Path, value: str, **attributes: str) -> str:
         (("energy", "energy:5"), "names and columns of their own"),
         (
             ("benchnav.planning:Unicycle",),
-            "to be a subclass of benchnav.metrics.Metric, got Unicycle",
+            "to be an instance of benchnav.metrics.Metric, got Unicycle",
         ),
     ],
 )
@@ -341,7 +341,11 @@ def test_a_metric_that_cannot_be_had_is_refused_before_the_run(
         ("1 / 0", {}, "got ZeroDivisionError: division by zero.*tried on Episode"),
         ("math.inf", {}, "got inf"),
         ("'a'", {}, "got 'a'"),
-        ("1.0", {"better": "more"}, "Expected `better` as higher, lower or neither"),
+        (
+            "1.0",
+            {"better": "more"},
+            "Expected `better` as 'higher', 'lower' or 'neither'",
+        ),
         ("1.0", {"column": "score"}, "and 'score' with 'score'"),
         ("1.0", {"column": "map"}, "and 'bookkeeping' with 'map'"),
     ],

@@ -110,7 +110,9 @@ def test_what_is_no_figure_is_an_error_before_anything_runs_or_is_written(
     (tmp_path / "own.py").write_text("class Own: ...")
     part = f"{tmp_path / 'own.py'}:Own"
     assert call("eval", "report", str(folder), "--figures", part) == 2
-    assert "to be a subclass of benchnav.viz.Figure, got Own" in capsys.readouterr().err
+    assert (
+        "to be an instance of benchnav.viz.Figure, got Own" in capsys.readouterr().err
+    )
     assert not (folder / "report.html").exists()
     with pytest.raises(ConfigError, match=r"subclass of benchnav\.viz\.Figure"):
         check_suite(Suite(figures=(part,)), elsewhere=False)

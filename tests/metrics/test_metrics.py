@@ -154,7 +154,7 @@ def test_energy_is_a_sum_over_steps_that_are_commanded_to_move() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"power_w": 0}, "`power_w` of metric 'energy' above 0 and finite, got 0"),
+        ({"power_w": 0}, "`power_w` of metric 'energy' > 0 and finite, got 0"),
         (
             {"min_traversability": 0},
             r"`min_traversability` of metric 'energy' in \(0, 1\], got 0",
@@ -206,9 +206,9 @@ class Fine(Metric):
         ({"unit": None}, "Expected `unit` as text"),
         ({"column": "a b_s"}, "Expected `column` of letters, digits and _"),
         ({"suffix": "_m"}, "Expected `suffix` as the end of column 'fine_s'"),
-        ({"better": "more"}, "Expected `better` as higher, lower or neither"),
+        ({"better": "more"}, "Expected `better` as 'higher', 'lower' or 'neither'"),
         ({"scale": 0}, "Expected `scale` above 0"),
-        ({"min_steps": -1}, "Expected `min_steps` ≥ 0"),
+        ({"min_steps": -1}, "Expected `min_steps` as a whole number ≥ 0"),
     ],
 )
 def test_attributes_without_meaning_are_named(

@@ -87,5 +87,5 @@ def test_best_set_is_the_stepwise_bootstrap_t_by_hand(
 def test_blocks_of_samples_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     wins = np.random.default_rng(0).binomial(3, 0.8, (12, 5))
     expected = best_set_p(wins, 3)
-    monkeypatch.setattr(best, "_CHUNK", 700)
+    monkeypatch.setattr(best, "_CHUNK_SIZE", 700)
     np.testing.assert_array_equal(best_set_p(wins, 3), expected)

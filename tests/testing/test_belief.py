@@ -159,7 +159,7 @@ def of_the_prior(
 
 
 BAD: dict[str, tuple[Any, str]] = {
-    "no belief": (object(), "Expected the belief to be a subclass of benchnav.planning.Belief, got object"),
+    "no belief": (object(), "Expected the belief to be an instance of benchnav.planning.Belief, got object"),
     "learns by a word": (having(learns="yes"), "Expected `learns` of type bool, got 'yes'"),
     "writes into the state": (doing("update", lambda s, *_: s.std.mul_(0.5)), "got another state.std."),
     "writes into what is sensed": (doing("update", lambda _, s, *__: s.std.mul_(2)), "got another sensed.std."),

@@ -168,7 +168,7 @@ def elsewhere(mixture: TraversabilityMixture, _: Observation) -> TraversabilityM
 
 
 BAD = {
-    "no predict": (object(), "Expected the model to be a subclass of benchnav.models.TraversabilityModel, got object"),
+    "no predict": (object(), "Expected the model to be an instance of benchnav.models.TraversabilityModel, got object"),
     "an error": (Needy(), "ValueError: sides differ (test_model.py, line 128) [20×37]"),
     "no mixture": (
         changed(lambda mixture, _: mixture.weights),

@@ -38,7 +38,7 @@ class Forgetful(GoalDistance):
 
 
 BAD: dict[str, tuple[Any, str]] = {
-    "no objective": (object(), "Expected the objective to be a subclass of benchnav.planning.Objective, got object"),
+    "no objective": (object(), "Expected the objective to be an instance of benchnav.planning.Objective, got object"),
     "another cost": (Forgetful(), "Expected the same result from `stage` when called again"),
     "a path that is free": (changed("path_cost", lambda cost, *_: cost - 1), "Expected costs above 0 from `path_cost`"),
     "a path that pays": (changed("path_cost", lambda cost, *_: -cost), "Expected costs above 0 from `path_cost`"),

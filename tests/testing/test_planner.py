@@ -205,7 +205,7 @@ class Draws(Good):
 
 
 BAD: dict[str, tuple[Any, str]] = {
-    "no planner": (object(), "Expected the planner to be a subclass of benchnav.planning.Planner, got object"),
+    "no planner": (object(), "Expected the planner to be an instance of benchnav.planning.Planner, got object"),
     "writes into the states": (acting(lambda step, _: step.state.zero_()), "got another step.state."),
     "writes into what was observed": (
         acting(lambda step, _: step.traversability.zero_()),

@@ -82,7 +82,7 @@ class Gathering(Unicycle):
 
 
 BAD: dict[str, tuple[Any, str]] = {
-    "no robot": (object(), "Expected the robot to be a subclass of benchnav.planning.Robot, got object"),
+    "no robot": (object(), "Expected the robot to be an instance of benchnav.planning.Robot, got object"),
     "no time step": (having(dt_s=0.0), "Expected `dt_s` > 0 and finite, got 0.0"),
     "no speed": (having(top_speed_mps=0.0), "Expected `top_speed_mps` > 0 and finite, got 0.0"),
     "bounds the wrong way round": (having(action_low=(1.0, 1.0)), "low below high, of 2 actions"),

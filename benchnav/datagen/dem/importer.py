@@ -25,7 +25,7 @@ import numpy as np
 from numpy import ndarray
 
 from benchnav.core.errors import DatasetError, expect
-from benchnav.core.store import building, real_place
+from benchnav.core.store import building, resolve_link
 from benchnav.datagen.dem.crs import load_rasterio
 from benchnav.datagen.dem.drive_log import Drives
 from benchnav.datagen.dem.options import Cut, Rasters
@@ -131,7 +131,7 @@ def import_dem(
         "a recipe whose `layers` do not change λ, since an import draws no layers, got "
         f"{', '.join(affecting)}.",
     )
-    out = real_place(out)
+    out = resolve_link(out)
     splits = {
         name: Split(scenario=cut.scenario, maps=1, solvable=cut.solvable)
         for name in cut.shares

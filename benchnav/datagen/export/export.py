@@ -19,7 +19,7 @@ import yaml
 
 from benchnav.core.errors import ConfigError, check_label, choose, expect
 from benchnav.core.sources import digest_of_path
-from benchnav.core.store import building, take_place
+from benchnav.core.store import building, replace_folder
 from benchnav.datagen.export.parquet import (
     FOLDER,
     MAP,
@@ -179,7 +179,7 @@ def export(
         text = json.dumps(node, indent=1, ensure_ascii=False)
         (folder / METADATA).write_text(f"{text}\n")
         (folder / CARD).write_text(card(dataset, names, publication))
-        take_place(folder, out)
+        replace_folder(folder, out)
 
 
 def _foreign(out: Path) -> str:

@@ -18,7 +18,7 @@ import numpy as np
 
 import benchnav
 from benchnav.core.errors import ConfigError, DatasetError, expect
-from benchnav.core.store import Shard, real_place, replacing, restore, sole_writer
+from benchnav.core.store import Shard, replacing, resolve_link, restore, sole_writer
 from benchnav.core.workers import run_calls
 from benchnav.datagen.files.hdf5 import (
     ShardFile,
@@ -68,7 +68,7 @@ def create(
         BenchnavError: If another run is writing it, a worker was killed, or the cluster
             was lost.
     """
-    path = real_place(path)
+    path = resolve_link(path)
     expect(
         shard is None or not is_one_file(path),
         f"`out` to be a folder, since a shard is made, got {path}.",

@@ -18,14 +18,14 @@ import numpy as np
 from numpy import ndarray
 
 import benchnav
-from benchnav.core.errors import DatasetError, out_of_memory
+from benchnav.core.errors import DatasetError, out_of_memory_error
 from benchnav.core.store import (
-    refuse_taken,
+    check_replaceable,
+    replace_folder,
     replacing,
     restore,
     seal,
     sole_writer,
-    take_place,
     write_text,
 )
 from benchnav.datagen import schema
@@ -257,7 +257,7 @@ def check_output(path: Path, overwrite: bool, names: Collection[str] = ()) -> No
     Raises:
         ConfigError: If it may not.
     """
-    refuse_taken(path, overwrite, partial(foreign_in, names=names))
+    check_replaceable(path, overwrite, partial(foreign_in, names=names))
 
 
 def foreign_in(path: Path, names: Collection[str] = ()) -> str:
@@ -325,7 +325,7 @@ def assemble(contents: Contents, folder: Path, out: Path) -> None:
     write_text(folder / FOLDER_MANIFEST, seal(manifest))
     if folder != out:
         check_output(out, True)  # another program may have written to it
-        take_place(folder, out)
+        replace_folder(folder, out)
 
 
 def _opened(split: str, files: Iterable[Path]) -> Iterator[h5py.Group]:
@@ -366,7 +366,7 @@ def named_errors(path: Path) -> Iterator[None]:
         yield
     except (OSError, RuntimeError) as error:
         reason = getattr(error, "strerror", None) or " ".join(str(error).split())
-        raise out_of_memory(error) or DatasetError(
+        raise out_of_memory_error(error) or DatasetError(
             f"Could not write {path}: {reason}. Correct this, then run the same "
             "command again."
         ) from error
@@ -378,11 +378,11 @@ def exclusive_output(
 ) -> Iterator[None]:
     """Acquire an output path for one process, after a check; convert write errors.
 
-    See `refuse_taken` and `named_errors`.
+    See `check_replaceable` and `named_errors`.
     """
     with named_errors(out), sole_writer(out, str(out)):
         restore(out)
-        refuse_taken(out, overwrite, foreign)
+        check_replaceable(out, overwrite, foreign)
         yield
 
 

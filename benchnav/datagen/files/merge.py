@@ -15,7 +15,7 @@ import numpy as np
 
 from benchnav.core.errors import ConfigError, DatasetError
 from benchnav.core.settings import plain
-from benchnav.core.store import building, real_place
+from benchnav.core.store import building, resolve_link
 from benchnav.datagen import schema
 from benchnav.datagen.files.check import find_faults
 from benchnav.datagen.files.hdf5 import (
@@ -67,7 +67,7 @@ def merge(
             shards are missing.
         ConfigError: If `out` exists and may not be replaced.
     """
-    out = real_place(out)
+    out = resolve_link(out)
     finished = [path for path in paths if is_dataset(path) or not path.is_dir()]
     if finished and len(finished) < len(paths):
         raise DatasetError(

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray
 
-from benchnav.core.errors import BenchnavError, ConfigError, expect, out_of_memory
+from benchnav.core.errors import BenchnavError, ConfigError, expect, out_of_memory_error
 from benchnav.core.grid import Grid
 from benchnav.core.settings import one_line
 from benchnav.datagen.layers.layer import DrawnMaps, Layer, Streams
@@ -185,7 +185,7 @@ def _call(
         raise
     except Exception as error:
         text = f"`{method}` of layer {layer.name!r} failed: {one_line(error)}"
-        raise out_of_memory(error) or ConfigError(text) from error
+        raise out_of_memory_error(error) or ConfigError(text) from error
 
 
 def _checked(

@@ -2,7 +2,7 @@
 
 A unit of work is identified by a key: the digest of its condition, seed, realisation,
 maps and code. Code comprises all modules of this package that a unit of the condition
-imports (see `package_modules`), the parts' own code and files, versions of installed
+imports (see `digests_of_package_modules`), the parts' own code and files, versions of installed
 packages, and the arithmetic of the processor.
 """
 
@@ -29,9 +29,9 @@ from benchnav.core import registry
 from benchnav.core.device import gpu_name
 from benchnav.core.registry import Part
 from benchnav.core.shipped_files import PACKAGE
-from benchnav.core.sources import digest_of, package_modules
+from benchnav.core.sources import digest_of, digests_of_package_modules
 from benchnav.core.store import text_digest
-from benchnav.core.touched import Touches, touches_of, unlike
+from benchnav.core.touched import Touches, differing_entries, touches_of
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.eval.experiment.condition import MEANING, Condition
 from benchnav.eval.experiment.unit import Conditions, Unit
@@ -136,7 +136,7 @@ def describe_parts(condition: Condition) -> Code:
     statistics = condition.statistics
     if statistics:
         parts["statistics of the ground"] = text_digest(statistics.to_json())
-    return {"modules": package_modules(modules), "parts": parts}
+    return {"modules": digests_of_package_modules(modules), "parts": parts}
 
 
 def describe_metrics(metrics: Iterable[Part]) -> dict[str, Any]:
@@ -146,7 +146,7 @@ def describe_metrics(metrics: Iterable[Part]) -> dict[str, Any]:
         target = part.found
         sources: Any = [target.origin, target.digest]
         if target.shipped:
-            sources = package_modules([target.target.__module__])
+            sources = digests_of_package_modules([target.target.__module__])
         files = registry.option_files(part)
         described[part.object.column] = {
             "part": part.part,
@@ -212,7 +212,7 @@ def code_differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list
         lines.append(f"{name} ({before} to {now['environment'][name]})")
     lines += _differing(earlier, now, "parts")
     lines += [f"metric {column}" for column in _differing(earlier, now, METRICS)]
-    lines += unlike(earlier.get(TOUCHED, {}), now.get(TOUCHED, {}))
+    lines += differing_entries(earlier.get(TOUCHED, {}), now.get(TOUCHED, {}))
     return lines
 
 

@@ -20,7 +20,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from benchnav.core.errors import ConfigError, out_of_memory
+from benchnav.core.errors import ConfigError, out_of_memory_error
 from benchnav.core.settings import one_line
 from benchnav.core.sources import digest_of_path
 from benchnav.core.store import Shard, replacing, seal, unseal, write_text
@@ -194,7 +194,7 @@ def damaged(path: Path, remedy: str) -> Iterator[None]:
         is_ours = isinstance(error, DamageError | ConfigError)
         reason = error if is_ours else one_line(error)
         message = f"{path} is damaged: {reason}. {remedy}"
-        raise out_of_memory(error) or ConfigError(message) from error
+        raise out_of_memory_error(error) or ConfigError(message) from error
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -174,7 +174,7 @@ def _pair_table(
             shown_counts.append(Column(name.removeprefix("n_"), cell_of(name)))
     rows = table.to_dict("records")
     all_columns = [*labels, *shown_counts, *columns]
-    return table_of(rows, all_columns, labels=len(labels), notes=notes)
+    return table_of(rows, all_columns, n_labels=len(labels), notes=notes)
 
 
 def _significance(p: str) -> Column:

@@ -96,7 +96,7 @@ def hypothesis_table(
         Column("result", _result),
     ]
     bold_note = "supported." if tests["supported"].any() else ""
-    table = table_of(rows, columns, labels=2, notes=notes, bold_note=bold_note)
+    table = table_of(rows, columns, n_labels=2, notes=notes, bold_note=bold_note)
     explained = []
     is_of_time = tests["metric"] == TOTAL_TIME.name
     is_difference = tests["kind"] == "difference"

@@ -182,7 +182,7 @@ def result_table(
     return table_of(
         rows,
         columns,
-        labels=len(labels),
+        n_labels=len(labels),
         notes=tuple(notes),
         bold_note=bold_note(summary),
     )
@@ -263,7 +263,9 @@ def learning_table(summary: pd.DataFrame) -> Table | None:
         ),
     ]
     columns += _columns_to_full(rows, summary)
-    return table_of(rows, columns, labels=len(labels), title="Learning during episodes")
+    return table_of(
+        rows, columns, n_labels=len(labels), title="Learning during episodes"
+    )
 
 
 def _mean_column(metric: Metric, write: Callable[[Any], str]) -> Column:
@@ -362,7 +364,7 @@ def _across(
     label_headings = [name.capitalize() for name in labels]
     return Table(
         headings=(*label_headings, *_PAPER * len(shown_blocks)),
-        labels=len(labels),
+        n_labels=len(labels),
         rows=tuple(map(tuple, np.hstack([shown_names, cells]))),
         groups=tuple(title for title, _ in shown_blocks),
         rules=frozenset(np.flatnonzero(starts_planner)[1:].tolist()),

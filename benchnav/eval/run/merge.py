@@ -13,8 +13,14 @@ from pathlib import Path
 from typing import Any
 
 from benchnav.core.errors import ConfigError
-from benchnav.core.store import Shard, new_folder, replacing, sole_writer, take_place
-from benchnav.core.touched import unlike
+from benchnav.core.store import (
+    Shard,
+    new_folder,
+    replace_folder,
+    replacing,
+    sole_writer,
+)
+from benchnav.core.touched import differing_entries
 from benchnav.eval.experiment.condition import label_words
 from benchnav.eval.experiment.metrics import metrics_of_run
 from benchnav.eval.experiment.unit import Unit, in_table_order, units
@@ -92,7 +98,7 @@ def merge_shards(parts: Sequence[Path], folder: Path) -> Iterator[tuple[int, int
         finish_run(partial, copied)
         note_checksums(partial, [partial / ERRORS])
         keep_ground(partial)
-        take_place(partial, target, last=RUN)
+        replace_folder(partial, target, last=RUN)
 
 
 def _check_one_environment(makings: Sequence[Finished]) -> None:
@@ -109,7 +115,7 @@ def _check_one_environment(makings: Sequence[Finished]) -> None:
     touched: dict[str, str] = {}
     for making in makings:
         contents = making.metadata.get(TOUCHED, {})
-        changed = unlike(touched, contents)
+        changed = differing_entries(touched, contents)
         if changed:
             raise ConfigError(
                 f"Expected shards whose parts read the same, got {making.path}, "

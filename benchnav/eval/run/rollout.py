@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from benchnav.core.device import GPU_FAULTS, DeviceError, gpu_failed
-from benchnav.core.errors import BenchnavError, out_of_memory
+from benchnav.core.errors import BenchnavError, out_of_memory_error
 from benchnav.core.settings import fault
 from benchnav.eval.run.knowledge import Knowing, Learning
 from benchnav.planning.objective import distance
@@ -327,7 +327,7 @@ def run_episodes(
     except GPU_FAULTS as error:
         raise gpu_failed(error) from error
     except (Exception, SystemExit) as error:
-        if no_memory := out_of_memory(error):
+        if no_memory := out_of_memory_error(error):
             raise no_memory from error
         trace = traceback.format_exc() if bool(now.running.any()) else ""
         log.blame(now.running, fault(error))
@@ -429,4 +429,4 @@ def _move(
     except Exception as error:
         robot = type(simulation.robot).__name__
         message = f"Robot {robot} failed in the simulation: {fault(error)}"
-        raise out_of_memory(error) or RobotError(message) from error
+        raise out_of_memory_error(error) or RobotError(message) from error

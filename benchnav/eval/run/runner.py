@@ -16,7 +16,7 @@ from benchnav.core.device import gpu_name
 from benchnav.core.errors import ConfigError
 from benchnav.core.progress import Progress
 from benchnav.core.store import Shard, sole_writer
-from benchnav.core.touched import changes_since, unlike
+from benchnav.core.touched import changed_entries, differing_entries
 from benchnav.core.workers import connected, run_calls
 from benchnav.eval.experiment.suite import RECORDS, Record, Suite
 from benchnav.eval.experiment.unit import (
@@ -291,7 +291,7 @@ def _missing(
         finished = _counting(makings, unit, origin, reuse_code)
         reason, lines = _why_missing(folder, unit, origin, makings, finished)
         if not reason and is_here and not reuse_code and finished:
-            lines = changes_since(finished.metadata.get(TOUCHED, {}))
+            lines = changed_entries(finished.metadata.get(TOUCHED, {}))
             reason = "changed" if lines else ""
         if not reason and finished and not finished.has(unit):
             reason = "unrecorded"
@@ -395,10 +395,10 @@ def _check_steady(finished: list[Finished], is_here: bool) -> None:
     changed: dict[str, None] = {}
     for making in finished:
         touched = making.metadata.get(TOUCHED, {})
-        changed |= dict.fromkeys(unlike(seen, touched))
+        changed |= dict.fromkeys(differing_entries(seen, touched))
         seen |= touched
     if is_here:
-        changed |= dict.fromkeys(changes_since(seen))
+        changed |= dict.fromkeys(changed_entries(seen))
     if changed:
         raise ConfigError(
             "Expected what parts read to stay the same during the run, got changes: "
@@ -433,7 +433,7 @@ def _finished(
         counted.append((unit, making))
         changed = []
         if reuse_code:
-            changed = changes_since(making.metadata.get(TOUCHED, {}))
+            changed = changed_entries(making.metadata.get(TOUCHED, {}))
         if changed or making.metadata["key"] != origin.key(unit):
             n_reused += 1
             changes |= dict.fromkeys([*_differences(making, origin), *changed])

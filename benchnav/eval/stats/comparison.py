@@ -10,10 +10,10 @@ from benchnav.eval.stats.hypotheses import comparable, means_and_difference
 from benchnav.eval.stats.pairs import Pair
 from benchnav.stats.episodes import (
     Interval,
+    as_fractions_of_budget,
     budgets_differ,
     difference_p,
     gain_by_map,
-    in_budgets,
     interval_of,
     mean_differences,
     summed_differences,
@@ -108,7 +108,7 @@ def _corrected(rows: Sequence[Mapping[str, Any]], *names: str) -> pd.DataFrame:
 def _compare(
     rows: pd.DataFrame, alpha: float, difference: float, as_fractions: bool
 ) -> dict[str, Any]:
-    timed = in_budgets(rows) if as_fractions else rows
+    timed = as_fractions_of_budget(rows) if as_fractions else rows
     time_unit = "_share" if as_fractions else "_s"
     time_interval = interval_of(timed, "total_time_s")
     gain, draws = gain_by_map(rows)

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from torchmetrics import Metric
 from torchmetrics.classification import MulticlassAccuracy, MulticlassJaccardIndex
 
-from benchnav.core.errors import ConfigError, expect, out_of_memory, quiet
+from benchnav.core.errors import ConfigError, expect, out_of_memory_error, quiet
 from benchnav.core.settings import hint, one_line
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.checkpoint import Checkpoint, member_names
@@ -256,7 +256,7 @@ def build_network(
         except (OSError, KeyError, RuntimeError) as error:
             if not config.pretrained:
                 raise
-            raise out_of_memory(error) or ConfigError(
+            raise out_of_memory_error(error) or ConfigError(
                 f"Expected to download ImageNet weights of {config.encoder} for "
                 f"`pretrained`, got: {one_line(error)} "
                 "Try again with a network connection, or leave "

@@ -38,7 +38,7 @@ def open_maps(
         ConfigError: If `splits` is empty, or the folder contains other files.
     """
     from benchnav.core.errors import expect
-    from benchnav.core.store import refuse_taken
+    from benchnav.core.store import check_replaceable
     from benchnav.datagen.files.find import find_dataset
     from benchnav.datagen.files.reader import TerrainDataset
     from benchnav.models.config import check_seed
@@ -47,7 +47,7 @@ def open_maps(
     if out:
         names = {*files, FIGURES}
         reason = partial(_foreign, files=names, content=content)
-        refuse_taken(Path(out), overwrite, reason)
+        check_replaceable(Path(out), overwrite, reason)
         check_writable(Path(out, next(iter(files))))
     dataset = TerrainDataset(find_dataset(data))
     expect(splits != [], f"`splits` among {', '.join(dataset.splits)}, got none.")

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from benchnav.core.distribution import TraversabilityDistribution
-from benchnav.core.errors import BenchnavError, ConfigError, expect, out_of_memory
+from benchnav.core.errors import BenchnavError, ConfigError, expect, out_of_memory_error
 from benchnav.core.ground import SEEN
 from benchnav.core.settings import call, of, one_line, read
 from benchnav.core.shipped_files import PACKAGE
@@ -341,7 +341,7 @@ def _unfit(
         remedy = f"See {file}, line {frame.lineno}, in `{frame.name}`."
     elif hasattr(config, "architecture") and hasattr(config, "encoder"):
         owner = f"{config.architecture} of {config.encoder}"
-    return out_of_memory(error) or ConfigError(
+    return out_of_memory_error(error) or ConfigError(
         f"Expected a network that takes batches of {batch} maps of {height}×{width} "
         f"cells, got {owner}, which does not: {one_line(error).rstrip('.')}. {remedy}"
     )

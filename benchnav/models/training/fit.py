@@ -38,7 +38,7 @@ from benchnav.core.errors import (
     CheckpointError,
     ConfigError,
     expect,
-    out_of_memory,
+    out_of_memory_error,
     quiet,
 )
 from benchnav.core.settings import check_known, one_line
@@ -374,7 +374,7 @@ def make_trainer(callbacks: list[Callback], **settings: Any) -> lightning.Traine
             **settings,
         )
     except Exception as error:  # Lightning raises various exceptions for settings
-        raise out_of_memory(error) or _unusable(error) from error
+        raise out_of_memory_error(error) or _unusable(error) from error
 
 
 def _unusable(error: Exception) -> ConfigError:

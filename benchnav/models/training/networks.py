@@ -6,7 +6,7 @@ from typing import Any
 
 from lightning.pytorch.callbacks import Callback, EarlyStopping
 
-from benchnav.core.errors import BenchnavError, ConfigError, expect, out_of_memory
+from benchnav.core.errors import BenchnavError, ConfigError, expect, out_of_memory_error
 from benchnav.core.settings import of, one_line, read
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.ground import layer_means
@@ -273,7 +273,7 @@ def fit_network(
     except BenchnavError:
         raise
     except Exception as error:  # custom code may raise anything
-        raise out_of_memory(error) or ConfigError(
+        raise out_of_memory_error(error) or ConfigError(
             f"Expected `calibrate` of {type(network).__name__} to succeed, got: "
             f"{one_line(error)} Fix it, and train again with --overwrite."
         ) from error

@@ -19,11 +19,11 @@ from lightning.pytorch import loggers as lightning_loggers
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import Logger
 
-from benchnav.core.errors import BenchnavError, ConfigError, expect, out_of_memory
+from benchnav.core.errors import BenchnavError, ConfigError, expect, out_of_memory_error
 from benchnav.core.settings import hint, one_line
 from benchnav.core.sources import (
     attribute,
-    digest_of_file_part,
+    digest_of_file_and_imports,
     digest_of_target,
     load_file,
 )
@@ -157,7 +157,7 @@ def _class(setting: str, class_path: str) -> type:
         except BenchnavError:
             raise
         except Exception as error:  # a user's module may raise anything
-            raise out_of_memory(error) or ConfigError(
+            raise out_of_memory_error(error) or ConfigError(
                 f"Expected `trainer.{setting}` from a module, got {class_path!r}: "
                 f"{one_line(error)}"
             ) from error
@@ -191,7 +191,7 @@ def _create(setting: str, spec: Any, folder: Path | None) -> Any:
             f"Install it, such as: pip install {package.partition('.')[0]}"
         ) from error
     except Exception as error:  # a user's class may raise anything
-        raise out_of_memory(error) or ConfigError(
+        raise out_of_memory_error(error) or ConfigError(
             f"Expected arguments that {class_path} takes, got: {one_line(error)[:300]}"
         ) from error
 
@@ -207,5 +207,5 @@ def _digest(kind: type, class_path: str) -> str:
     owner = class_path.rpartition(":")[0]
     if owner.endswith(".py"):
         path = Path(os.path.expanduser(owner)).resolve()
-        return digest_of_file_part(path, path.read_bytes())
+        return digest_of_file_and_imports(path, path.read_bytes())
     return digest_of_target(kind)

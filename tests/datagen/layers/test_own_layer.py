@@ -167,7 +167,7 @@ def test_other_code_than_was_recorded_is_rejected(
         ),
         (
             ("class Wetness(Layer)", "class Wetness"),
-            "to be a subclass of benchnav.datagen.Layer",
+            "to be an instance of benchnav.datagen.Layer",
         ),
     ],
 )

@@ -52,7 +52,7 @@ def page(tmp_path: Path) -> Page:
     picture = tmp_path / "success.png"
     matplotlib.image.imsave(picture, np.zeros((20, 1000, 3)))
     table = Table(
-        headings=("planner", EVIL), labels=1, rows=(("a", "1"), (EVIL, Bold("2"))), notes=(EVIL,),
+        headings=("planner", EVIL), n_labels=1, rows=(("a", "1"), (EVIL, Bold("2"))), notes=(EVIL,),
         bold_note="the best", explained=(("planner", EVIL),),
     )  # fmt: skip
     about = {

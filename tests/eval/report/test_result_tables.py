@@ -150,7 +150,7 @@ def test_labels_that_differ_are_shown_and_others_are_not() -> None:
     def headings(*labels: dict[str, str]) -> tuple[str, ...]:
         table = table_of(made.rows(made.row(one) for one in labels))
         assert {len(row) for row in table.rows} == {len(table.headings)}
-        return table.headings[: table.labels]
+        return table.headings[: table.n_labels]
 
     one = made.condition()
     assert headings(one) == ("scenario", "planner", "risk")
@@ -399,7 +399,7 @@ def test_labels_that_differ_have_a_column_and_notes_name_the_family() -> None:
     )
     shown = comparison_table(table, 0.2, "risk")
     assert shown.headings[:3] == ("planner", "risk", "against")
-    assert shown.labels == 3
+    assert shown.n_labels == 3
     notes = " ".join(shown.notes)
     assert "corrected over 2 pairs (Holm)" in notes
     needed = np.unique(table["maps_needed"])

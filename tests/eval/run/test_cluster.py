@@ -86,7 +86,7 @@ def cluster_of_two(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster
 
 @pytest.fixture(autouse=True)
 def patience(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dask, "_REACH_S", PATIENCE_S)
+    monkeypatch.setattr(dask, "_CONNECTION_S", PATIENCE_S)
     monkeypatch.setattr(dask, "_WORKERS_S", PATIENCE_S)
 
 
@@ -159,11 +159,11 @@ def test_a_worker_of_other_code_or_without_the_data_is_named(
     suite = suite_on(
         dataset_path, tmp_path / "log", risks=("mean",), scenarios=("std",), seeds=(0,)
     )
-    modules = provenance.package_modules
+    modules = provenance.digests_of_package_modules
     with monkeypatch.context() as patch:
         patch.setattr(
             provenance,
-            "package_modules",
+            "digests_of_package_modules",
             lambda names: modules(names) | {"benchnav.eval.run.rollout": "0"},
         )
         with pytest.raises(
@@ -252,7 +252,7 @@ def test_a_scheduler_that_cannot_be_reached_is_one_line_and_drops_nothing(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(dask, "_REACH_S", 0.2)
+    monkeypatch.setattr(dask, "_CONNECTION_S", 0.2)
     suite = suite_on(
         dataset_path, tmp_path / "log", scenarios=("std",), risks=("mean",), seeds=(0,)
     )

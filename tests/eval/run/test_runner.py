@@ -564,10 +564,10 @@ def test_units_of_other_code_or_maps_are_kept_and_not_used_and_what_changed_is_n
     )
     suite = quick(data, planners=(f"{mine}:Mine",), scenarios=("std",))
     rows = finish(suite, folder)
-    modules = provenance.package_modules
+    modules = provenance.digests_of_package_modules
     changes = {
         "benchnav.eval.run.rollout": (
-            provenance, "package_modules", lambda names: modules(names) | {"benchnav.eval.run.rollout": "0"}
+            provenance, "digests_of_package_modules", lambda names: modules(names) | {"benchnav.eval.run.rollout": "0"}
         ),
         "torch (": (provenance, "version", lambda name: "9.9" if name == "torch" else version(name)),
         "processor (": (torch.backends.cpu, "get_cpu_capability", lambda: "ABACUS"),

@@ -12,7 +12,7 @@ import pytest
 from benchnav.core import sources
 from benchnav.core.errors import ConfigError
 from benchnav.core.ownership import is_installed, is_own
-from benchnav.core.touched import changes_since, snapshot, watch
+from benchnav.core.touched import changed_entries, snapshot, watch
 from benchnav.core.workers import run_calls
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.folder.provenance import code_differences
@@ -159,7 +159,7 @@ def test_what_a_part_reads_is_recorded_and_a_change_runs_its_unit_again(
         touched
     )
     assert not {"package benchnav", "package h5py", "package gymnasium"} & set(touched)
-    assert changes_since(touched) == []
+    assert changed_entries(touched) == []
     assert touched in [
         code["touched"]
         for code in open_run(own.parent / "run").manifest["codes"].values()
@@ -167,7 +167,7 @@ def test_what_a_part_reads_is_recorded_and_a_change_runs_its_unit_again(
     assert run(own, dataset_path, "run") == ["2 of 2 units were there already"]
 
     monkeypatch.setenv("OWN_GAIN", "0.5")
-    assert changes_since(touched) == ["variable OWN_GAIN"]
+    assert changed_entries(touched) == ["variable OWN_GAIN"]
     assert run(own, dataset_path, "run", reuse_code=True) == [
         "2 of 2 units were there already"
     ]

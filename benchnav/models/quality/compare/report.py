@@ -156,7 +156,7 @@ def comparison_table(
         numbers.to_dict("records"),
         columns,
         title=title,
-        labels=2,
+        n_labels=2,
         numbers=True,
         bold_note=note if marked else "",
     )
@@ -217,7 +217,7 @@ def difference_table(comparison: Comparison) -> Table:
         rows.to_dict("records"),
         columns,
         title="Differences to the best",
-        labels=4,
+        n_labels=4,
         bold_note=note,
     )
 
