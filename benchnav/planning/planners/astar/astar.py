@@ -4,8 +4,8 @@ The exact cost to go h* of every cell is computed once per λ̂ map, on the host
 compiled Dijkstra search backward from the goal. A* with h* as its heuristic expands
 only the cells of a cheapest path. Hence replanning from any robot position only follows
 pointers. Non-free cells cost their penalty per metre, on the half of an edge that lies
-in them, so that every cell has a path. A step between two non-free cells that touch at a
-corner costs the penalty on its whole length (`gridgraph.squeezes`). Sources: Hart,
+in them, so that every cell has a path. A step between two non-free cells that touch at
+a corner costs the penalty on its whole length (`gridgraph.squeezes`). Sources: Hart,
 Nilsson and Raphael (1968); paper IV-A1. Letters in shapes: B episodes, H×W cells, N
 points, E edges.
 """
@@ -214,7 +214,7 @@ def search(problem: Problem, costs: Iterable[Tensor] | None = None) -> CostToGo:
     return CostToGo(to_go, torch.from_numpy(following).to(start.device))
 
 
-def framed(problem: Problem, field: CostToGo) -> Tensor:
+def pad_costs(problem: Problem, field: CostToGo) -> Tensor:
     """Return padded cost to go and padded costs per level metre, for `cost_at`.
 
     Args:
@@ -243,7 +243,7 @@ def cost_at(grid: Grid, costs: Tensor, x_m: Tensor, y_m: Tensor) -> Tensor:
 
     Args:
         grid: grid of the maps.
-        costs: padded costs from `framed`, shape [B, 2, N].
+        costs: padded costs from `pad_costs`, shape [B, 2, N].
         x_m: x of the positions in metres, shape [B, J].
         y_m: y of the positions in metres, shape [B, J].
 
