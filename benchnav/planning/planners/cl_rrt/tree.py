@@ -106,8 +106,8 @@ class Route(Batch):
         rows: references of the edges, as rows of `Reference`, shape [B, D, N, 4].
         end_m: arc length in metres at which each reference is left for the next, shape
             [B, D].
-        path: predicted positions (x, y) along the path in metres, shape [B, D·P, 2];
-            unused positions are NaN.
+        path: predicted positions (x, y) along the path in metres, shape [B, D·P, 2]; NaN
+            after its end.
         tree: predicted positions (x, y) along all edges in metres, shape [B, E, P, 2];
             unused positions are NaN.
     """
