@@ -137,8 +137,8 @@ def test_a_map_that_changes_has_another_cost_to_go() -> None:
     changed = replace(problem, risk_map=problem.risk_map.flip(1))
     after = planner.revise(before, changed)
     wanted = astar.pad_costs(changed, astar.search(changed))
-    assert torch.equal(after.to_go, wanted)
-    assert not torch.equal(before.to_go, wanted)
+    assert torch.equal(after.cost_to_go, wanted)
+    assert not torch.equal(before.cost_to_go, wanted)
 
 
 @pytest.mark.parametrize("cost", [False, True])
@@ -186,7 +186,7 @@ def test_an_episode_alone_does_as_it_does_in_a_batch(wanted: str) -> None:
         first(problem.select(member)), planner.select(state, member)
     )
     assert torch.equal(together[member], alone)
-    assert planner.select(after, member).to_go.shape == (1, 2, 18 * 18)
+    assert planner.select(after, member).cost_to_go.shape == (1, 2, 18 * 18)
 
 
 class OwnUnit(GoalDistance):
