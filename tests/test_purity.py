@@ -18,7 +18,7 @@ from benchnav.planning import risk
 from benchnav.planning.planners.astar import astar
 from benchnav.planning.planners.astar.dwa import DWAConfig, score, velocity_window
 from benchnav.planning.problem import Problem
-from benchnav.planning.world.outcome import Outcome, tell_standstill
+from benchnav.planning.world.outcome import Outcome, classify_standstill
 from benchnav.planning.world.simulation import Simulation, end
 from benchnav.planning.world.world import World
 from tests import factories
@@ -141,7 +141,7 @@ def test_the_world() -> None:
     steps = torch.tensor([199, 199])
     track, driven = torch.zeros(2, 200, 2), torch.zeros(2, 199)
     same_after(
-        lambda: tell_standstill(outcome, steps, track, driven, 0.1),
+        lambda: classify_standstill(outcome, steps, track, driven, 0.1),
         outcome,
         steps,
         track,

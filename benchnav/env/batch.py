@@ -24,7 +24,7 @@ from benchnav.planning.objective import GoalDistance, Objective, distance
 from benchnav.planning.problem import Task, heading_to
 from benchnav.planning.robots import Robot
 from benchnav.planning.world.outcome import Outcome
-from benchnav.planning.world.realisation import check_known
+from benchnav.planning.world.realisation import check_traversability
 from benchnav.planning.world.simulation import Simulation, SimulationState
 from benchnav.planning.world.world import Endpoints, World, read_world
 
@@ -107,7 +107,7 @@ class EnvBatch:
         self._places = Endpoints(**places)
         # Both raise here rather than in the first reset.
         self._world.budget_s(self._places.reference_time_s, robot_model.top_speed_mps)
-        check_known(self._maps, self._world)
+        check_traversability(self._maps, self._world)
         self._map = np.zeros(size, dtype=np.int64)
         self._noise_seed = np.zeros(size, dtype=np.int64)
         self._simulation: Simulation | None = None

@@ -1,12 +1,12 @@
 """Rules of free space and of immobilisation, the same for all planners.
 
-A cell is free if the value of a map there exceeds a threshold, or if it is at the goal.
-A planner may cross non-free cells at a high finite penalty, so that all planners solve
-the same problem, and a path exists even if no free path is predicted. A planner with a
-horizon, such as MPPI, may still wait in front of such cells. Motion and path costs use a
-λ̂ of at least `min_traversability`, so that a robot can plan a path out of terrain that
-is predicted to immobilise it. This goes beyond the paper, whose equation 2e forbids
-non-free cells.
+A cell is free if the value of a map in the cell exceeds a threshold, or if the cell is
+within the goal radius. Other cells have a high finite penalty, whereas the paper's
+equation 2e forbids them. Hence a path always exists, even if no free path is predicted.
+A planner with a short horizon, such as MPPI, may still wait in front of non-free cells.
+
+Motion and path costs use a λ̂ of at least `min_traversability`. Hence a robot can plan
+a path out of terrain that is predicted to immobilise it.
 """
 
 from dataclasses import asdict, dataclass
@@ -19,9 +19,12 @@ from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import expect
 from benchnav.core.grid import Grid
 
-# Penalty of a step, and of a metre, in non-free cells; the paper's penalty of a step.
-# It is higher than the cost of any path over free terrain.
 PENALTY = 1e4
+"""Penalty of each step, or of each metre, in non-free cells.
+
+It exceeds the cost of any path over free terrain. The paper has the same penalty of a
+step.
+"""
 UNSEEN = ("prior", "optimistic", "pessimistic")
 _LATER = {"unseen": "prior", "replan_every_s": 0.5}
 
@@ -31,9 +34,10 @@ class FreeSpace:
     """Rule for free cells.
 
     Args:
-        by: map that decides: `risk`, λ̂ of the risk setting, or `mean`, E[λ] of the
-            prediction.
-        above: threshold that the map exceeds in free cells; λ_stuck in the paper.
+        by: map that is compared with the threshold: `risk` for λ̂ of the risk setting,
+            or `mean` for E[λ] of the prediction.
+        above: threshold in [0, 1) that the map exceeds in free cells; λ_stuck in the
+            paper.
     """
 
     by: str = "risk"
@@ -49,28 +53,34 @@ class FreeSpace:
 
     @property
     def source(self) -> str:
-        """Field of a `Problem` that decides which cells are free."""
+        """Name of the field of a `Problem` from which free cells are derived."""
         return "risk_map" if self.by == "risk" else "distribution"
 
     def mask(
         self, risk_map: Tensor, distribution: TraversabilityDistribution
     ) -> Tensor:
-        """Return the free mask, bool [B, H, W], from λ̂ [B, H, W] and the prediction."""
+        """Return the mask of free cells, bool, shape [B, H, W].
+
+        Args:
+            risk_map: λ̂ of the risk setting, shape [B, H, W].
+            distribution: predicted distribution of λ, shape [B, H, W].
+        """
         values = risk_map if self.by == "risk" else distribution.mean()
         return values > self.above
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rules:
-    """Rules of a task, besides its robot and objective; the defaults are the paper's.
+    """Rules of a task; the defaults are the paper's.
 
     Args:
         free_space: rule for free cells.
-        min_traversability: minimum λ̂ of motion and path costs.
-        goal_radius_m: distance to the goal in metres below which a robot has reached it.
-        unseen: assumption about λ of unobserved terrain: `prior`, the distribution over
-            all training maps; `optimistic`, 1; `pessimistic`, the mean of the worst
-            fifth of the prior, although such cells stay free.
+        min_traversability: minimum λ̂ of motion and path costs, in (0, 1].
+        goal_radius_m: distance to the goal in metres below which a robot has reached
+            it.
+        unseen: assumption about λ of unobserved terrain. `prior`: the distribution of λ
+            over all training maps. `optimistic`: λ = 1. `pessimistic`: the mean of the
+            worst fifth of the prior; unobserved cells are nevertheless free.
         replan_every_s: time between two updates of a robot's belief, in seconds.
     """
 
@@ -106,13 +116,16 @@ class Rules:
         distribution: TraversabilityDistribution,
         seen: Tensor | None = None,
     ) -> Tensor:
-        """Return the free mask without the area at the goal, bool, shape [B, H, W].
+        """Return the mask of free cells, before the cells at the goal are set free.
 
         Args:
             risk_map: λ̂, shape [B, H, W].
             distribution: distribution of λ, shape [B, H, W].
-            seen: mask of observed cells, bool, shape [B, H, W]; None for all. With
-                `pessimistic` unobserved cells are always free.
+            seen: mask of observed cells, bool, shape [B, H, W]; None if all cells are
+                observed. With `pessimistic`, all unobserved cells are free.
+
+        Returns:
+            Mask, bool, shape [B, H, W].
         """
         free = self.free_space.mask(risk_map, distribution)
         if seen is not None and self.unseen == "pessimistic":
@@ -122,7 +135,7 @@ class Rules:
     def to_dict(self) -> dict[str, Any]:
         """Return the rules as plain data for JSON.
 
-        Settings of later versions are omitted at their defaults.
+        Settings that version 1 did not have are omitted if they have their defaults.
         """
         rules = asdict(self)
         for name, default in _LATER.items():
@@ -136,9 +149,9 @@ class Immobile:
     """Rule of immobilisation.
 
     Args:
-        below: observed λ below which terrain immobilises a robot.
-        for_s: consecutive time in seconds on such terrain after which an episode ends,
-            whatever the commands.
+        below: λ under the robot below which terrain immobilises it, in (0, 1].
+        for_s: consecutive time in seconds on such terrain after which a robot is
+            immobilised and its episode ends, whatever the robot commands.
     """
 
     below: float = 0.1
@@ -154,7 +167,16 @@ class Immobile:
 
 
 def cells_at_goal(grid: Grid, goal_m: Tensor, radius_m: float) -> Tensor:
-    """Return a mask of cells in the goal's disc, bool [B, H, W], for goals [B, 2]."""
+    """Return a mask of cells of which some point is nearer to the goal than a radius.
+
+    Args:
+        grid: grid of the maps.
+        goal_m: goals (x, y) in metres, shape [B, 2].
+        radius_m: radius in metres.
+
+    Returns:
+        Mask, bool, shape [B, H, W].
+    """
     rows = torch.arange(grid.height, device=goal_m.device)
     columns = torch.arange(grid.width, device=goal_m.device)
     x, y = grid.centre_of(rows, columns)

@@ -1,13 +1,17 @@
-"""Objectives J: what a planner minimises.
+"""Objectives J, the costs that planners minimise.
 
-An objective is an `Objective`, with `stage` and `terminal`. With `path_cost` it also
-defines the cost per metre of path, which planners that search paths minimise. `target`
-is the goal, or a local planner's waypoint. J receives λ̂ at the state before the motion,
-as the risk setting returns it, without the bound `min_traversability`. In the Gymnasium
-environment J receives the observed λ. J does not include the penalty of non-free cells,
-which the `Problem` adds. If the constructor of an objective has a parameter `robot` or
-`goal_radius_m`, it receives the value of the task. Source: paper III-C and IV-A. Letters
-in shapes: *B any leading dimensions, S state and A action dimensions.
+An `Objective` has a cost of each step (`stage`) and of the last state (`terminal`). The
+target of these costs is the goal, or a local planner's waypoint. `path_cost`, the cost
+per metre of a path, is minimised by planners that search paths.
+
+J receives λ̂ at the state before the motion, from the risk map and without the lower
+bound `min_traversability`. In the Gymnasium environment, J receives the observed λ. J
+does not include the penalty of non-free cells, which the `Problem` adds. If the
+constructor of an objective has a parameter `robot` or `goal_radius_m`, it receives the
+value of the task.
+
+Source: paper III-C and IV-A. Letters in shapes: *B any leading dimensions, S state and
+A action dimensions.
 """
 
 from abc import ABC, abstractmethod
@@ -20,13 +24,14 @@ from benchnav.core.errors import expect
 from benchnav.core.specified import Specified
 from benchnav.planning.robots import Robot
 
-_WAYPOINT_M = 0.2  # distance below which a robot has reached a waypoint
+_WAYPOINT_M = 0.2  # distance in metres below which a robot has reached a waypoint
 
 
 class Objective(Specified, ABC):
-    """Base class of costs J, summed over a trajectory. Shapes broadcast over *B.
+    """Base class of objectives; `benchnav.testing.check_objective` checks the contract.
 
-    `benchnav.testing.check_objective` checks the contract.
+    J of a trajectory is the sum of the costs of its steps and the terminal cost. The
+    leading dimensions *B of the arguments broadcast.
     """
 
     @abstractmethod
@@ -38,8 +43,8 @@ class Objective(Specified, ABC):
         Args:
             state: states that begin with (x, y, θ), shape [*B, S].
             action: actions, shape [*B, A].
-            traversability: λ̂ at the state, in [0, 1] without a lower bound, 0 off the
-                map, shape [*B].
+            traversability: λ̂ of the risk map at the state, in [0, 1], 0 off the map,
+                shape [*B].
             target: target (x, y) in metres, shape [*B, 2].
 
         Returns:
@@ -51,13 +56,14 @@ class Objective(Specified, ABC):
         """Return the terminal cost, shape [*B]; arguments as for `stage`."""
 
     def path_cost(self, traversability: Tensor, grade: Tensor) -> Tensor:
-        """Return the cost of a horizontal metre of path; by default its length in 3D.
+        """Return the cost per horizontal metre of path; by default the length in 3D.
 
-        The cost of a path is the sum over its segments.
+        The cost of a path is the sum of the costs of its segments.
 
         Args:
-            traversability: λ̂ of motion, shape [*B].
-            grade: rise of that metre, negative downhill, shape [*B].
+            traversability: λ̂ that scales motion, at least `min_traversability`, shape
+                [*B].
+            grade: rise per horizontal metre, negative downhill, shape [*B].
 
         Returns:
             Cost, finite and above 0, shape [*B].
@@ -79,17 +85,20 @@ class GoalDistance(Objective):
         return distance(state, target)
 
     def path_cost(self, traversability: Tensor, grade: Tensor) -> Tensor:
-        """Return the length in 3D, which the paper's A* minimises (paper IV-A1)."""
+        """Return the length in 3D, as the paper's A* uses it (paper IV-A1)."""
         return super().path_cost(traversability, grade)
 
 
 @dataclass(frozen=True)
 class TravelTime(Objective):
-    """Time to the target in seconds: steps before it, then the distance at top speed.
+    """Time to the target in seconds.
+
+    It is the time until the target is reached, or until the end of a trajectory plus
+    the time to drive the remaining distance at top speed.
 
     Args:
         robot: robot with its time step and top speed.
-        goal_radius_m: distance below which a state has reached the target, in metres.
+        goal_radius_m: distance in metres within which a state has reached the target.
     """
 
     robot: Robot
@@ -115,19 +124,19 @@ class TravelTime(Objective):
         return remaining_m / self.robot.top_speed_mps
 
     def path_cost(self, traversability: Tensor, grade: Tensor) -> Tensor:
-        """Return seconds at top speed under λ̂; see `Objective`.
+        """Return the seconds per metre at top speed under λ̂; see `Objective`.
 
-        The grade does not affect it, since robots drive in the plane.
+        The grade has no effect, since the robots' motion is two-dimensional.
         """
         return 1 / (traversability * self.robot.top_speed_mps)
 
 
 def toward_waypoints(objective: Objective) -> Objective:
-    """Return J of a local planner, in which a waypoint has a small radius.
+    """Return an objective for driving to waypoints, with a small target radius.
 
-    A waypoint would not attract a robot within the goal's radius, for example in a
-    narrow passage. A dataclass with a field `goal_radius_m` is copied with the smaller
-    radius; other objectives are returned unchanged.
+    With the goal's radius, a waypoint would not attract a robot that is within this
+    radius, for example in a narrow passage. A dataclass with a field `goal_radius_m` is
+    copied with the smaller radius. Other objectives are returned unchanged.
     """
     if not is_dataclass(objective):
         return objective
@@ -139,7 +148,7 @@ def toward_waypoints(objective: Objective) -> Objective:
 
 
 def has_path_cost(objective: Objective) -> bool:
-    """Return whether an objective defines the cost of a metre of path itself."""
+    """Return whether the class of an objective overrides `Objective.path_cost`."""
     return type(objective).path_cost is not Objective.path_cost
 
 

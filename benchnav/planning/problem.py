@@ -1,8 +1,8 @@
 """The navigation problem of a planner (paper, equation 2).
 
-A problem contains only predictions; the truth stays in the simulation. Letters in
-shapes: B episodes, H×W cells, S state and A action dimensions, *K any further
-dimensions.
+A problem contains only predictions; only the simulation contains the true λ. Letters in
+shapes: B episodes, H×W cells, M fields, N cells of a padded map, S state and A action
+dimensions, *K any further dimensions.
 """
 
 from dataclasses import dataclass, field, replace
@@ -21,19 +21,19 @@ from benchnav.planning.free_space import PENALTY, Immobile, Rules, cells_at_goal
 from benchnav.planning.objective import Objective
 from benchnav.planning.robots import Robot
 
-# Replaces a λ̂ of 0 in padded maps, in which the sign marks free cells and 0 is off the
-# map.
+# Value for λ̂ = 0 in padded maps. There the sign marks free cells, and 0 means "off the
+# map".
 _ZERO = 1e-30
 
 
 class FieldSource(Protocol):
-    """Source of λ fields of B episodes: `benchnav.planning.sensing.belief.Fields`."""
+    """Source of λ fields of B episodes, such as `sensing.belief.Fields`."""
 
     def sample(self, count: int, key: int, cells: Tensor | None = None) -> Tensor:
         """Draw fields; see `Problem.sample_fields`."""
 
     def select(self, members: Tensor) -> Self:
-        """Return some episodes, by index, int64."""
+        """Return the source of the episodes at these indices (int64)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,11 +60,13 @@ class Problem(Batch):
         observation: the robots' observation.
         distribution: the predicted distribution of λ, shape [B, H, W].
         risk_map: λ̂ of the risk setting, in [0, 1], shape [B, H, W].
-        free: S_free, the goal's disc included, bool, shape [B, H, W].
+        free: mask of free cells (S_free in the paper), including the goal's disc, bool,
+            shape [B, H, W].
         start: initial states, shape [B, S].
         goal_m: goals (x, y) in metres, shape [B, 2].
         time_budget_s: T of each episode in seconds, shape [B].
-        fields: source of correlated fields of λ; see `sample_fields`.
+        fields: source of correlated fields of λ; see `sample_fields`. None if no
+            planner uses fields.
         immobile: the world's rule of immobilisation, which planners may consider; None
             if nothing immobilises robots.
     """
@@ -81,7 +83,7 @@ class Problem(Batch):
     immobile: Immobile | None = None
 
     def __post_init__(self) -> None:
-        """Check that all tensors are of one batch."""
+        """Check that all tensors have the same number of episodes and cells."""
         n_episodes = self.start.shape[0]
         map_shape = n_episodes, *self.grid.shape
         expected = {
@@ -140,8 +142,8 @@ class Problem(Batch):
         Args:
             count: number of fields M.
             key: stream key, see `benchnav.core.rng`; each key draws different fields.
-            cells: mask of the requested cells, bool, shape [B, H, W], which may save
-                time; λ of other cells is then undefined. None for all cells.
+            cells: mask of the cells whose λ is needed, bool, shape [B, H, W]; λ of
+                other cells is then undefined, which may save time. None for all cells.
 
         Returns:
             λ in [0, 1], shape [B, M, H, W]; the fields of an episode do not depend on
@@ -158,7 +160,7 @@ class Problem(Batch):
         return self.fields.sample(count, key, cells).to(self.risk_map)
 
     def select(self, members: Tensor) -> "Problem":
-        """Return some episodes, by index, int64."""
+        """Return the problems of the episodes at these indices (int64)."""
         selected = super().select(members)
         if self.fields is None:
             return selected
@@ -174,10 +176,11 @@ class Problem(Batch):
 
     @cached_property
     def padded_ground(self) -> Tensor:
-        """λ̂ and free mask in one padded map: λ̂ if free, −λ̂ if not, −0 off the map.
+        """λ̂ and free mask in one padded map, shape [B, N].
 
-        Motion, J and the penalty of non-free cells thus need only one lookup per step;
-        see `motion_traversability`, `stage_cost` and `free_at`.
+        A value is λ̂ in free cells, −λ̂ in non-free cells, and −0 off the map. Hence
+        one lookup per step provides motion, J and the penalty of non-free cells; see
+        `motion_traversability`, `stage_cost` and `free_at`.
         """
         return ground_map(self.grid, self.risk_map, self.free)
 
@@ -190,7 +193,7 @@ class Problem(Batch):
 
     @property
     def dynamics(self) -> "Dynamics":
-        """Inputs of a rollout, except its maps."""
+        """Grid, robot and objective, for compiled rollouts."""
         min_traversability = self.task.rules.min_traversability
         return Dynamics(self.grid, self.robot, self.objective, min_traversability)
 
@@ -199,24 +202,25 @@ class Problem(Batch):
         return self.grid.lookup(self.padded_ground, state[..., 0], state[..., 1])
 
     def traversability_at(self, state: Tensor) -> Tensor:
-        """Return λ̂ of motion at states, 0 off the map; shapes as for `ground_at`."""
+        """Return λ̂ that scales motion at states [B, *K, S], 0 off the map, [B, *K]."""
         min_traversability = self.task.rules.min_traversability
         return motion_traversability(self.ground_at(state), min_traversability)
 
     def free_at(self, state: Tensor) -> Tensor:
-        """Return a mask of states in free cells, bool; shapes as for `ground_at`."""
+        """Return a mask of states [B, *K, S] in free cells, bool, shape [B, *K]."""
         return self.ground_at(state) > 0
 
     def stage_cost(
         self, state: Tensor, action: Tensor, ground: Tensor, target: Tensor
     ) -> Tensor:
-        """Return J of a step plus the penalty of non-free cells.
+        """Return J of a step, plus the penalty in a non-free cell.
 
         Args:
             state: states, shape [B, *K, S].
             action: actions, shape [B, *K, A].
             ground: `ground_at(state)`, shape [B, *K].
-            target: target (x, y) in metres, shape [B, *1, 2].
+            target: target (x, y) in metres; its shape [B, …, 2] broadcasts to
+                [B, *K, 2].
 
         Returns:
             Cost, shape [B, *K].
@@ -224,22 +228,22 @@ class Problem(Batch):
         return stage_cost(self.objective, state, action, ground, target)
 
     def terminal_cost(self, state: Tensor, target: Tensor) -> Tensor:
-        """Return the terminal J plus the penalty of non-free cells.
+        """Return the terminal J, plus the penalty in a non-free cell.
 
-        Shapes as for `stage_cost`.
+        The arguments and the result have the same shapes as those of `stage_cost`.
         """
         ground = self.ground_at(state)
         return terminal_cost(self.objective, state, ground, target)
 
 
 class Dynamics(NamedTuple):
-    """Inputs of a rollout, except its maps, for compiled functions.
+    """Inputs of a compiled rollout, except its maps.
 
     Args:
         grid: size and resolution of the maps.
         robot: robot with the motion F.
         objective: objective J.
-        min_traversability: minimum λ̂ of motion.
+        min_traversability: minimum λ̂ that scales motion.
     """
 
     grid: Grid
@@ -249,13 +253,13 @@ class Dynamics(NamedTuple):
 
 
 def ground_map(grid: Grid, traversability: Tensor, free: Tensor) -> Tensor:
-    """Return `Problem.padded_ground` of any λ and free mask, both [*B, H, W]."""
+    """Return `Problem.padded_ground` for given λ and free mask, both [*B, H, W]."""
     magnitude = traversability.clamp(min=_ZERO)
     return grid.pad(torch.where(free, magnitude, -magnitude), outside=-0.0)
 
 
 def motion_traversability(ground: Tensor, min_traversability: float) -> Tensor:
-    """Return λ̂ of motion: at least `min_traversability` on the map, 0 off it.
+    """Return λ̂ that scales motion: at least a minimum on the map, 0 off it.
 
     Args:
         ground: values of `Problem.padded_ground`, any shape.
@@ -269,7 +273,7 @@ def motion_traversability(ground: Tensor, min_traversability: float) -> Tensor:
 
 
 def predicted_traversability(ground: Tensor) -> Tensor:
-    """Return λ̂ of the risk setting, 0 off the map, from `Problem.padded_ground`."""
+    """Return λ̂ of the risk map, 0 off the map, from values of `padded_ground`."""
     magnitude = ground.abs()
     return torch.where(magnitude <= _ZERO, 0, magnitude)
 
@@ -277,7 +281,7 @@ def predicted_traversability(ground: Tensor) -> Tensor:
 def stage_cost(
     objective: Objective, state: Tensor, action: Tensor, ground: Tensor, target: Tensor
 ) -> Tensor:
-    """Return J of a step plus the penalty of non-free cells; see `Problem.stage_cost`."""
+    """Return J of a step plus the penalty; see `Problem.stage_cost`."""
     traversability = predicted_traversability(ground)
     cost = objective.stage(state, action, traversability, target)
     return cost + PENALTY * (ground <= 0)
@@ -299,9 +303,9 @@ class Prediction:
     Args:
         observation: the robots' observation.
         distribution: the predicted distribution of λ, shape [B, H, W].
-        risk_map: λ̂ of the risk setting, shape [B, H, W].
-        free: free mask without the area at the goal, bool, shape [B, H, W]; None to
-            derive it by the rules of the task.
+        risk_map: λ̂ of the risk setting, in [0, 1], shape [B, H, W].
+        free: mask of free cells, before the cells at the goal are set free, bool, shape
+            [B, H, W]; None to derive it by the rules of the task.
         fields: source of correlated fields of λ; None if no planner uses them.
     """
 
@@ -327,7 +331,7 @@ def pose_problem(
         prediction: prediction of B maps.
         start_m: starts (x, y) in metres, shape [B, 2].
         goal_m: goals (x, y) in metres, shape [B, 2].
-        time_budget_s: T in seconds, a number or of shape [B].
+        time_budget_s: time budget T in seconds, a number or a tensor of shape [B].
         immobile: the world's rule of immobilisation; None if nothing immobilises
             robots.
     """

@@ -1,12 +1,14 @@
-"""Risk measures: from the distribution of traversability to a map for planners.
+"""Risk measures, which reduce the distribution of traversability to a map for planners.
 
-A measure maps a `TraversabilityDistribution` of shape [B, H, W] to λ̂ in [0, 1] of that
-shape. The shipped measures are values, such as `CVaR(0.8)`. A custom measure may be any
-function of a distribution; its other keyword parameters are its options. In suites and
-commands a setting is written `name` or `name:level`: `cvar:0.9`, `var:0.95`,
-`expected-time:0.05`, `mean`. Risk means the lower tail of λ; a higher level of CVaR or
-VaR is more cautious. The distribution computes the integrals. Source: paper II and
-III-B; `ExpectedTime`, `TimeCVaR` and `Chance` go beyond the paper.
+A measure maps a `TraversabilityDistribution` of shape [B, H, W] to λ̂ in [0, 1] of the
+same shape. The shipped measures are objects, such as `CVaR(0.8)`. A custom measure may
+be any function of a distribution; its other keyword parameters are its options. In
+suites and commands, a risk setting is written as a name, or as a name and the value of
+the first option: `mean`, `cvar:0.9`, `var:0.95`, `expected-time:0.05`.
+
+Low λ is bad, so risk concerns the lower tail of λ. A higher level of CVaR or VaR is
+more cautious. Source: paper II and III-B; `ExpectedTime`, `TimeCVaR` and `Chance` go
+beyond the paper.
 """
 
 from abc import ABC, abstractmethod
@@ -27,7 +29,7 @@ class RiskMeasure(Specified, ABC):
 
     @abstractmethod
     def __call__(self, distribution: TraversabilityDistribution) -> Tensor:
-        """Infer λ̂.
+        """Return λ̂ of each cell.
 
         Args:
             distribution: distribution of λ in each cell, shape [B, H, W].
@@ -39,7 +41,7 @@ class RiskMeasure(Specified, ABC):
 
 @dataclass(frozen=True)
 class Mean(RiskMeasure):
-    """Mean E[λ], which does not consider a tail."""
+    """Mean E[λ], which is neutral to risk."""
 
     def __call__(self, distribution: TraversabilityDistribution) -> Tensor:
         """Infer λ̂; see `RiskMeasure`."""
@@ -78,14 +80,15 @@ class CVaR(RiskMeasure):
 
 @dataclass(frozen=True)
 class ExpectedTime(RiskMeasure):
-    """1 / E[1 / max(λ, floor)]: a path's length over it is the expected time.
+    """λ̂ = 1 / E[1 / max(λ, floor)], under which the time of a path is its expectation.
 
-    It suits a risk-neutral robot if the λ field is constant during an episode. In
-    contrast to the mean, it includes the time that is lost on slow terrain; it does not
-    consider a tail. A lower floor makes immobilising terrain more expensive.
+    The time of a path is its length over λ̂, at a commanded speed of 1. The measure
+    suits a risk-neutral robot if the λ field is constant during an episode. In contrast
+    to the mean, it includes the time that is lost on slow terrain. A lower floor makes
+    immobilising terrain more expensive.
 
     Args:
-        floor: minimum speed, as a fraction of the commanded one, in (0, 1].
+        floor: minimum speed as a fraction of the commanded speed, in (0, 1].
     """
 
     floor: float = 0.05
@@ -98,14 +101,14 @@ class ExpectedTime(RiskMeasure):
 
 @dataclass(frozen=True)
 class TimeCVaR(RiskMeasure):
-    """1 / CVaR of the time 1 / max(λ, floor).
+    """λ̂ = 1 / CVaR of the time 1 / max(λ, floor).
 
-    A path's length over it is the path's time on the worst fraction of terrain. `CVaR`
-    averages λ over this fraction, and `TimeCVaR` averages the time.
+    Over the worst 1 − level fraction of each cell's distribution, `CVaR` averages λ,
+    and `TimeCVaR` averages the time per metre.
 
     Args:
-        level: α in [0, 1); 0 for `ExpectedTime`.
-        floor: minimum speed, as a fraction of the commanded one, in (0, 1].
+        level: α in [0, 1); 0 is equivalent to `ExpectedTime`.
+        floor: minimum speed as a fraction of the commanded speed, in (0, 1].
     """
 
     level: float = 0.9
@@ -119,10 +122,10 @@ class TimeCVaR(RiskMeasure):
 
 @dataclass(frozen=True)
 class Chance(RiskMeasure):
-    """P(λ ≥ bound), the exceedance probability.
+    """Exceedance probability P(λ ≥ bound).
 
     Args:
-        bound: traversability in [0, 1].
+        bound: bound of λ, in [0, 1].
     """
 
     bound: float = 0.1
@@ -135,7 +138,7 @@ class Chance(RiskMeasure):
 
 @dataclass(frozen=True)
 class SingleClass(RiskMeasure):
-    """The CVaR of the most likely class only, including its soft spots.
+    """CVaR under the most likely class of each cell, including its soft spots.
 
     Args:
         level: α in [0, 1).
@@ -149,7 +152,7 @@ class SingleClass(RiskMeasure):
 
 
 def apply(measure: RiskFunction, distribution: TraversabilityDistribution) -> Tensor:
-    """Infer λ̂ and check it.
+    """Return the λ̂ that a risk measure computes, after checks.
 
     Args:
         measure: any risk measure.
@@ -159,21 +162,26 @@ def apply(measure: RiskFunction, distribution: TraversabilityDistribution) -> Te
         λ̂ in [0, 1], shape [B, H, W].
 
     Raises:
-        ConfigError: If the measure returns anything else.
+        ConfigError: If the measure does not return floating-point values in [0, 1] of
+            this shape.
     """
     risk_map = measure(distribution)
     shape = list(distribution.shape)
     got: object = type(risk_map).__name__
     if isinstance(risk_map, Tensor):
         got = list(risk_map.shape)
-    expect(got == shape, f"a risk measure to return λ̂ of shape {shape}, got {got}.")
+    expect(
+        got == shape, f"a risk measure to return a tensor of shape {shape}, got {got}."
+    )
     expect(
         risk_map.is_floating_point(),
-        f"a risk measure to return λ̂ as floating-point numbers, got {risk_map.dtype}.",
+        "a risk measure to return a floating-point tensor, got dtype "
+        f"{risk_map.dtype}.",
     )
     in_range = (risk_map >= 0) & (risk_map <= 1)
     expect(
         in_range.all(),
-        "a risk measure to return λ̂ in [0, 1], got values outside or NaN.",
+        "a risk measure to return values in [0, 1], got values outside this range or "
+        "NaN.",
     )
     return risk_map.to(distribution.dtype)

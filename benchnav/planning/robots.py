@@ -1,11 +1,11 @@
 """Robots: state transitions F under actions and traversability.
 
-A robot is a `Robot`, with the members listed there and
+A robot is a `Robot`. It is called as
 
     F(state [*B, S], action [*B, A], traversability [*B]) -> state [*B, S]
 
-where a state begins with (x, y, θ) in metres and radians. Planners use F with predicted
-traversability, and the simulation uses it with true traversability. Sources: paper II
+A state begins with (x, y, θ) in metres and radians. Planners call F with predicted
+traversability, and the simulation calls it with true traversability. Sources: paper II
 and IV-A; Rajamani (2012), "Vehicle dynamics and control", section 2.2 (bicycle).
 Letters in shapes: *B any leading dimensions, S state and A action dimensions.
 """
@@ -20,7 +20,7 @@ from torch import Tensor
 from benchnav.core.errors import expect
 from benchnav.core.specified import Specified
 
-# Names of actions, which tell planners the meaning of each action.
+# Names of actions, by which planners recognise the actions that they can command.
 SPEED = "speed_mps"
 TURN_RATE = "turn_rate_radps"
 STEERING = "steering_rad"
@@ -40,7 +40,7 @@ class Robot(Specified, ABC):
     @property
     @abstractmethod
     def action_names(self) -> tuple[str, ...]:
-        """Names of the A actions, with units; they decide how planners steer."""
+        """Names of the A actions, with units, by which planners recognise them."""
 
     @property
     @abstractmethod
@@ -64,7 +64,7 @@ class Robot(Specified, ABC):
 
     @abstractmethod
     def initial_state(self, pose: Tensor) -> Tensor:
-        """Return the states of robots standing at poses (x, y, θ), [B, S] from [B, 3]."""
+        """Return states [B, S] of robots that stand at poses (x, y, θ), [B, 3]."""
 
     @abstractmethod
     def __call__(self, state: Tensor, action: Tensor, traversability: Tensor) -> Tensor:
@@ -82,7 +82,7 @@ class Robot(Specified, ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class _Vehicle(Robot):
-    """Common part of the shipped robots: a time step, and a speed within bounds."""
+    """Base class of the shipped robots, with a time step and bounds of the speed."""
 
     dt_s: float = 0.1
     speed_mps: tuple[float, float] = (0.0, 1.0)
@@ -98,13 +98,13 @@ class _Vehicle(Robot):
         return max(map(abs, self.speed_mps))
 
     def initial_state(self, pose: Tensor) -> Tensor:
-        """Return the pose; see `Robot`."""
+        """Return the poses as states; see `Robot`."""
         return pose.clone()
 
 
 @dataclass(frozen=True, kw_only=True)
 class Unicycle(_Vehicle):
-    """The paper's unicycle, whose traversability scales both velocities.
+    """The paper's unicycle: traversability scales linear and angular velocity.
 
     State (x, y, θ), action (v, ω). Source: paper IV-A.
 
@@ -143,7 +143,8 @@ class DifferentialDrive(Unicycle):
     """A differential drive: a unicycle with limited accelerations.
 
     State (x, y, θ, v, ω), commanded action (v, ω). The velocities in the state are
-    those of the wheels; traversability scales the resulting motion.
+    those that the wheels would produce at λ = 1. Traversability scales the resulting
+    motion.
 
     Args:
         dt_s: time step in seconds.
@@ -189,10 +190,11 @@ class DifferentialDrive(Unicycle):
 
 @dataclass(frozen=True, kw_only=True)
 class Bicycle(_Vehicle):
-    """A kinematic bicycle, referred to the rear axle: it turns only while it drives.
+    """A kinematic bicycle, which turns only while it drives.
 
-    State (x, y, θ), action (v, δ) with θ' = v tan(δ) / wheelbase. Traversability scales
-    v, and hence also the turn rate. Source: Rajamani (2012).
+    State (x, y, θ) of the rear axle, action (v, δ) with the turn rate
+    θ' = v tan(δ) / wheelbase. Traversability scales v, and hence also the turn rate.
+    Source: Rajamani (2012).
 
     Args:
         dt_s: time step in seconds.
@@ -244,7 +246,7 @@ def _drive(
 
 
 def steps_in(time_s: float, dt_s: float) -> int:
-    """Return the number of time steps in a duration: the nearest, at least one."""
+    """Return the number of time steps in a duration, rounded, at least 1."""
     return max(1, round(time_s / dt_s))
 
 
@@ -258,11 +260,15 @@ def component_wise(values: Tensor) -> Tensor:
 
 def _stack(parts: tuple[Tensor, ...]) -> Tensor:
     # The component dimension is outermost in memory, so that each component is
-    # contiguous: compiled rollouts are four times faster.
+    # contiguous. This makes compiled rollouts four times faster.
     components = torch.broadcast_tensors(*parts)
     return torch.stack(components).movedim(0, -1)
 
 
 def _check_bounds(name: str, bounds: tuple[float, float]) -> None:
     low, high = bounds
-    expect(low < high, f"`{name}` as (minimum, maximum), got {bounds}.")
+    expect(
+        low < high,
+        f"`{name}` as (minimum, maximum), with the minimum below the maximum, got "
+        f"{bounds}.",
+    )

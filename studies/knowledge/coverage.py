@@ -37,7 +37,7 @@ from benchnav.eval.experiment.unit import Extent, Unit, units
 from benchnav.eval.run.knowledge import Knowing
 from benchnav.eval.run.rollout import Observer
 from benchnav.eval.run.unit import Built, Settings, read_block, simulate
-from benchnav.planning.world.realisation import joined
+from benchnav.planning.world.realisation import are_connected
 from studies.study import Rows, Work
 from studies.units import build_unit, one_unit, stakes_suite
 
@@ -205,7 +205,7 @@ def rejection(data: Path, maps: int) -> Rows:
             scores = correlated_normal(key, np.array(unit.maps), grid.shape, length)
             field = truth.from_normal(torch.from_numpy(scores).float()).double()
             is_immobile = field < world.immobile.below
-            is_kept = joined(~is_immobile, grid, block.places)
+            is_kept = are_connected(~is_immobile, grid, block.places)
             drawn = torch.stack((torch.ones_like(field), field, is_immobile.double()))
             sums += torch.stack((drawn, drawn * is_kept[:, None, None]))
             n_rejected += int((~is_kept).sum())

@@ -17,7 +17,7 @@ from benchnav.planning import MPPI, MPPIConfig, Plan, Problem
 from benchnav.planning.planners.compilation import Fused
 from benchnav.planning.planners.mppi import MPPIState
 from benchnav.planning.planners.mppi_rollouts import (
-    Ends,
+    TerminalInputs,
     advance_chunk,
     roll_out,
     total_cost,
@@ -70,7 +70,7 @@ class SmoothMPPI(MPPI):
             / (high - low)[:, None]
         )
         cost = cost + config.smoothness * changes.square().sum((1, 2))
-        ends = self._ends(plan_state, target_m, problem.padded_ground, None)
+        ends = self._terminal_inputs(plan_state, target_m, problem.padded_ground, None)
         _, updated = self._weigh(
             states,
             cost,
@@ -216,7 +216,9 @@ class ICEM(MPPI):
         return total_cost(
             states,
             cost,
-            Ends(ground, target, problem.grid, problem.objective, to_go=to_go),
+            TerminalInputs(
+                ground, target, problem.grid, problem.objective, cost_to_go=to_go
+            ),
         )[0]
 
 

@@ -96,9 +96,11 @@ def gap(work: Work, folder: Path, maps: int = 50) -> dict[str, Rows]:
             excess=lambda mesh, value: 1.0, _CHECK_EVERY=lower_bound._MOST_STEPS
         ):
             converged_s = lower_bound_s(*arguments)
-        with without(_reached=no_reach):
+        with without(_max_reaching=no_reach):
             without_reach_s = lower_bound_s(*arguments)
-        with without(_reached=no_reach, _max_depth_m=lambda motion, immobile: -1.0):
+        with without(
+            _max_reaching=no_reach, _max_depth_m=lambda motion, immobile: -1.0
+        ):
             without_dips_s = lower_bound_s(*arguments)
         reference_s = times_s[index]
         steps = (

@@ -23,7 +23,7 @@ from torch import Tensor
 from benchnav.core import rng
 from benchnav.planning import MPPI, MPPIConfig, Problem, Step
 from benchnav.planning.planners.astar import astar
-from benchnav.planning.planners.cost_risk import framed_fields, tail_cost
+from benchnav.planning.planners.cost_risk import pad_fields, tail_cost
 from benchnav.planning.planners.mppi import MPPIState
 from benchnav.planning.planners.mppi_rollouts import advance_chunk, roll_out
 from benchnav.stats.intervals import mean_interval
@@ -69,14 +69,12 @@ def optimism(
     plan_state: MPPIState = planner.init(
         problem, rng.generator(rng.stream_key(0, "cost risk"))
     )
-    assert plan_state.to_go is not None
+    assert plan_state.cost_to_go is not None
     state, gaps_by_moment, elapsed_s = problem.start, [], []
     observed = torch.full_like(state[:, 0], torch.nan)
 
     def fields(count: int, *key: Any) -> Tensor:
-        return framed_fields(
-            problem, problem.sample_fields(count, rng.stream_key(*key))
-        )
+        return pad_fields(problem, problem.sample_fields(count, rng.stream_key(*key)))
 
     for step in range(MOMENTS[-1] + 1):
         # The fields that the planner will draw in this step.
@@ -90,7 +88,7 @@ def optimism(
             gaps = []
             for actions in (chosen, plan_state.mean):
                 own_fields_cost = costs_on(
-                    problem, state, actions, own_fields, plan_state.to_go
+                    problem, state, actions, own_fields, plan_state.cost_to_go
                 )
                 fresh = [
                     costs_on(
@@ -98,7 +96,7 @@ def optimism(
                         state,
                         actions,
                         fields(AT_ONCE, 7, "fresh", step, part),
-                        plan_state.to_go,
+                        plan_state.cost_to_go,
                     )
                     for part in range(FRESH // AT_ONCE)
                 ]

@@ -13,9 +13,9 @@ from benchnav.core import rng
 from benchnav.planning import MPPI, MPPIConfig, Problem, Step, distance
 from benchnav.planning.free_space import PENALTY
 from benchnav.planning.planners.compilation import Fused
-from benchnav.planning.planners.cost_risk import framed_fields
+from benchnav.planning.planners.cost_risk import pad_fields
 from benchnav.planning.planners.mppi import MPPIState
-from benchnav.planning.planners.mppi_rollouts import OF_EPISODES
+from benchnav.planning.planners.mppi_rollouts import BATCHED_ARGUMENTS
 from benchnav.planning.planners.noise_bank import Sampled, perturb
 from benchnav.planning.problem import Dynamics, motion_traversability
 from benchnav.planning.robots import component_wise
@@ -47,10 +47,10 @@ class ManyTrialsMPPI(MPPI):
                 advance_pair,
                 config.samples * config.fields,
                 self.worth_compiling,
-                batched=OF_EPISODES,
+                batched=BATCHED_ARGUMENTS,
             )
 
-    def _ground(self, plan_state: MPPIState, state: Tensor) -> Tensor:
+    def _padded_ground(self, plan_state: MPPIState, state: Tensor) -> Tensor:
         """Return the padded λ fields of this step's rollouts.
 
         The shape is [B·M, N], or [B·M, 2·N] with pairs of fields.
@@ -58,12 +58,12 @@ class ManyTrialsMPPI(MPPI):
         if self._is_paired:
             problem = plan_state.problem
             key = rng.stream_key(plan_state.key, plan_state.step)
-            fields = framed_fields(
+            fields = pad_fields(
                 problem, problem.sample_fields(2 * self.config.fields, key)
             )
             ground = fields.unflatten(0, (-1, 2)).flatten(1)
         else:
-            ground = super()._ground(plan_state, state)
+            ground = super()._padded_ground(plan_state, state)
         return torch.where(ground == 0, _STILL, ground) if self._is_still else ground
 
 

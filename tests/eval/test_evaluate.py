@@ -98,7 +98,7 @@ def test_a_world_is_its_preset_by_name(tmp_path: Path) -> None:
     assert read_world(World.stakes(time_budget_s=60.0)) == read_world(changed)
     assert read_world(World.stakes(immobile=None))[0].immobile is None
     with pytest.raises(
-        ConfigError, match="either `time_budget_s` or `time_budget_ratio`"
+        ConfigError, match="exactly one of `time_budget_s` and `time_budget_ratio`"
     ):
         World.stakes(time_budget_s=60.0, time_budget_ratio=2.0)
 

@@ -29,7 +29,7 @@ from benchnav.planning.sensing.sensor import Step
 from benchnav.planning.world import realisation
 from benchnav.planning.world import simulation as simulation_module
 from benchnav.planning.world import world as world_module
-from benchnav.planning.world.outcome import Outcome, tell_standstill
+from benchnav.planning.world.outcome import Outcome, classify_standstill
 from benchnav.planning.world.simulation import Simulation, end
 from benchnav.planning.world.world import World
 from tests import factories
@@ -159,7 +159,9 @@ def test_the_simulation(
     expect(simulation.unhindered(now, gpu(BATCH, 2)), *problem.start.shape)
     now = end(now, now.running, Outcome.PLANNER_ERROR)
     expect(
-        tell_standstill(now.outcome, now.step, gpu(BATCH, 21, 2), gpu(BATCH, 20), 0.1),
+        classify_standstill(
+            now.outcome, now.step, gpu(BATCH, 21, 2), gpu(BATCH, 20), 0.1
+        ),
         BATCH,
         dtype=torch.int64,
     )

@@ -223,7 +223,7 @@ BAD: dict[str, tuple[Any, str]] = {
     "doubles": (action_of(lambda action, _: action.double()), "got torch.float64 of shape [4, 2]"),
     "elsewhere": (action_of(lambda action, _: action.to("meta")), "on cpu, got torch.float32 of shape [4, 2] on meta"),
     "too fast": (action_of(lambda action, _: action + 0.5), "within the robot's bounds"),
-    "no plan": (plan_of(lambda plan: None), "Expected a Plan as the last output"),
+    "no plan": (plan_of(lambda plan: None), "Expected `plan` to return a Plan as its third value"),
     "an unknown status": (plan_of(lambda plan: replace(plan, status=plan.status + 3)), "`Plan.status` in 0–2"),
     "a status for all": (plan_of(lambda plan: replace(plan, status=plan.status[:1])), "got torch.int64 of shape [1]"),
     "a path for all": (plan_of(lambda plan: replace(plan, path=plan.path[:1])), "shape [4, N, 2], got [1, 3, 2]"),

@@ -35,7 +35,7 @@ from benchnav.eval.run.combinations import LeftOut, find_left_out
 from benchnav.eval.run.unit import read_maps
 from benchnav.models.checkpoint import load_checkpoint
 from benchnav.models.predictor import class_mismatch
-from benchnav.planning.world.realisation import check_known, draw_frozen
+from benchnav.planning.world.realisation import check_traversability, draw_frozen
 
 Say = Callable[[str], None]
 
@@ -279,7 +279,7 @@ def _check_world(condition: Condition, dataset: TerrainDataset, maps: int) -> li
     checked = chosen if is_imported else chosen[:1]
     for start in checked[::BLOCK_MAPS]:
         block = read_maps(dataset, split, checked[start : start + BLOCK_MAPS])
-        check_known(block.terrain, world)
+        check_traversability(block.terrain, world)
         if world.noise == "frozen" and start == 0:
             first = torch.tensor([0])
             terrain = block.terrain.select(first)

@@ -33,7 +33,7 @@ from benchnav.planning.planners.planner import Plan, Planner, PlanStatus
 from benchnav.planning.problem import Problem
 from benchnav.planning.sensing.knowledge import KnowledgeError
 from benchnav.planning.sensing.sensor import Step
-from benchnav.planning.world.outcome import Outcome, tell_standstill
+from benchnav.planning.world.outcome import Outcome, classify_standstill
 from benchnav.planning.world.simulation import Simulation, SimulationState, end
 
 _MAX_REMAINING = 0.75  # fraction of running episodes above which no batch is reduced
@@ -198,7 +198,7 @@ class _Log:
             torch.cat(values, dim=1) for values in zip(*self._steps, strict=True)
         )
         seconds = self.clock.seconds()
-        outcome = tell_standstill(
+        outcome = classify_standstill(
             now.outcome, now.step, track[..., :2], driven, self.dt_s
         )
         reasons = [*self._reasons, ""]  # index -1 selects the empty one

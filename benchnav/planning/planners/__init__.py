@@ -1,4 +1,4 @@
-"""Planners: their common protocol, and the shipped planners.
+"""Planners: their common interface, and the shipped planners.
 
-Entry points in `pyproject.toml` name the planners.
+Entry points in `pyproject.toml` list the planners by name.
 """

@@ -1,8 +1,8 @@
-"""The boundary between a planner and the loop: inputs are copied, outputs are checked.
+"""Calls of a planner by the evaluation: inputs are copied, and outputs are checked.
 
-A planner that writes into its inputs neither moves a robot nor changes a map. An action
-that no robot can execute is a fault of its episode, and not an error of the loop.
-Letters in shapes: B episodes, S state and A action dimensions.
+A planner that modifies its inputs hence neither moves a robot nor changes a map. An
+invalid action ends only its own episode, and not the evaluation. Letters in shapes: B
+episodes, A action dimensions.
 """
 
 from dataclasses import dataclass, replace
@@ -16,7 +16,7 @@ from benchnav.planning.planners.planner import LAYERS, Plan, Planner
 from benchnav.planning.problem import Problem
 from benchnav.planning.sensing.sensor import Step
 
-NOT_FINITE = "Expected finite actions, got some that are not."
+NOT_FINITE = "Expected finite actions, got NaN or infinite values."
 
 
 @dataclass(frozen=True)
@@ -24,12 +24,12 @@ class Answer:
     """A planner's output after checks.
 
     Args:
-        action: finite actions; zeros, clipped to the bounds, for faulty episodes, shape
-            [B, A].
+        action: finite actions, shape [B, A]; zeros, clipped to the robot's bounds, for
+            faulty episodes.
         plan_state: plan state for the next step.
-        plan: plan without invalid layers; its status has shape [B].
+        plan: plan, whose layers are empty if one of them is invalid.
         faulty: mask of episodes with an invalid output, bool, shape [B].
-        reason: fault of the faulty episodes, in one line.
+        reason: message about the invalid output, in one line.
     """
 
     action: Tensor
@@ -40,15 +40,12 @@ class Answer:
 
 
 def begin(planner: Planner[Any], problem: Problem, generator: torch.Generator) -> Any:
-    """Initialise a planner on a copy of the problem.
+    """Return a planner's first plan state, from a copy of the problem.
 
     Args:
-        planner: any planner; its exceptions pass through.
-        problem: B problems; not modified, whatever the planner does.
-        generator: the planner's randomness.
-
-    Returns:
-        The first plan state.
+        planner: any planner; its exceptions are not caught.
+        problem: B problems, which a planner cannot modify.
+        generator: random generator of the planner.
     """
     return planner.init(problem.clone(), generator)
 
@@ -56,17 +53,16 @@ def begin(planner: Planner[Any], problem: Problem, generator: torch.Generator) -
 def revise(
     planner: Planner[Any], plan_state: Any, problem: Problem, generator: torch.Generator
 ) -> Any:
-    """Replan on a copy of a problem with another λ̂, by `revise` or again by `init`.
+    """Return a planner's plan state for a new prediction, from a copy of the problem.
+
+    A planner without `revise` starts again with `init`.
 
     Args:
-        planner: any planner; its exceptions pass through.
+        planner: any planner; its exceptions are not caught.
         plan_state: plan state of the last answer.
-        problem: B problems that start at the robots' current states; not modified,
-            whatever the planner does.
-        generator: the planner's randomness, if it starts again.
-
-    Returns:
-        The next plan state.
+        problem: B problems that start at the robots' current states, which a planner
+            cannot modify.
+        generator: random generator of a planner that starts again.
     """
     revised = planner.revise(plan_state, problem.clone())
     if revised is NotImplemented:
@@ -75,24 +71,24 @@ def revise(
 
 
 def act(planner: Planner[Any], step: Step, plan_state: Any, problem: Problem) -> Answer:
-    """Return a planner's next actions, from copies of its inputs and checked.
+    """Return a planner's next actions, computed from copies of its inputs and checked.
 
     Args:
-        planner: any planner; its exceptions pass through.
-        step: robot states; not modified, whatever the planner does.
-        plan_state: plan state from `begin` or the last answer.
-        problem: problem with the bounds of the actions, not passed to the planner.
+        planner: any planner; its exceptions are not caught.
+        step: robot states, which a planner cannot modify.
+        plan_state: plan state from `begin`, `revise` or the last answer.
+        problem: B problems with the bounds of the actions, for the checks.
 
     Returns:
-        The answer. A wrong type, shape, dtype or device makes every episode faulty, and
-        a non-finite action only its own episode.
+        The answer. If the output has a wrong type, shape, dtype or device, all episodes
+        are faulty. If an action is NaN or infinite, only its episode is faulty.
     """
     output = planner.plan(step.clone(), plan_state)
     standing = standing_actions(problem)
     no_layers = Plan.empty(len(problem), step.state.device)
     if fault := find_fault(output, problem):
-        everyone = torch.ones_like(step.traversability, dtype=torch.bool)
-        return Answer(standing, plan_state, no_layers, everyone, fault)
+        all_faulty = torch.ones_like(step.traversability, dtype=torch.bool)
+        return Answer(standing, plan_state, no_layers, all_faulty, fault)
     action, next_state, plan = output
     action = action.detach()
     faulty = ~action.isfinite().all(dim=1)
@@ -103,14 +99,14 @@ def act(planner: Planner[Any], step: Step, plan_state: Any, problem: Problem) ->
 
 
 def standing_actions(problem: Problem) -> Tensor:
-    """Return actions for faulty episodes: zeros, clipped to the bounds, shape [B, A]."""
+    """Return zero actions for faulty episodes, clipped to the bounds, shape [B, A]."""
     low, high = problem.action_bounds
     standing = torch.zeros_like(low).clamp(low, high)
     return standing.expand(len(problem), -1)
 
 
 def find_fault(output: Any, problem: Problem) -> str:
-    """Return the fault of a planner's output, in one line; empty without a fault.
+    """Return a message about a planner's output, in one line; empty if it is valid.
 
     Args:
         output: return value of `plan`.
@@ -120,7 +116,7 @@ def find_fault(output: Any, problem: Problem) -> str:
     if isinstance(output, tuple):
         got = f"{len(output)} values"
     if not isinstance(output, tuple) or len(output) != 3:
-        return f"Expected (action, plan_state, Plan) from `plan`, got {got}."
+        return f"Expected `plan` to return (action, plan_state, Plan), got {got}."
     action, _, plan = output
     start = problem.start
     n_episodes = len(problem)
@@ -129,7 +125,10 @@ def find_fault(output: Any, problem: Problem) -> str:
     if fault:
         return fault
     if not isinstance(plan, Plan):
-        return f"Expected a Plan as the last output, got {type(plan).__name__}."
+        return (
+            "Expected `plan` to return a Plan as its third value, got "
+            f"{type(plan).__name__}."
+        )
     status = plan.status
     return find_tensor_fault(
         "`Plan.status`", status, torch.int64, (n_episodes,), start.device
@@ -137,11 +136,11 @@ def find_fault(output: Any, problem: Problem) -> str:
 
 
 def find_layer_faults(plan: Plan, problem: Problem) -> list[str]:
-    """Return faults of the layers of a plan, a line each.
+    """Return messages about the invalid layers of a plan, one line each.
 
     Args:
         plan: any plan.
-        problem: B problems.
+        problem: B problems, for the shapes of layers.
     """
     n_episodes = len(problem)
     faults = []

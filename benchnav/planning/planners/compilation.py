@@ -1,14 +1,13 @@
 """Compilation of rollouts by `torch.compile`.
 
 `torch.compile` fuses a rollout's many small operations, which saves time if there are
-many rollouts. It needs a C++ compiler at run time. Without a compiler the same code runs
-eagerly, and one line reports it. PyTorch's switch `TORCH_COMPILE_DISABLE=1` turns
-compilation off.
+many rollouts. It needs a C++ compiler at run time. Without a compiler, the same code
+runs uncompiled, and a line on stderr reports it. The environment variable
+`TORCH_COMPILE_DISABLE=1` turns compilation off.
 
-Whether a planner runs compiled depends only on its settings and the device. It depends
-neither on the number of episodes of a batch nor on earlier compilations in the process,
-since compiled and eager results differ in their last bits, and compiled code is much
-faster.
+Compiled results differ from uncompiled ones in their last bits, and compiled code is
+much faster. Hence compilation depends only on a planner's settings and the device, and
+not on the number of episodes or on earlier compilations in the process.
 """
 
 import logging
@@ -25,19 +24,16 @@ R = TypeVar("R")
 
 
 def can_compile() -> bool:
-    """Return whether compilation is available.
-
-    It needs a C++ compiler, and PyTorch's switch must not be off.
-    """
+    """Return whether a C++ compiler is available and compilation is not turned off."""
     names = (os.environ.get("CXX", ""), "g++", "clang++")
     has_compiler = any(shutil.which(name) for name in names if name)
     return not _is_switched_off() and has_compiler
 
 
 def _is_switched_off() -> bool:
-    """Return whether PyTorch's compilation is switched off.
+    """Return whether PyTorch's compilation is turned off.
 
-    PyTorch's compiler is not imported for this, since its import takes a second.
+    The function does not import PyTorch's compiler, since the import takes a second.
     """
     if "torch._dynamo" in sys.modules:
         return bool(torch._dynamo.config.disable)
@@ -53,15 +49,16 @@ class Fused(Generic[R]):
     """A pure function that is compiled at its first call if possible.
 
     It is compiled once for a single episode and once for any larger number of episodes,
-    so that a batch may shrink. Objects are independent: a failed compilation of one
-    does not affect others.
+    so that the number of episodes may decrease. If the compilation of one function
+    fails, other functions are still compiled.
 
     Args:
-        function: function of tensors and named tuples of tensors, the first argument a
-            tensor; it must not modify its arguments.
-        rollouts: number of rollouts of an episode in a call.
-        min_rollouts: minimum number that is worth the seconds of compilation. Fewer run
-            eagerly, in a time that hardly depends on their number.
+        function: function whose arguments are tensors, named tuples of tensors, and
+            other values. Its first argument is a tensor or begins with one. It must not
+            modify its arguments.
+        rollouts: number of rollouts per episode in a call.
+        min_rollouts: minimum number of rollouts per episode for which a function is
+            compiled on the CPU.
         batched: indices of the arguments whose first dimension is that of the episodes;
             each item of a tuple counts as an argument.
     """
@@ -84,7 +81,7 @@ class Fused(Generic[R]):
         """Whether the function runs compiled; None before the first call."""
 
     def __call__(self, *args: Any) -> R:
-        """Call the function, compiled if that saves time and is possible."""
+        """Call the function, compiled if this is possible and saves time."""
         if self.compiled is False:
             return self._function(*args)
         items: list[Any] = []
@@ -104,7 +101,8 @@ class Fused(Generic[R]):
             self.compiled = False
             reason = str(error).strip().splitlines()[0]
             print(
-                f"benchnav: running uncompiled, several times slower: {reason}",
+                "benchnav: compilation failed, so rollouts run uncompiled and several "
+                f"times slower: {reason}",
                 file=sys.stderr,
             )
             return self._function(*args)
@@ -121,7 +119,7 @@ class Fused(Generic[R]):
     def _call(
         self, kinds: list[type], items: list[Any], signature: tuple[object, ...]
     ) -> R:
-        """Run the compiled function, with options for compilation if it is needed."""
+        """Run the compiled function; compile it first if the signature is new."""
         if self._fused is None:
             function = _of_items(self._function, kinds)
             self._fused = torch.compile(function, dynamic=False, fullgraph=True)
@@ -143,31 +141,33 @@ class Fused(Generic[R]):
     def _signature(self, items: list[Any]) -> tuple[object, ...]:
         """Return the properties of a call that require separate compilation.
 
-        They are shapes, dtypes and devices of tensors, other arguments, and PyTorch's
-        modes.
+        They are the shapes, dtypes and devices of tensors, the values of other
+        arguments, PyTorch's modes and the number of threads.
         """
-        parts: list[object] = [
+        properties: list[object] = [
             torch.is_inference_mode_enabled(),
             torch.is_grad_enabled(),
             torch.get_num_threads(),
         ]
         for index, item in enumerate(items):
             if not isinstance(item, torch.Tensor):
-                parts.append(_key(item))
+                properties.append(_key(item))
                 continue
             shape: tuple[object, ...] = item.shape
             if index in self._batched:
                 shape = (len(item) > 1, item.shape[1:])
-            parts.append((shape, item.dtype, item.device))
-        return tuple(parts)
+            properties.append((shape, item.dtype, item.device))
+        return tuple(properties)
 
 
 def _of_items(function: Callable[..., R], kinds: list[type]) -> Callable[..., R]:
-    """Return a function of single items, whose guards are cheaper than those of tuples.
+    """Return a function that receives the items of tuples instead of the tuples.
+
+    PyTorch checks single tensors faster than tuples at each call.
 
     Args:
-        function: function of arguments of these types.
-        kinds: types of the arguments; a named tuple is replaced by its items.
+        function: function of arguments, some of which are named tuples.
+        kinds: types of the arguments; each item of a named tuple becomes an argument.
     """
     sizes = [len(kind._fields) if issubclass(kind, tuple) else 0 for kind in kinds]  # type: ignore[attr-defined]
 
@@ -192,18 +192,18 @@ def _compiling(checked: bool) -> Iterator[None]:
     Setting them takes longer than a rollout, so they are set only for compilation.
 
     Args:
-        checked: whether computed indices are checked.
+        checked: whether compiled code checks the indices that it computes.
     """
-    import torch._inductor.config  # imported here, since its import takes a second
+    import torch._inductor.config  # Imported here, since the import takes a second.
 
-    # It warns of a CUDA toolkit without a GPU, which does not matter on the CPU.
+    # PyTorch warns if a CUDA toolkit has no GPU, which does not matter on the CPU.
     notices = logging.getLogger("torch.utils.cpp_extension")
     level = notices.level
     notices.setLevel(logging.ERROR)
     try:
         with (
-            # PyTorch's own limit, a few shapes in a process, would make results depend
-            # on earlier runs.
+            # PyTorch's default limit of a few shapes per process would make results
+            # depend on earlier runs.
             torch._dynamo.config.patch(
                 recompile_limit=sys.maxsize,
                 accumulated_recompile_limit=sys.maxsize,
@@ -218,7 +218,7 @@ def _compiling(checked: bool) -> Iterator[None]:
 
 
 def _key(arg: object) -> object:
-    """Return an argument, or its id if it cannot be hashed, as a robot with a list."""
+    """Return an argument, or its id if it cannot be hashed."""
     try:
         hash(arg)
     except TypeError:
@@ -227,10 +227,10 @@ def _key(arg: object) -> object:
 
 
 def _is_ours(arg: object) -> bool:
-    """Return whether PyTorch or this package defines an argument's class.
+    """Return whether the class of an argument belongs to PyTorch, Python or benchnav.
 
-    Such arguments compute only valid indices. A custom robot or objective may compute
-    invalid ones. Checking each index takes a third of the time.
+    With such arguments, all computed indices are valid. A custom robot or objective may
+    compute invalid indices, so they are checked, which takes a third of the time.
     """
     package = type(arg).__module__.split(".")[0]
     return package in ("torch", "builtins", "benchnav")

@@ -1,14 +1,14 @@
-"""Risk of the cost: the tail of an action sequence's costs on joint samples of λ.
+"""Risk of the cost: CVaR of the costs of an action sequence on joint samples of λ.
 
 A risk map contains the risk of each cell. The cost of a path is a sum over correlated
 cells, so its risk is not the sum of the cells' risks. Hence action sequences are rolled
 out on M joint samples of the λ field, and scored by the CVaR of their costs over these
-fields. On a field or a risk map, low λ may immobilise a robot (`advance_entrapped`),
-which the motion model does not include. Source: Cai et al. (2024), "EVORA: Deep
-evidential traversability learning for risk-aware off-road autonomy", CVaR-Cost.
+fields. Rollouts can also be immobilised by low λ (`advance_entrapped`), which the
+motion model does not include. Source: Cai et al. (2024), "EVORA: Deep evidential
+traversability learning for risk-aware off-road autonomy", CVaR-Cost.
 
 Letters in shapes: B episodes, M fields, K samples, T steps, S state and A action
-dimensions, H×W cells, N cells padded for lookups.
+dimensions, H×W cells of a map, N cells of a padded map.
 """
 
 import math
@@ -29,27 +29,27 @@ from benchnav.planning.problem import (
 from benchnav.planning.robots import component_wise
 
 
-def framed_fields(problem: Problem, fields: Tensor) -> Tensor:
-    """Return padded fields of λ with the problem's free mask, as `Problem.padded_ground`.
+def pad_fields(problem: Problem, fields: Tensor) -> Tensor:
+    """Return padded maps of λ fields and the free mask; see `Problem.padded_ground`.
 
     Args:
         problem: B problems.
-        fields: λ, shape [B, M, H, W].
+        fields: fields of λ in [0, 1], shape [B, M, H, W].
 
     Returns:
-        Padded maps, M for each episode in turn, shape [B·M, N].
+        Padded maps, M consecutive ones for each episode, shape [B·M, N].
     """
     free = problem.free[:, None].expand_as(fields)
     return ground_map(problem.grid, fields, free).flatten(0, 1)
 
 
 def within_reach(problem: Problem, state: Tensor, seconds: float) -> Tensor:
-    """Return a mask of cells that robots may reach in a given time at top speed.
+    """Return a mask of cells within the distance that robots drive at top speed.
 
     Args:
         problem: B problems.
         state: robot states, shape [B, S].
-        seconds: time in seconds.
+        seconds: driving time in seconds.
 
     Returns:
         Mask, bool, shape [B, H, W].
@@ -62,19 +62,21 @@ def within_reach(problem: Problem, state: Tensor, seconds: float) -> Tensor:
     dy = y - state[:, 1, None, None]
     distance_m = torch.hypot(dx, dy)
     reach_m = problem.robot.top_speed_mps * seconds
-    return distance_m <= reach_m + grid.resolution_m  # beyond a cell's corner
+    # A robot can touch a cell without reaching its centre; the margin of a cell's side
+    # exceeds the distance from centre to corner.
+    return distance_m <= reach_m + grid.resolution_m
 
 
 def tail_cost(cost: Tensor, level: float) -> Tensor:
-    """Return the CVaR of the cost: its mean over the worst 1 − level fraction of fields.
+    """Return the CVaR of the cost, its mean over the worst 1 − α fraction of fields.
 
     Args:
         cost: cost on each field, shape [B, M, K].
-        level: α in [0, 1); 0 for the mean.
+        level: level α in [0, 1); 0 for the mean.
 
     Returns:
-        CVaR, shape [B, K]. A field that is only partly within the worst fraction counts
-        with that part.
+        CVaR, shape [B, K]. If the worst fraction is no whole number of fields, the last
+        field has a weight below 1.
     """
     if level == 0:
         return cost.mean(1)
@@ -88,11 +90,12 @@ def tail_cost(cost: Tensor, level: float) -> Tensor:
 
 
 class Entrapment(NamedTuple):
-    """Permanent immobilisation of a robot, and its cost.
+    """Conditions under which terrain immobilises a rollout.
 
     Args:
         goal: goal (x, y) in metres, shape [B, 1, 2].
-        steps_left: number of remaining steps at the start of a rollout, shape [B, 1].
+        steps_left: number of steps from the start of the action sequences to the end of
+            the time budget, shape [B, 1].
         goal_radius_m: distance in metres below which a robot has reached the goal.
         below: λ below which terrain immobilises a robot.
         max_steps: consecutive steps on such terrain after which a robot is immobilised.
@@ -115,23 +118,24 @@ def advance_entrapped(
     entrapment: Entrapment,
     dynamics: Dynamics,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Roll out samples as `mppi.advance_chunk`, where low λ immobilises a robot.
+    """Roll out samples as in `mppi_rollouts.advance_chunk`; low λ immobilises robots.
 
-    A robot on such terrain for `max_steps` consecutive steps stops there. It pays J of
-    standing there, with the penalty of non-free cells, until its time is over. Its
-    states continue at no further cost. A robot that has reached the goal is no longer
-    immobilised.
+    A robot is immobilised after `max_steps` consecutive steps on terrain of low λ. The
+    cost of standing there for all remaining steps, with the penalty of non-free cells,
+    is then added at once. The robot's later states have no cost. A robot that has
+    reached the goal can no longer be immobilised.
 
     Args:
         states: robot states, shape [B, K, S].
-        cost: cost so far, shape [B, K].
-        dwell_steps: consecutive steps on immobilising terrain; `max_steps` for a robot
-            that has stopped, −1 for one that has reached the goal, shape [B, K].
+        cost: cost of the previous steps, shape [B, K].
+        dwell_steps: number of the last consecutive steps on immobilising terrain;
+            `max_steps` for an immobilised robot, −1 for a robot that has reached the
+            goal; shape [B, K].
         sampled: action sequences.
-        padded_ground: padded maps as in `Problem`, shape [B, N].
+        padded_ground: maps as in `Problem.padded_ground`, shape [B, N].
         target: target (x, y) in metres, shape [B, 1, 2].
         entrapment: conditions of immobilisation.
-        dynamics: dynamics of the problem.
+        dynamics: grid, robot and objective.
 
     Returns:
         States, cost and `dwell_steps` after these steps.
@@ -142,22 +146,22 @@ def advance_entrapped(
         action = sampled_actions(sampled, step)
         ground = grid.lookup(padded_ground, states[..., 0], states[..., 1])
         traversability = predicted_traversability(ground)
-        going = dwell_steps < max_steps
+        is_mobile = dwell_steps < max_steps
         dx = states[..., 0] - goal[..., 0]
         dy = states[..., 1] - goal[..., 1]
         longer_dwell = torch.where(traversability < below, dwell_steps + 1, 0)
         at_goal = torch.hypot(dx, dy) < goal_radius_m
-        has_arrived = (dwell_steps < 0) | at_goal
-        longer_dwell = torch.where(has_arrived, -1, longer_dwell)
-        stops = going & (longer_dwell >= max_steps)
+        has_reached_goal = (dwell_steps < 0) | at_goal
+        longer_dwell = torch.where(has_reached_goal, -1, longer_dwell)
+        becomes_immobile = is_mobile & (longer_dwell >= max_steps)
         step_cost = stage_cost(objective, states, action, ground, target)
         no_action = torch.zeros_like(action)
         standing_cost = stage_cost(objective, states, no_action, ground, target)
         remaining_steps = (steps_left - (step + 1)).clamp(min=0)
         remaining_cost = remaining_steps * standing_cost
-        step_cost = step_cost + torch.where(stops, remaining_cost, 0)
-        cost = cost + torch.where(going, step_cost, 0)
+        step_cost = step_cost + torch.where(becomes_immobile, remaining_cost, 0)
+        cost = cost + torch.where(is_mobile, step_cost, 0)
         scale = motion_traversability(ground, min_traversability)
         states = robot(states, action, scale)
-        dwell_steps = torch.where(going, longer_dwell, dwell_steps)
+        dwell_steps = torch.where(is_mobile, longer_dwell, dwell_steps)
     return component_wise(states), cost, dwell_steps

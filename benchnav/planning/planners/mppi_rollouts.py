@@ -26,18 +26,22 @@ from benchnav.planning.problem import (
 )
 from benchnav.planning.robots import component_wise, steps_in
 
-# A chunk of the horizon compiles in seconds and runs as fast as the unrolled horizon.
+# Rollouts are compiled for this number of steps. Code for the whole horizon would take
+# much longer to compile, and would run no faster.
 _CHUNK_STEPS = 10
-OF_EPISODES = (0, 1, 2, 6, 7)
-"""Arguments of `advance_chunk` with an episode dimension: states, cost, mean,
-padded_ground, target.
+BATCHED_ARGUMENTS = (0, 1, 2, 6, 7)
+"""Indices of the arguments of `advance_chunk` that have an episode dimension.
+
+They are states, cost, mean, padded_ground and target; each item of a tuple counts.
 """
-ENTRAPPED_OF_EPISODES = (0, 1, 2, 3, 7, 8, 9, 10)
-"""Arguments of `advance_entrapped` with an episode dimension: states, cost,
-dwell_steps, mean, padded_ground, target, goal, steps_left.
+ENTRAPPED_BATCHED_ARGUMENTS = (0, 1, 2, 3, 7, 8, 9, 10)
+"""Indices of the arguments of `advance_entrapped` that have an episode dimension.
+
+They are states, cost, dwell_steps, mean, padded_ground, target, goal and steps_left;
+each item of a tuple counts.
 """
-_DRAWN_SAMPLES = 40
-_MIN_SPREAD = 1e-30  # > 0, so that samples of equal cost have equal weights
+_PLOTTED_SAMPLES = 40
+_MIN_SPREAD = 1e-30  # Above 0, so that samples of equal cost get equal weights.
 
 
 def control_cost(mean: Tensor, noise: Tensor, scale: Tensor) -> Tensor:
@@ -46,7 +50,7 @@ def control_cost(mean: Tensor, noise: Tensor, scale: Tensor) -> Tensor:
     Args:
         mean: mean action sequences u, shape [B, T, A].
         noise: unclipped noise ε, shape [T, A, K].
-        scale: standard deviations, Σ = diag(scale²), shape [A].
+        scale: standard deviations of the noise, Σ = diag(scale²), shape [A].
 
     Returns:
         Cost, shape [B, K].
@@ -59,28 +63,29 @@ class Dwell(NamedTuple):
     """Dwell times of robots on immobilising terrain.
 
     Args:
-        dwell_steps: consecutive steps on such terrain, shape [B].
-        time_s: time since the start in seconds.
+        dwell_steps: number of the last consecutive steps on such terrain, shape [B].
+        time_s: time since the start of the episodes in seconds.
     """
 
     dwell_steps: Tensor
     time_s: float
 
 
-class Ends(NamedTuple):
-    """Terminal costs of rollouts.
+class TerminalInputs(NamedTuple):
+    """Inputs of the terminal costs of rollouts.
 
     Args:
-        padded_ground: padded maps, M for each episode in turn, shape [B·M, N].
+        padded_ground: padded maps of λ, M consecutive ones for each episode, shape
+            [B·M, N].
         target: target (x, y) in metres, shape [B·M, 1, 2].
         grid: size and resolution of the maps.
-        objective: J.
+        objective: objective J.
         fields: number of fields M.
-        level: α of the CVaR over fields.
-        going: mask of rollouts that have not stopped, bool, shape [B·M, K]; None
-            without entrapment.
-        to_go: costs of the cheapest paths, as in `astar.framed`, shape [B, 2, N]; None
-            if the terminal cost is that of J.
+        level: level α of the CVaR over the fields, in [0, 1).
+        is_mobile: mask of rollouts that are not immobilised, bool, shape [B·M, K]; None
+            if terrain does not immobilise rollouts.
+        cost_to_go: costs of the cheapest paths, padded by `astar.pad_costs`, shape
+            [B, 2, N]; None if J provides the terminal cost.
     """
 
     padded_ground: Tensor
@@ -89,8 +94,8 @@ class Ends(NamedTuple):
     objective: Objective
     fields: int = 1
     level: float = 0.0
-    going: Tensor | None = None
-    to_go: Tensor | None = None
+    is_mobile: Tensor | None = None
+    cost_to_go: Tensor | None = None
 
 
 def roll_out(
@@ -103,25 +108,27 @@ def roll_out(
     ground: Tensor | None = None,
     dwell: Dwell | None = None,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Roll out sampled action sequences, summing J and the penalty of non-free cells.
+    """Roll out sampled action sequences and sum their costs, without terminal costs.
+
+    The cost of a step is that of J plus the penalty of non-free cells.
 
     Args:
         problem: B problems.
         state: initial states, shape [B, S].
         mean: mean action sequences, shape [B, T, A].
-        noise: offsets of every mean, shape [T, A, K]; their sum with the mean is
-            clipped to the action bounds.
+        noise: noise that is added to each mean before clipping, shape [T, A, K].
         target_m: targets (x, y) in metres, shape [B, 2].
-        advance: `advance_chunk`, or `advance_entrapped` with `dwell`, or its compiled
-            form.
-        ground: padded maps, M for each episode, as in `framed_fields`, shape [B·M, N];
-            None for λ̂.
-        dwell: dwell times on immobilising terrain; None without entrapment.
+        advance: `advance_chunk`, or `advance_entrapped` if `dwell` is given; either may
+            be compiled.
+        ground: padded maps of λ, M for each episode, from `pad_fields`, shape
+            [B·M, N]; None for λ̂.
+        dwell: dwell times on immobilising terrain; None if terrain does not immobilise
+            rollouts.
 
     Returns:
-        The last states, shape [B·M, K, S]; the cost without terminal cost, shape
-        [B·M, K]; and, with `dwell`, a mask of rollouts that have not stopped, bool,
-        shape [B·M, K].
+        The last states, shape [B·M, K, S]; the costs, shape [B·M, K]; and a mask of
+        rollouts that are not immobilised, bool, shape [B·M, K], or None without
+        `dwell`.
     """
     ground = problem.padded_ground if ground is None else ground
     count = len(ground) // len(problem)
@@ -129,7 +136,7 @@ def roll_out(
     mean = mean.repeat_interleave(count, 0)
     target_m = target_m.repeat_interleave(count, 0)
     states = component_wise(state[:, None].expand(-1, noise.shape[2], -1))
-    # All arguments are contiguous, since each layout is compiled separately.
+    # All arguments are made contiguous, since PyTorch compiles each layout separately.
     target = target_m[:, None].contiguous()
     cost = state.new_zeros(states.shape[:2])
     low, high = problem.action_bounds
@@ -170,18 +177,18 @@ def advance_chunk(
     target: Tensor,
     dynamics: Dynamics,
 ) -> tuple[Tensor, Tensor]:
-    """Roll out samples over a chunk of the horizon, and add their costs.
+    """Roll out samples over a chunk of the horizon, and add the costs of its steps.
 
     Args:
         states: robot states, shape [B, K, S].
-        cost: cost so far, shape [B, K].
+        cost: cost of the previous steps, shape [B, K].
         sampled: action sequences of the chunk.
-        padded_ground: padded maps as in `Problem`, shape [B, N].
+        padded_ground: maps as in `Problem.padded_ground`, shape [B, N].
         target: target (x, y) in metres, shape [B, 1, 2].
-        dynamics: dynamics of the problem.
+        dynamics: grid, robot and objective.
 
     Returns:
-        States and cost after these steps.
+        The states after the chunk, and the cost that includes its steps.
     """
     grid, robot, objective, min_traversability = dynamics
     for step in range(sampled.mean.shape[1]):
@@ -197,30 +204,31 @@ def weigh(
     states: Tensor,
     cost: Tensor,
     sampled: Sampled,
-    ends: Ends,
+    terminal_inputs: TerminalInputs,
     temperature: float | None,
     temperature_share: float,
 ) -> tuple[Tensor, Tensor]:
-    """Add terminal costs, weigh samples by exp(−cost / temperature) and move the mean.
+    """Weigh samples by exp(−cost / temperature), and move the mean.
 
     Args:
         states: last states of the rollouts, shape [B·M, K, S].
         cost: cost of the rollouts without terminal cost, shape [B·M, K].
         sampled: action sequences of the whole horizon.
-        ends: terminal costs.
-        temperature: temperature in the units of J; None for a relative one.
-        temperature_share: relative temperature, as a fraction of `cost_spread`.
+        terminal_inputs: inputs of the terminal costs.
+        temperature: temperature in the units of J; None to use `temperature_share`.
+        temperature_share: temperature as a fraction of `cost_spread`.
 
     Returns:
-        Weights of the samples, shape [B, K], and the mean action sequences, shape
-        [B, T, A].
+        Weights of the samples, shape [B, K], which sum to 1 over K, and the new mean
+        action sequences, shape [B, T, A].
     """
-    cost, cost_per_field = total_cost(states, cost, ends)
+    cost, cost_per_field = total_cost(states, cost, terminal_inputs)
     scale: Tensor | float | None = temperature
     if scale is None:
         stopped = None
-        if ends.going is not None:
-            stopped = (~ends.going).unflatten(0, (-1, ends.fields)).sum(1)
+        if terminal_inputs.is_mobile is not None:
+            is_stopped = ~terminal_inputs.is_mobile
+            stopped = is_stopped.unflatten(0, (-1, terminal_inputs.fields)).sum(1)
         scale = temperature_share * cost_spread(cost, cost_per_field, stopped)
     min_cost = cost.amin(dim=1, keepdim=True)
     weights = torch.softmax((min_cost - cost) / scale, dim=1)
@@ -228,32 +236,36 @@ def weigh(
     return weights, mean
 
 
-def total_cost(states: Tensor, cost: Tensor, ends: Ends) -> tuple[Tensor, Tensor]:
-    """Add the terminal cost.
+def total_cost(
+    states: Tensor, cost: Tensor, terminal_inputs: TerminalInputs
+) -> tuple[Tensor, Tensor]:
+    """Return the costs of samples, with terminal costs.
 
-    The cost of rollouts on M fields is the CVaR over them. Stopped rollouts have no
-    terminal cost.
+    The cost of a sample is the CVaR of its costs on M fields. An immobilised rollout
+    has no terminal cost.
 
     Args:
         states: last states of the rollouts, shape [B·M, K, S].
         cost: cost of the rollouts without terminal cost, shape [B·M, K].
-        ends: terminal costs.
+        terminal_inputs: inputs of the terminal costs.
 
     Returns:
-        Cost of the samples, shape [B, K], and on each field, shape [B, M, K].
+        Cost of each sample, shape [B, K], and its cost on each field, shape [B, M, K].
     """
-    padded_ground, target, grid, objective, fields, level, going, to_go = ends
+    padded_ground, target, grid, objective, fields, level, is_mobile, cost_to_go = (
+        terminal_inputs
+    )
     ground = grid.lookup(padded_ground, states[..., 0], states[..., 1])
-    if to_go is None:
+    if cost_to_go is None:
         end_cost = terminal_cost(objective, states, ground, target)
     else:
-        # All fields of an episode share one map of costs.
+        # All fields of an episode share one map of the cost to go.
         episode_states = states.unflatten(0, (-1, fields)).flatten(1, 2)
         x, y = episode_states[..., 0], episode_states[..., 1]
-        path_cost = astar.cost_at(grid, to_go, x, y)
+        path_cost = astar.cost_at(grid, cost_to_go, x, y)
         end_cost = path_cost.view_as(cost) + PENALTY * (ground <= 0)
-    if going is not None:
-        end_cost = torch.where(going, end_cost, 0)
+    if is_mobile is not None:
+        end_cost = torch.where(is_mobile, end_cost, 0)
     cost = cost + end_cost
     cost_per_field = cost.unflatten(0, (-1, fields))
     if fields > 1:
@@ -264,22 +276,25 @@ def total_cost(states: Tensor, cost: Tensor, ends: Ends) -> tuple[Tensor, Tensor
 def cost_spread(
     cost: Tensor, cost_per_field: Tensor | None = None, stopped: Tensor | None = None
 ) -> Tensor:
-    """Return the mean excess of costs over the minimum: the unit of temperature.
+    """Return the mean difference between the costs and the minimum cost.
 
-    Samples that pay the penalty of non-free cells for more steps than the best sample,
-    over all fields, are excluded. Otherwise the penalty would set the temperature near
-    such cells, and all paths over free terrain would have equal weight. Steps are
-    counted by the cost on each field in units of the penalty, so the spread of J itself
-    should be less than half of the penalty. For the same reason, samples that stop for
-    good on more fields than the best sample are excluded.
+    It is the unit of a relative temperature. Samples that cross more non-free cells
+    than the best sample, summed over steps and fields, are excluded. Otherwise the
+    penalty of such cells would set the temperature, and all paths over free terrain
+    would have nearly equal weights. For the same reason, samples that are immobilised
+    on more fields than the best sample are excluded.
+
+    The number of steps in non-free cells is the cost in units of the penalty, rounded.
+    Hence the spread of J itself should be less than half the penalty.
 
     Args:
         cost: cost of each sample, shape [B, K].
         cost_per_field: cost on each field, shape [B, M, K]; None for a single field.
-        stopped: number of fields on which each sample stops, shape [B, K]; None for 0.
+        stopped: number of fields on which each sample is immobilised, shape [B, K];
+            None for 0.
 
     Returns:
-        Mean excess, > 0, shape [B, 1].
+        Mean difference, > 0, shape [B, 1].
     """
     if cost_per_field is None:
         cost_per_field = cost[:, None]
@@ -287,12 +302,12 @@ def cost_spread(
     index = best[:, None].expand(-1, cost_per_field.shape[1], -1)
     excess_per_field = cost_per_field - cost_per_field.gather(2, index)
     penalties_per_field = (excess_per_field / PENALTY + 0.5).floor()
-    counted = penalties_per_field.sum(1) <= 0
+    is_counted = penalties_per_field.sum(1) <= 0
     if stopped is not None:
-        counted = counted & (stopped <= stopped.gather(1, best))
+        is_counted = is_counted & (stopped <= stopped.gather(1, best))
     excess = cost - cost.amin(dim=1, keepdim=True)
-    total = torch.where(counted, excess, 0).sum(dim=1, keepdim=True)
-    spread = total / counted.sum(dim=1, keepdim=True)
+    total = torch.where(is_counted, excess, 0).sum(dim=1, keepdim=True)
+    spread = total / is_counted.sum(dim=1, keepdim=True)
     return spread.clamp(min=_MIN_SPREAD)
 
 
@@ -304,7 +319,7 @@ def average(
     return torch.clamp(mean + offset, low, high)
 
 
-def drawn_paths(
+def plotted_paths(
     problem: Problem,
     state: Tensor,
     updated: Tensor,
@@ -312,8 +327,20 @@ def drawn_paths(
     noise: Tensor,
     weights: Tensor,
 ) -> dict[str, Tensor]:
-    """Return layers of a plan: the updated mean's path, and those of the best samples."""
-    count = min(_DRAWN_SAMPLES, weights.shape[1])
+    """Return the paths of the updated mean and of the best samples, for figures.
+
+    Args:
+        problem: B problems.
+        state: initial states, shape [B, S].
+        updated: updated mean action sequences, shape [B, T, A].
+        mean: mean action sequences before the update, shape [B, T, A].
+        noise: noise of the samples, shape [T, A, K].
+        weights: weights of the samples, shape [B, K].
+
+    Returns:
+        Layers `path` and `samples` of a `Plan`.
+    """
+    count = min(_PLOTTED_SAMPLES, weights.shape[1])
     best = weights.topk(count, dim=1).indices
     best_noise = noise[..., best].movedim(2, 0)
     samples = perturb(mean[..., None], best_noise, *problem.action_bounds)

@@ -1,9 +1,9 @@
 """Interfaces of planners and local planners, and the plans that they return.
 
-A planner is stateless: `init` creates a plan state, and `plan` receives a plan state and
-returns the next. Both are pure functions: their results depend only on the arguments.
-Letters in shapes: B episodes, N points, M samples, E edges, S state and A action
-dimensions.
+A planner is stateless: `init` creates a plan state, and `plan` receives a plan state
+and returns the next plan state. Both are pure functions of their arguments and the
+planner's settings. Letters in shapes: B episodes, N points, M samples, E edges, T time
+steps, K action sequences, S state and A action dimensions.
 """
 
 import math
@@ -22,18 +22,18 @@ from benchnav.planning.problem import Problem, Task
 from benchnav.planning.robots import STEERING, Robot
 from benchnav.planning.sensing.sensor import Step
 
-# Layers of a `Plan`, with their dimensions between the episodes and (x, y).
+# Layers of a `Plan`, with the dimensions between the first, B, and the last, (x, y).
 LAYERS = {"path": "N", "samples": "MN", "reference": "N", "tree": "EN"}
 
-# Remedies for a robot that a planner does not steer.
-_SAMPLED = "Use a planner that samples actions, such as mppi."
-_STEERED = (
-    "The planner commands a turn rate; this robot is steered by an angle, and turns "
-    "only while it drives. Use mppi, astar_mppi or straight."
+# Remedies in the message for a robot that a planner cannot steer.
+_ANY_ACTIONS_REMEDY = "Use a planner that samples actions, such as mppi."
+_STEERING_REMEDY = (
+    "The planner commands a turn rate, but this robot is steered by an angle, and "
+    "turns only while it drives. Use mppi, astar_mppi or straight."
 )
 
-# Fields of a `Problem` that depend on a prediction. By the rules of the task, free space
-# depends on one of the first two.
+# Fields of a `Problem` that depend on a prediction. Free space is derived from
+# `risk_map` or `distribution`, as the rules of the task define.
 INPUTS = frozenset({"risk_map", "distribution", "fields"})
 
 
@@ -41,14 +41,14 @@ class PlanStatus(IntEnum):
     """Result of planning for an episode."""
 
     OK = 0
-    # no path to the goal has been found yet; the action follows the best partial path
+    # No path to the goal has been found yet; the action follows the best partial path.
     PARTIAL = 1
-    FAILED = 2  # the planner gives up; the episode ends as a planner failure
+    FAILED = 2  # The planner gives up; the episode ends as a planner failure.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """Status of planning, and the layers that playback draws.
+    """Status of planning, and layers of positions that figures and playback show.
 
     Unused points are NaN. Layers that a planner does not return have size 0.
 
@@ -72,7 +72,7 @@ class Plan:
     def empty(
         cls, batch: int, device: torch.device | str = "cpu", **layers: Tensor
     ) -> "Plan":
-        """Return a plan with status OK and only the given layers."""
+        """Return a plan with status OK; layers that are not given are empty."""
         values = {"status": torch.zeros(batch, dtype=torch.int64, device=device)}
         for name, inner in LAYERS.items():
             no_points = [0] * len(inner)
@@ -80,7 +80,7 @@ class Plan:
         return cls(**{**values, **layers})
 
     def lines(self, member: int) -> dict[str, Tensor]:
-        """Return the layers of one episode as polylines, shape [lines, N, 2]."""
+        """Return the layers of the episode at an index as polylines, [lines, N, 2]."""
         lines = {}
         for name in LAYERS:
             layer = getattr(self, name)[member]
@@ -94,32 +94,32 @@ State = TypeVar("State")
 class Planner(Specified, ABC, Generic[State]):
     """Base class of planners; `benchnav.testing.check_planner` checks the contract.
 
-    `init` and `plan` are required; the other members have defaults. A planner stores
-    only its settings. Everything that changes is in the plan state, so that one planner
-    can plan for any batch in any order.
+    `init` and `plan` are required; the other methods and attributes have defaults. A
+    planner stores only its settings. All that changes from step to step is in the plan
+    state, so that one planner can plan for any batch in any order.
     """
 
     steers: tuple[tuple[str, ...], ...] | None = None
-    """Action names of the robots that it steers; None for any robot."""
+    """Action names of the robots that the planner can steer; None for any names."""
 
     robots: tuple[type[Robot], ...] | None = None
-    """Classes of robots that it plans for, among those that it steers; None for all."""
+    """Classes of the robots that the planner can steer; None for any class."""
 
     blind: bool = False
-    """Whether it uses no map; a class attribute.
+    """Whether the planner uses no prediction; a class attribute.
 
-    One run then represents all models and risk settings. See `uses`.
+    Its results are then the same under all models and risk settings. See `uses`.
     """
 
     plans_once: bool = False
-    """Whether it plans only at the start; beliefs that learn are then rejected."""
+    """Whether the planner plans only once; it then rejects beliefs that learn."""
 
     given_truth: bool = False
-    """Whether it receives λ itself; models other than `clairvoyant` are then rejected."""
+    """Whether the planner requires the true λ, from the model `clairvoyant`."""
 
     @property
     def compiled(self) -> bool | None:
-        """Whether it runs compiled.
+        """Whether the planner runs compiled.
 
         None before the first plan, and for a planner without compiled functions.
         """
@@ -131,7 +131,7 @@ class Planner(Specified, ABC, Generic[State]):
 
         Args:
             problem: B problems, with predictions.
-            generator: source of randomness on the CPU, for use in this call only.
+            generator: random generator on the CPU, for use in this call only.
         """
 
     @abstractmethod
@@ -143,65 +143,69 @@ class Planner(Specified, ABC, Generic[State]):
             plan_state: plan state from `init` or the last call; not modified.
 
         Returns:
-            Actions within the bounds, shape [B, A]; the next plan state; the plan.
+            Actions within the robot's bounds, shape [B, A]; the next plan state; and
+            the plan.
         """
 
     def select(self, plan_state: State, members: Tensor) -> State:
-        """Return the plan state of some episodes, so that ended ones cost no time.
+        """Return the plan state of some episodes, so that ended episodes take no time.
 
         Args:
             plan_state: plan state of all episodes; not modified.
             members: indices of the episodes to keep, int64, shape [M].
 
         Returns:
-            The plan state of these episodes; `NotImplemented`, the default, if ended
-            episodes must stay in the batch.
+            The plan state of these episodes. The default, `NotImplemented`, means that
+            ended episodes must stay in the batch.
         """
         return NotImplemented
 
     def revise(self, plan_state: State, problem: Problem) -> State:
-        """Replan for an updated λ̂ map.
+        """Return a plan state for an updated prediction.
 
         Args:
             plan_state: plan state from the last call; not modified.
-            problem: problems of the same episodes that start at the robots' current
-                states; only prediction, λ̂ and free mask may differ.
+            problem: problems of the same episodes, whose start is the robots' current
+                state; only the prediction, λ̂ and the free mask may also differ.
 
         Returns:
-            A plan state for the new problem; `NotImplemented`, the default, if the
-            planner must start again with `init`.
+            A plan state for the new problems. The default, `NotImplemented`, means that
+            the planner starts again with `init`.
         """
         return NotImplemented
 
     def uses(self, task: Task) -> frozenset[str]:
-        """Return the predicted inputs that affect its actions.
+        """Return the names of the predicted inputs that affect the planner's actions.
 
-        Conditions that differ only in other inputs run once.
+        Conditions that differ only in unused inputs are run only once.
 
         Args:
             task: the task; its rules define the input of free space, see
                 `FreeSpace.source`.
 
         Returns:
-            A subset of `INPUTS`; by default all of them, or no input for a blind
+            A subset of `INPUTS`; by default all of them, or the empty set for a blind
             planner.
         """
         return frozenset() if self.blind else INPUTS
 
     def follows(self, task: Task) -> str:
-        """Return what it minimises instead of J, in one line for tables; empty for J."""
+        """Return the cost that the planner minimises instead of J; empty for J.
+
+        The text is one line for tables.
+        """
         return ""
 
     def remarks(self, task: Task) -> tuple[str, ...]:
-        """Return notes for tables, a line each, such as limits that it adds."""
+        """Return notes for tables, one line each, such as the planner's own limits."""
         return ()
 
 
 class LocalPlanner(Planner[State]):
     """Base class of local planners: planners that receive a target at each step.
 
-    The plan state is a `Batch` with a `problem`. Used as a planner, it drives toward the
-    goal.
+    The plan state is a `Batch` with a field `problem`. Without a global planner, the
+    target is the goal.
     """
 
     name: str
@@ -209,7 +213,7 @@ class LocalPlanner(Planner[State]):
 
     @property
     def seeks_goal(self) -> bool:
-        """Whether its cost is a cost to the goal, whatever the target is."""
+        """Whether the planner minimises a cost to the goal, whatever the target is."""
         return False
 
     def plan(self, step: Step, plan_state: Any) -> tuple[Tensor, State, Plan]:
@@ -223,9 +227,9 @@ class LocalPlanner(Planner[State]):
         """Return actions toward targets (x, y), shape [B, 2]; see `Planner.plan`."""
 
     def commit_action(self, plan_state: State, action: Tensor) -> State:
-        """Return the plan state after executed actions, shape [B, A].
+        """Return the plan state after the execution of actions, shape [B, A].
 
-        The executed actions may differ from those of `plan_toward`.
+        They may differ from the actions that `plan_toward` returned.
         """
         return plan_state
 
@@ -244,13 +248,13 @@ def check_finite(
     above_zero: tuple[str, ...],
     at_least_zero: tuple[str, ...] = (),
 ) -> None:
-    """Check that settings are finite and not negative; None is always valid.
+    """Check that settings are finite and above 0, or at least 0; None is always valid.
 
     Args:
-        owner: owner of the settings, for the message.
+        owner: name of the planner or controller, for the message.
         settings: dataclass of settings.
-        above_zero: names of fields that must not be 0.
-        at_least_zero: names of fields that may be 0.
+        above_zero: names of fields that must be above 0.
+        at_least_zero: names of fields that must be at least 0.
 
     Raises:
         ConfigError: If a setting is out of its range.
@@ -274,21 +278,22 @@ def check_steers(planner: Planner[Any], robot: Robot, name: str) -> None:
         name: name of the planner, for the message.
 
     Raises:
-        ConfigError: If the planner does not steer robots with these actions, or of this
-            class.
+        ConfigError: If the planner cannot steer robots of this class, or with these
+            actions.
     """
     robot_name = type(robot).__name__
     if planner.robots is not None and type(robot) not in planner.robots:
-        kinds = " or ".join(kind.__name__ for kind in planner.robots)
+        class_list = [robot_class.__name__ for robot_class in planner.robots]
+        class_names = " or ".join(class_list)
         raise ConfigError(
-            f"Expected robot {kinds} for planner {name!r}, got {robot_name}."
+            f"Expected robot {class_names} for planner {name!r}, got {robot_name}."
         )
     names = tuple(robot.action_names)
     steered_names = (names,) if planner.steers is None else planner.steers
     options = " or ".join(f"({', '.join(option)})" for option in steered_names)
-    knows_angle = any(STEERING in option for option in steered_names)
-    needs_angle = STEERING in names and not knows_angle
-    remedy = _STEERED if needs_angle else _SAMPLED
+    can_steer_angle = any(STEERING in option for option in steered_names)
+    needs_angle = STEERING in names and not can_steer_angle
+    remedy = _STEERING_REMEDY if needs_angle else _ANY_ACTIONS_REMEDY
     expect(
         names in steered_names,
         f"a robot with actions {options} for planner {name!r}, got "

@@ -1,8 +1,8 @@
 """Straight driving to the goal: the blind baseline.
 
-`Straight` uses only the goal. Planners with a global path use the same control law in
-their recovery.
-Letters in shapes: B episodes, S state and A action dimensions.
+`Straight` uses only the goal and no map. Planners with a global path use the same
+control law in their recovery. Letters in shapes: B episodes, *B any leading dimensions,
+S state dimensions.
 """
 
 import math
@@ -17,19 +17,20 @@ from benchnav.planning.sensing.sensor import Step
 
 # Turn rate in rad/s, or steering angle in rad, per radian of heading error.
 _TURN_GAIN = 4.0
-# A robot with a larger heading error turns before it drives, so that it leaves narrow
-# passages straight.
-_AWAY_RAD = 0.2
-# Maximum speed per metre of remaining distance, 1/s, to prevent overshooting.
-_APPROACH = 2.0
-# Minimum fraction of the top speed for a robot that cannot turn in place.
-_CREEP = 0.3
+# A robot with a larger heading error turns in place, so that it drives straight through
+# narrow passages.
+_MAX_HEADING_ERROR_RAD = 0.2
+# Maximum speed per metre of remaining distance in 1/s, so that the robot does not
+# overshoot.
+_APPROACH_GAIN = 2.0
+# Minimum fraction of the top speed of a robot that cannot turn in place.
+_MIN_SPEED_FRACTION = 0.3
 
 STEERS = ((SPEED, TURN_RATE), (SPEED, STEERING))
 
 
 def turn_toward(state: Tensor, target_m: Tensor) -> Tensor:
-    """Return angles from headings to positions, in [−π, π), shape [*B].
+    """Return angles from headings to the directions of targets, in [−π, π), shape [*B].
 
     Args:
         state: states that begin with (x, y, θ), shape [*B, S].
@@ -47,7 +48,7 @@ def steer_toward(state: Tensor, target_m: Tensor, robot: Robot) -> Tensor:
     Args:
         state: states that begin with (x, y, θ), shape [B, S].
         target_m: targets (x, y) in metres, shape [B, 2].
-        robot: robot with one of the pairs of actions in `STEERS`.
+        robot: robot whose actions are one of the pairs in `STEERS`.
 
     Returns:
         Actions within the bounds, shape [B, 2].
@@ -57,30 +58,32 @@ def steer_toward(state: Tensor, target_m: Tensor, robot: Robot) -> Tensor:
     high = robot.action_high
     gain = _TURN_GAIN
     if robot.action_rates is not None:
-        # A robot of limited acceleration must be able to stop its turn in time.
+        # A robot with limited acceleration must be able to stop its turn in time.
         _, max_rate = robot.action_rates
         gain = min(gain, 2 * max_rate / high[1])
-    min_fraction = 0.0 if TURN_RATE in robot.action_names else _CREEP
-    fraction = (1 - heading_error.abs() / _AWAY_RAD).clamp(min=min_fraction)
+    can_turn_in_place = TURN_RATE in robot.action_names
+    min_fraction = 0.0 if can_turn_in_place else _MIN_SPEED_FRACTION
+    relative_error = heading_error.abs() / _MAX_HEADING_ERROR_RAD
+    fraction = (1 - relative_error).clamp(min=min_fraction)
     distance_m = torch.linalg.vector_norm(target_m - state[:, :2], dim=1)
-    speed = torch.minimum(high[0] * fraction, _APPROACH * distance_m)
+    speed = torch.minimum(high[0] * fraction, _APPROACH_GAIN * distance_m)
     turn = gain * heading_error
     speed = speed.clamp(low[0], high[0])
     return torch.stack((speed, turn.clamp(low[1], high[1])), dim=1)
 
 
 class Straight(Planner[Problem]):
-    """The blind baseline: full speed straight to the goal, whatever the terrain."""
+    """Blind baseline, which drives straight to the goal at full speed."""
 
     steers = STEERS
     blind = True
 
     def follows(self, task: Task) -> str:
-        """Return that it minimises nothing; see `Planner`."""
+        """Return that the planner minimises no cost; see `Planner`."""
         return "none (it drives straight at the goal)"
 
     def init(self, problem: Problem, generator: torch.Generator) -> Problem:
-        """Return the problem as the plan state; draws nothing. See `Planner`."""
+        """Return the problem as the plan state; see `Planner`."""
         return problem
 
     def plan(self, step: Step, plan_state: Problem) -> tuple[Tensor, Problem, Plan]:
@@ -95,5 +98,5 @@ class Straight(Planner[Problem]):
         return problem
 
     def select(self, plan_state: Problem, members: Tensor) -> Problem:
-        """Return some episodes; see `Planner`."""
+        """Return the problems of some episodes; see `Planner`."""
         return plan_state.select(members)

@@ -1,14 +1,15 @@
 """Turning manoeuvres of robots that are steered by an angle.
 
-Noise that is independent from step to step hardly turns a bicycle, since its steering
-averages out. If the goal is behind a standing robot, no sample then contains a turn to
-it, and all samples lead away from it. Turns are therefore separate action sequences:
-full steering at full speed for a while, then straight ahead. Source: after Trevisan and
-Alonso-Mora (2024), "Biased-MPPI: Informing sampling-based model predictive control by
-fusing ancillary controllers", whose controllers add such sequences to the samples. If no
-turn pays within the horizon, the robot drives a Dubins path. Letters in shapes: B
-episodes, M fields, N cells of a padded map, T horizon steps, A action dimensions, P
-primitives.
+Noise that is independent from step to step hardly turns a bicycle, since the steering
+angles average out. If the goal is behind a standing robot, no sample then turns to the
+goal, and all samples lead away from it. Turns are therefore separate action sequences:
+full steering at full speed for some steps, then straight driving. If no turn is cheaper
+than standing within the horizon, the robot follows a Dubins path.
+
+Source: after Trevisan and Alonso-Mora (2024), "Biased-MPPI: Informing sampling-based
+model predictive control by fusing ancillary controllers", whose controllers add such
+sequences to the samples. Letters in shapes: B episodes, M fields, N cells of a padded
+map, T horizon steps, S state and A action dimensions, P primitives.
 """
 
 import math
@@ -25,12 +26,12 @@ from benchnav.planning.problem import (
 )
 from benchnav.planning.robots import SPEED, STEERING, Robot
 
-_DURATIONS = 16  # number of equal parts of the horizon that a turn may last for
-_SPACING = 0.5  # between points at which a Dubins path is checked, in cells
+_DURATIONS = 16  # A turn lasts for 0, 1, … or 16 sixteenths of the horizon.
+_SPACING_CELLS = 0.5  # distance between the checked points of a Dubins path, in cells
 
 
 def is_steered(robot: Robot) -> bool:
-    """Return whether a robot is driven by a speed and a steering angle."""
+    """Return whether the actions of a robot include a speed and a steering angle."""
     return {SPEED, STEERING} <= set(robot.action_names)
 
 
@@ -41,29 +42,29 @@ def choose(
     state: Tensor,
     target_m: Tensor,
     ground: Tensor,
-    following: Tensor,
+    was_on_dubins_path: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Replace mean action sequences that are no better than standing by turns.
+    """Return mean action sequences, or turns if the mean costs no less than standing.
 
-    A turn replaces the mean instead of being a sample, since the average of a left turn
-    and a right turn is not a turn. A turn may pay only after the horizon. If none pays
-    within it, the robot follows a Dubins path until it faces the target; samples would
-    only slow it down.
+    A turn replaces the mean and is not a sample, since the average of a left turn and a
+    right turn is no turn. If no turn costs less than standing within the horizon, the
+    robot follows a Dubins path until it faces the target. Samples would only slow this
+    turn.
 
     Args:
-        cost_of: returns the cost of action sequences, [B, K], for means [B, T, A] and
-            offsets from them, [T, A, K].
+        cost_of: function that returns the costs [B, K] of action sequences, from means
+            [B, T, A] and offsets that are added to each mean, [T, A, K].
         mean: mean action sequences, shape [B, T, A].
         problem: B problems of a robot that is steered by an angle.
         state: states of the robots, shape [B, S].
         target_m: target (x, y) in metres, shape [B, 2].
-        ground: padded maps, M for each episode, as in `framed_fields`, shape [B·M, N].
-        following: mask of robots that followed a Dubins path in the last step, bool,
-            shape [B].
+        ground: padded maps, M for each episode, as in `pad_fields`, shape [B·M, N].
+        was_on_dubins_path: mask of robots that followed a Dubins path in the last step,
+            bool, shape [B].
 
     Returns:
-        Action sequences, shape [B, T, A], and a mask of those on Dubins paths, which
-        must be used unchanged, bool, shape [B].
+        Action sequences, shape [B, T, A], and a mask of robots that follow a Dubins
+        path, bool, shape [B]. Their action sequences must not be changed.
     """
     horizon = mean.shape[1]
     primitives = turning_primitives(problem.robot, horizon, mean)
@@ -71,20 +72,20 @@ def choose(
     mean_cost = cost_of(mean, no_offset)
     standing = 0 * mean
     standing_cost = cost_of(standing, no_offset)
-    stands = (mean_cost >= standing_cost)[:, 0]
-    # Only on the CPU: another device would have to synchronise.
+    is_no_better = (mean_cost >= standing_cost)[:, 0]
+    # On a GPU, this test would have to wait for the result of the comparison.
     if mean.device.type == "cpu":
-        needs_turn = stands | following
+        needs_turn = is_no_better | was_on_dubins_path
         if not bool(needs_turn.any()):
-            return mean, following
+            return mean, was_on_dubins_path
     turn_cost, best = cost_of(standing, primitives).min(dim=1)
-    pays = stands & (turn_cost < standing_cost[:, 0])
-    path, turns = follow_dubins(problem, state, target_m, ground, horizon)
-    follows = turns & (following | (stands & ~pays))
+    is_turn_cheaper = is_no_better & (turn_cost < standing_cost[:, 0])
+    path, has_path = follow_dubins(problem, state, target_m, ground, horizon)
+    on_dubins_path = has_path & (was_on_dubins_path | (is_no_better & ~is_turn_cheaper))
     best_turn = primitives.movedim(2, 0)[best]
-    turn = torch.where(follows[:, None, None], path, best_turn)
-    replaces = (pays | follows)[:, None, None]
-    return torch.where(replaces, turn, mean), follows
+    turn = torch.where(on_dubins_path[:, None, None], path, best_turn)
+    is_replaced = (is_turn_cheaper | on_dubins_path)[:, None, None]
+    return torch.where(is_replaced, turn, mean), on_dubins_path
 
 
 def follow_dubins(
@@ -92,20 +93,20 @@ def follow_dubins(
 ) -> tuple[Tensor, Tensor]:
     """Return actions at full speed along the shortest forward path to a target.
 
-    The path starts to the side of the target or, if that path is not clear, to the
-    other side. A path is clear if it stays on free terrain that does not immobilise, as
-    far as the robot gets within the horizon at λ = 1.
+    The path first turns toward the target or, if that path is not clear, away from it.
+    A path is clear if it crosses only free cells that do not immobilise a robot. Its
+    checked length is the distance that the robot drives within the horizon at λ = 1.
 
     Args:
         problem: B problems of a robot that is steered by an angle.
         state: states of the robots, shape [B, S].
         target_m: target (x, y) in metres, shape [B, 2].
-        ground: padded maps, M for each episode, as in `framed_fields`, shape [B·M, N].
+        ground: padded maps, M for each episode, as in `pad_fields`, shape [B·M, N].
         horizon: number of steps T.
 
     Returns:
-        Action sequences, shape [B, T, A], and a mask of episodes in which one of both
-        paths is clear and turns, bool, shape [B].
+        Action sequences, shape [B, T, A], and a mask of episodes in which one of the
+        two paths is clear and the chosen path is not straight, bool, shape [B].
     """
     robot = problem.robot
     low, high = problem.action_bounds
@@ -126,9 +127,9 @@ def follow_dubins(
 
     n_fields = len(ground) // len(state)
     x, y = state[:, :2].repeat_interleave(n_fields, 0).unbind(-1)
-    own_ground = problem.grid.lookup(ground, x, y)
+    ground_at_robot = problem.grid.lookup(ground, x, y)
     min_traversability = problem.task.rules.min_traversability
-    traversability = motion_traversability(own_ground, min_traversability)
+    traversability = motion_traversability(ground_at_robot, min_traversability)
     mean_traversability = traversability.unflatten(0, (len(state), -1)).mean(dim=1)
     step_m = step_m * mean_traversability
     along_m = torch.arange(horizon + 1, device=state.device) * step_m[:, None]
@@ -149,9 +150,12 @@ def follow_dubins(
 
 
 def _full_steering(problem: Problem, state: Tensor) -> tuple[Tensor, Tensor]:
-    """Return distance and turn of a step at λ = 1 with full steering, shape [B] each.
+    """Return the distance and the turn of a step with full steering at λ = 1.
 
-    Both are the minimum over a step to the right and one to the left.
+    Each is the minimum over a step to the right and a step to the left.
+
+    Returns:
+        Distance in metres and turn in radians, each of shape [B].
     """
     robot = problem.robot
     low, high = problem.action_bounds
@@ -175,7 +179,7 @@ def _is_clear(
     ground: Tensor,
     reach_m: float,
 ) -> Tensor:
-    """Return whether paths stay on free terrain that does not immobilise, bool, [B].
+    """Return a mask of paths on free cells that do not immobilise a robot, bool, [B].
 
     Args:
         problem: B problems.
@@ -185,7 +189,7 @@ def _is_clear(
         reach_m: checked length of the paths in metres.
     """
     grid = problem.grid
-    spacing_m = _SPACING * grid.resolution_m
+    spacing_m = _SPACING_CELLS * grid.resolution_m
     count = 1 + math.ceil(reach_m / spacing_m)
     points = sample_segments(state[:, :3], *segments, spacing_m, count)
     points = points.repeat_interleave(len(ground) // len(state), 0)
@@ -199,10 +203,10 @@ def _is_clear(
 
 
 def turning_primitives(robot: Robot, horizon: int, like: Tensor) -> Tensor:
-    """Return turns to both sides.
+    """Return turns to both sides, each followed by straight driving.
 
-    They are forward. If the robot can reverse, there are also turns backward, and turns
-    backward that are followed by straight driving forward.
+    A robot turns and drives forward. A robot that can reverse also turns and drives
+    backward, or turns backward and then drives forward.
 
     Args:
         robot: robot that is steered by an angle.

@@ -1,1 +1,1 @@
-"""The world: the effect of traversability on robots, and the ends of episodes."""
+"""The world: the effect of traversability on robots, and the outcomes of episodes."""

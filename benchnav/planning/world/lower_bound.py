@@ -1,39 +1,39 @@
 """A lower bound of the time to the goal, for all planners, if λ is constant.
 
-**Claim.** Let robots move as the shipped ones do: a time step leads from p to a point
-at most v·dt·λ(p) away, where v is the top speed. Let λ⁺(x) be the maximum λ(p) over the
-points p from which a step can lead to x or past it, |x − p| ≤ v·dt·λ(p). Let W be
-continuous, 0 on the goal's disc, with |∇W| ≤ 1 / (v·λ⁺) almost everywhere. Then no
-trajectory from x reaches the goal in less than W(x).
+**Claim.** Let robots move as the shipped robots do: a time step leads from p to a point
+at a distance of at most v·dt·λ(p), where v is the top speed. Let λ⁺(x) be the maximum
+λ(p) over the points p from which a step can lead to x or beyond: |x − p| ≤ v·dt·λ(p).
+Let W be continuous, 0 on the goal's disc, with |∇W| ≤ 1 / (v·λ⁺) almost everywhere.
+Then no trajectory from x reaches the goal in less time than W(x).
 
-**Proof.** Each point x of the segment from p to its successor q has |x − p| ≤
-v·dt·λ(p), so that λ⁺(x) ≥ λ(p). Along the segment W decreases by at most its length
-times the maximum slope, v·dt·λ(p) / (v·λ(p)) = dt. A trajectory of K steps to the goal
-ends where W is 0, hence W(start) ≤ K·dt. On a triangulation W is linear on each closed
-triangle, and a segment along an edge lies in two of them. Hence the slope is bounded by
-the maximum λ⁺ on the closed triangle.
+**Proof.** A step from p to q is a segment. Each of its points x has |x − p| ≤
+v·dt·λ(p), so that λ⁺(x) ≥ λ(p). Along the segment, W decreases by at most the length of
+the segment times the maximum slope, v·dt·λ(p) / (v·λ(p)) = dt. A trajectory of K steps
+to the goal ends where W is 0, hence W(start) ≤ K·dt. On a triangulation, W is linear on
+each closed triangle. A segment along an edge lies in two triangles. Hence the slope on
+a triangle must satisfy the bound for the maximum λ⁺ on the closed triangle.
 
-**Immobilising terrain.** A robot is lost after m consecutive steps that start on λ
-under `below`, unless it has reached the goal. A trajectory to the goal is a polygonal
-line. Take a point x of it on immobilising terrain, and the longest part around x that
-stays on such terrain. This part enters by a fraction of one step, at most v·dt long, or
-begins at the start. It has at most m steps from inside, each up to v·dt·`below` long. It
-ends where it leaves such terrain or reaches the goal's disc. So it is at most
-v·dt·(1 + m·`below`) long, and x is at most half of that away from other terrain, the
-disc or the start. Deeper points are removed, since no trajectory to the goal contains
-one. W need not be continuous across them. If they separate start and goal, no trajectory
-reaches the goal.
+**Immobilising terrain.** A robot is immobilised after m consecutive steps that start on
+λ below `below`, unless it has reached the goal. A trajectory to the goal is a polygonal
+line. Take a point x of the trajectory on immobilising terrain, and the longest part
+around x that stays on such terrain. This part begins at the start, or within a step of
+at most v·dt that enters such terrain. It contains at most m steps that start on such
+terrain, each at most v·dt·`below` long. It ends where it leaves such terrain or reaches
+the goal's disc. So its length is at most v·dt·(1 + m·`below`), and the distance of x
+from other terrain, the disc or the start is at most half of this length. Points at a
+larger distance are removed, since no trajectory to the goal contains one. W need not be
+continuous across removed points. If they separate start and goal, no trajectory reaches
+the goal.
 
 **The largest W.** The augmented Lagrangian method finds the W with the maximum sum over
 the nodes, by one Poisson equation and one projection on discs per iteration (Ennaji,
 Igbida and Nguyen, 2021, "Augmented Lagrangian methods for degenerate Hamilton–Jacobi
-equations"). Its convergence affects only the size of the bound, and not its validity:
-the slope of each triangle is measured in float64, and W is divided by the maximum
-excess.
+equations"). Incomplete convergence makes the bound smaller, but not invalid: the slope
+of each triangle is measured in float64, and W is divided by the maximum excess.
 
-λ and positions are in single precision. Rounding may make a step longer, or read λ at a
-point farther away, by some units in the last place; these are added to steps and
-distances. Letters in shapes: H×W cells, N nodes, T triangles.
+λ and positions are in single precision. By rounding, a step may be some units in the
+last place longer, or λ may be read at a point that much farther away. These units are
+added to steps and distances. Letters in shapes: H×W cells, N nodes, T triangles.
 """
 
 import math
@@ -59,13 +59,13 @@ from benchnav.planning.robots import (
 
 BOUNDED_ROBOTS = (Unicycle, DifferentialDrive, Bicycle)
 
-_MAX_SQUARES = 300_000  # of a map, so that the factors take less than 1 GB
-_MIN_TRAVERSABILITY = 1e-3
-_ULPS = 4 * 2.0**-24  # error of a position, as a fraction of the map's extent
-_RELAXATION = 1.6
-# Weight of the augmented Lagrangian, in units of the flux at the goal over the slowness.
+_MAX_SQUARES = 300_000  # maximum number of squares, so that factors take less than 1 GB
+_MIN_TRAVERSABILITY = 1e-3  # A smaller λ⁺ is replaced by this value.
+_RELATIVE_ERROR = 4 * 2.0**-24  # error of a position, as a fraction of the map's extent
+_RELAXATION = 1.6  # over-relaxation of the iteration, in (1, 2)
+# Weight of the augmented Lagrangian, relative to its natural unit; see `largest`.
 _WEIGHT = 5.0
-_EXCESS = 1.004  # maximum relative slope at convergence
+_EXCESS = 1.004  # maximum slope at convergence, relative to its bound
 _CHECK_EVERY = 25  # iterations between checks for convergence
 _MAX_STEPS = 300  # maximum number of iterations
 
@@ -75,9 +75,9 @@ class Motion:
     """Bounds of the motion of robots in an episode.
 
     Args:
-        robot: one of the shipped robots, whose λ scales its speed.
+        robot: one of `BOUNDED_ROBOTS`, whose speed is scaled by λ.
         goal_radius_m: distance in metres below which a robot has reached the goal.
-        immobile: conditions of immobilisation; None if nothing immobilises a robot.
+        immobile: rule of immobilisation; None if nothing immobilises a robot.
     """
 
     robot: Robot
@@ -86,7 +86,7 @@ class Motion:
 
     @property
     def step_m(self) -> float:
-        """Length of a step at λ = 1 in metres."""
+        """Length of a step at top speed and λ = 1 in metres."""
         return self.robot.top_speed_mps * self.robot.dt_s
 
 
@@ -103,41 +103,44 @@ def lower_bound_s(
         goal_m: goal (x, y) in metres, shape [2].
 
     Returns:
-        Time in seconds; 0 at the goal, infinite if no trajectory reaches it.
+        Time in seconds: 0 at the goal, and infinite if no trajectory reaches the goal.
     """
     start_m = np.asarray(start_m, np.float64)
     goal_m = np.asarray(goal_m, np.float64)
     step_m = motion.step_m
-    error_m = _ULPS * max(grid.extent_m)
+    error_m = _RELATIVE_ERROR * max(grid.extent_m)
     squares = _refined(grid, step_m)
-    times = squares.height // grid.height
-    fine = np.asarray(field, np.float64).repeat(times, 0).repeat(times, 1)
-    ends = _squares_within(squares, goal_m, motion.goal_radius_m + error_m)
-    begin = _square_at(squares, start_m)
-    is_reachable = np.ones_like(ends)
+    n_per_side = squares.height // grid.height
+    fine_field = np.asarray(field, np.float64)
+    fine_field = fine_field.repeat(n_per_side, 0).repeat(n_per_side, 1)
+    at_goal = _squares_within(squares, goal_m, motion.goal_radius_m + error_m)
+    start_square = _square_at(squares, start_m)
+    is_reachable = np.ones_like(at_goal)
     if motion.immobile is not None:
-        # In single precision, as the world compares.
+        # The world compares λ with `below` in single precision.
         below = np.float32(motion.immobile.below)
-        exits = (fine >= below) | ends
-        exits[begin] = True
+        exits = (fine_field >= below) | at_goal
+        exits[start_square] = True
         max_depth_m = _max_depth_m(motion, motion.immobile)
-        is_reachable = _near(exits, squares, max_depth_m + 2 * error_m)
+        is_reachable = _within(exits, squares, max_depth_m + 2 * error_m)
     regions, _ = label(is_reachable, generate_binary_structure(2, 2))
-    is_reachable = regions == regions[begin]
-    reached_ends = ends & is_reachable
-    if not reached_ends.any():
+    is_reachable = regions == regions[start_square]
+    reached_goal = at_goal & is_reachable
+    if not reached_goal.any():
         return math.inf
-    reach = _reached(fine, squares, step_m, 2 * error_m) + error_m / step_m
-    slowness = 1 / (motion.robot.top_speed_mps * reach.clip(_MIN_TRAVERSABILITY))
-    mesh = Mesh(squares, slowness, is_reachable, reached_ends)
+    max_traversability = _max_reaching(fine_field, squares, step_m, 2 * error_m)
+    max_traversability = max_traversability + error_m / step_m
+    max_traversability = max_traversability.clip(_MIN_TRAVERSABILITY)
+    slowness = 1 / (motion.robot.top_speed_mps * max_traversability)
+    mesh = Mesh(squares, slowness, is_reachable, reached_goal)
     value = largest(mesh, motion.goal_radius_m)
     return mesh.value_at(value, start_m)
 
 
 def _refined(grid: Grid, step_m: float) -> Grid:
-    """Return a grid of squares about as wide as a step.
+    """Return a grid of squares that are about as wide as a step is long.
 
-    A whole number of squares covers each side of a cell.
+    Each side of a cell is divided into a whole number of squares.
     """
     times = math.ceil(grid.resolution_m / step_m - 1e-6)
     max_times = math.isqrt(_MAX_SQUARES // (grid.height * grid.width))
@@ -146,13 +149,13 @@ def _refined(grid: Grid, step_m: float) -> Grid:
 
 
 def _max_depth_m(motion: Motion, immobile: Immobile) -> float:
-    """Return the maximum distance from other terrain on a trajectory to the goal."""
+    """Return the maximum distance from other terrain on any trajectory to the goal."""
     steps = steps_in(immobile.for_s, motion.robot.dt_s)
     return motion.step_m * (1 + steps * immobile.below) / 2
 
 
 def _square_at(squares: Grid, point_m: ndarray) -> tuple[int, int]:
-    """Return row and column of the square at a point, the nearest if it is outside."""
+    """Return row and column of the square nearest to a point."""
     index = np.floor(point_m[::-1] / squares.resolution_m).astype(int)
     last = np.array(squares.shape) - 1
     row, column = index.clip(0, last)
@@ -160,7 +163,7 @@ def _square_at(squares: Grid, point_m: ndarray) -> tuple[int, int]:
 
 
 def _squares_within(squares: Grid, point_m: ndarray, radius_m: float) -> ndarray:
-    """Return a mask of closed squares within a radius of a point, bool."""
+    """Return a mask of squares with a point within a radius of a given point, bool."""
     gaps_m = []
     for size, position_m in zip(squares.shape, point_m[::-1], strict=True):
         low_m = np.arange(size) * squares.resolution_m
@@ -173,7 +176,10 @@ def _squares_within(squares: Grid, point_m: ndarray, radius_m: float) -> ndarray
 
 
 def _around(squares: Grid, reach_m: float) -> list[tuple[int, int, float]]:
-    """Return offsets of squares within a distance, and the minimum distance of each."""
+    """Return offsets (row, column) of squares within a distance, and their distances.
+
+    Distances are the minima between any points of two squares, in metres.
+    """
     max_offset = math.floor(reach_m / squares.resolution_m) + 1
     offsets = range(-max_offset, max_offset + 1)
     squares_around = []
@@ -187,7 +193,7 @@ def _around(squares: Grid, reach_m: float) -> list[tuple[int, int, float]]:
 
 
 def _shifted(values: ndarray, row: int, column: int) -> ndarray:
-    """Return values shifted by some rows and columns, 0 beyond the edge."""
+    """Return values shifted by some rows and columns, with 0 beyond the edge."""
     height, width = values.shape
     margin = max(abs(row), abs(column))
     first_row = margin + row
@@ -196,19 +202,21 @@ def _shifted(values: ndarray, row: int, column: int) -> ndarray:
     return padded[first_row : first_row + height, first_column : first_column + width]
 
 
-def _near(exits: ndarray, squares: Grid, reach_m: float) -> ndarray:
-    """Return a mask of squares with a point within a distance of an exit, bool."""
+def _within(exits: ndarray, squares: Grid, reach_m: float) -> ndarray:
+    """Return a mask of squares within a distance of a square of a mask, bool."""
     is_near = exits.copy()
     for row, column, _ in _around(squares, reach_m):
         is_near |= _shifted(exits, row, column)
     return is_near
 
 
-def _reached(fine: ndarray, squares: Grid, step_m: float, error_m: float) -> ndarray:
-    """Return λ⁺, the maximum λ from which one step leads into each square."""
-    fastest = fine.copy()
+def _max_reaching(
+    field: ndarray, squares: Grid, step_m: float, error_m: float
+) -> ndarray:
+    """Return λ⁺ of each square: the maximum λ from which one step can reach it."""
+    fastest = field.copy()
     for row, column, distance_m in _around(squares, step_m + error_m):
-        shifted = _shifted(fine, row, column)
+        shifted = _shifted(field, row, column)
         is_in_reach = shifted * step_m + error_m >= distance_m
         is_faster = shifted > fastest
         fastest = np.where(is_in_reach & is_faster, shifted, fastest)
@@ -216,26 +224,29 @@ def _reached(fine: ndarray, squares: Grid, step_m: float, error_m: float) -> nda
 
 
 class Mesh:
-    """A triangulation of squares, two right triangles each, whose diagonals alternate.
+    """Triangulation of a map: each square is divided into two right triangles.
+
+    The diagonals of neighbouring squares have different directions.
 
     Args:
-        squares: grid of squares of the whole map.
-        slowness: maximum slope of W in each square in seconds per metre, of the shape
-            of the squares.
+        squares: grid of the squares of the whole map.
+        slowness: maximum slope of W in each square in seconds per metre, shape
+            [rows, columns] of the squares.
         is_kept: mask of squares that are not removed, bool, of the same shape.
         ends: mask of squares where W is 0, bool, of the same shape.
 
     Attributes:
-        right: node at the right angle of each triangle, int64, shape [T].
-        along: nodes at the ends of both legs of each triangle, int64, shape [2, T].
-        rise: maximum rise of W along a leg in seconds, shape [T].
+        right: index of the node at the right angle of each triangle, int64, shape [T].
+        along: indices of the nodes at the other ends of the two legs of each triangle,
+            int64, shape [2, T].
+        rise: maximum rise of W along a leg of each triangle in seconds, shape [T].
         free: mask of nodes where W is not fixed to 0, bool, shape [N].
     """
 
     def __init__(
         self, squares: Grid, slowness: ndarray, is_kept: ndarray, ends: ndarray
     ) -> None:
-        """Create the triangles."""
+        """Create the triangles of the squares that are kept."""
         self.squares = squares
         shape = squares.height + 1, squares.width + 1
         node = np.arange(shape[0] * shape[1]).reshape(shape)
@@ -243,8 +254,8 @@ class Mesh:
         low, right, up, far = (corner[is_kept] for corner in corners)
         row, column = np.nonzero(is_kept)
         even = (row + column) % 2 == 0
-        # Right angles at the lower left and the upper right corner, or at the other
-        # two.
+        # In even squares, the right angles are at the lower left and the upper right
+        # corner, and in odd squares at the other two corners.
         first = np.where(even, low, right)
         second = np.where(even, far, up)
         first_end = np.where(even, right, low)
@@ -262,9 +273,9 @@ class Mesh:
 
     @cached_property
     def rises(self) -> csr_array:
-        """Matrix from W at the free nodes to its rise along both legs of all triangles.
+        """Matrix that maps W at the free nodes to its rises along the triangles' legs.
 
-        Its shape is [2·T, free nodes].
+        Its shape is [2·T, number of free nodes].
         """
         count = len(self.right)
         values = np.repeat([1.0, -1.0], count)
@@ -278,26 +289,28 @@ class Mesh:
         return csr_array(all_nodes[:, self.free])
 
     def excess(self, value: ndarray) -> float:
-        """Return the maximum slope of W relative to its bound, from W at all N nodes."""
+        """Return the maximum slope of W relative to its bound, from W at N nodes."""
         at_right = value[self.right]
         across, upward = self.along
         rise = np.hypot(value[across] - at_right, value[upward] - at_right)
         return float((rise / self.rise).max())
 
     def value_at(self, value: ndarray, point_m: ndarray) -> float:
-        """Return W at a point, from W at all nodes, shape [N].
+        """Return W at a point, which must not be in a removed square.
 
-        It is undefined in a removed square.
+        Args:
+            value: W at all nodes, shape [N].
+            point_m: point (x, y) in metres, shape [2].
         """
         position = point_m / self.squares.resolution_m
         row, column = _square_at(self.squares, point_m)
         x, y = position - (column, row)
         nodes = value.reshape(self.squares.height + 1, -1)
         corners = nodes[row : row + 2, column : column + 2]
-        if (row + column) % 2:  # mirror to the layout of even squares
+        if (row + column) % 2:  # Mirror an odd square to the layout of even squares.
             corners = corners[:, ::-1]
             x = 1 - x
-        if x + y > 1:  # rotate the second triangle onto the first
+        if x + y > 1:  # Rotate the second triangle onto the first.
             corners = corners[::-1, ::-1]
             x = 1 - x
             y = 1 - y
@@ -308,12 +321,12 @@ class Mesh:
 
 
 def largest(mesh: Mesh, goal_radius_m: float) -> ndarray:
-    """Return nearly the largest W of bounded slope, at all nodes, shape [N].
+    """Return W at all nodes, shape [N]: nearly the largest W within the slope bounds.
 
     Args:
-        mesh: triangles.
-        goal_radius_m: radius in metres of the disc on which W is 0, which scales the
-            step sizes of the iteration.
+        mesh: triangulation with the bounds of the slope.
+        goal_radius_m: radius of the goal's disc in metres; it affects only the speed of
+            convergence.
     """
     rises = mesh.rises
     max_rise = mesh.rise
@@ -323,11 +336,13 @@ def largest(mesh: Mesh, goal_radius_m: float) -> ndarray:
     if not mesh.free.any():
         return value
     transposed = rises.T.tocsr()
-    # Nodes without a path to the goal would make the matrix singular.
+    # Without regularisation, nodes without a path to the goal would make the matrix
+    # singular.
     regularisation = 1e-9 * identity(rises.shape[1])
     matrix = (transposed @ rises + regularisation).tocsc()
     factors = splu(matrix, "MMD_AT_PLUS_A", options={"SymmetricMode": True})
-    # Flux through the rim of the disc from a unit source at each node, over the slowness.
+    # The natural unit of the weight is the flux through the border of the goal's disc
+    # from a unit source, divided by the slowness.
     flux = count / 2 * size**2 / (2 * math.pi * goal_radius_m)
     weight = _WEIGHT * flux * size / np.median(max_rise)
     source = size**2 / weight
@@ -339,7 +354,7 @@ def largest(mesh: Mesh, goal_radius_m: float) -> ndarray:
         relaxed = _RELAXATION * (rises @ free) + (1 - _RELAXATION) * allowed
         target = relaxed + multiplier
         length = np.hypot(target[:count], target[count:])
-        # The projection of each triangle's rises onto a disc.
+        # The two rises of each triangle are projected onto a disc.
         scale = max_rise / np.maximum(length, max_rise)
         allowed = target * np.tile(scale, 2)
         multiplier = multiplier + relaxed - allowed

@@ -1,7 +1,7 @@
-"""Simulation of true episodes, stepped as one batch.
+"""Simulation of episodes on the true terrain, stepped as one batch.
 
-The simulation contains the true terrain. λ at the robot's position scales its motion.
-Letters in shapes: B episodes, S state and A action dimensions.
+The true λ at a robot's position scales its motion. Letters in shapes: B episodes, H×W
+cells, S state and A action dimensions.
 """
 
 from collections.abc import Sequence
@@ -26,8 +26,9 @@ class SimulationState:
     Args:
         state: robot states, shape [B, S].
         outcome: `Outcome` of each episode, int64, shape [B].
-        step: number of steps taken in each episode, int64, shape [B].
-        dwell_steps: consecutive steps on immobilising terrain, int64, shape [B].
+        step: number of simulated steps of each episode, int64, shape [B].
+        dwell_steps: number of the last consecutive steps on immobilising terrain,
+            int64, shape [B].
     """
 
     state: Tensor
@@ -42,24 +43,24 @@ class SimulationState:
 
 
 class Simulation:
-    """B true episodes on B maps.
+    """B episodes on the true terrain of B maps.
 
     Args:
-        terrain: the true maps.
-        task: robot and goal radius, the same as for planners.
-        world: the model of λ.
-        places: starts and goals.
+        terrain: terrain of the B maps.
+        task: task with the robot and the goal radius that planners also receive.
+        world: model of λ.
+        places: start, goal and reference time of each episode.
         noise_key: root key of the noise; see `rng.stream_key`.
-        maps: index of each episode's stream under that root, B of them.
+        maps: indices of B maps; an episode draws its noise from the root key and the
+            index of its map.
 
     Attributes:
         robot: robot with the motion F.
         time_budget_s: time budget T of each episode in seconds, shape [B].
-        steps: T in time steps, int64, shape [B].
-        field: λ of all cells if it is constant, shape [B, H, W]; None if it is
-            resampled.
-        attempts: number of fields drawn until one connected start and goal, int64,
-            shape [B].
+        steps: T of each episode as a number of time steps, int64, shape [B].
+        field: λ of all cells, shape [B, H, W]; None if λ is resampled at each step.
+        attempts: number of fields that were drawn for each episode until start and goal
+            were connected, int64, shape [B].
     """
 
     def __init__(
@@ -85,96 +86,102 @@ class Simulation:
         max_steps = int(self.steps.max())
         realisation = Realisation(terrain, world, places, max_steps, noise_key, maps)
         self._realisation = realisation
-        # `exchange_` of the realisation modifies both in place.
+        # `Realisation.exchange_` modifies these two tensors in place.
         self.field = realisation.field
         self.attempts = realisation.attempts
-        self._immobile = world.immobile
+        self._immobile_rule = world.immobile
         self._low = goal_m.new_tensor(robot.action_low)
         self._high = goal_m.new_tensor(robot.action_high)
 
     @property
     def immobilising(self) -> Tensor:
-        """Mask of immobilising cells, bool, shape [B, H, W].
+        """Mask of cells that immobilise a robot, bool, shape [B, H, W].
 
-        No cell is immobilising if λ is resampled or the world does not immobilise
+        It is False everywhere if λ is resampled or the world does not immobilise
         robots.
         """
-        if self.field is None or self._immobile is None:
+        if self.field is None or self._immobile_rule is None:
             shape = len(self._goal_m), *self._grid.shape
             return self._goal_m.new_zeros(shape).bool()
-        return self.field < self._immobile.below
+        return self.field < self._immobile_rule.below
 
     def field_at(self, step: int) -> Tensor:
-        """Return λ of all cells at a step, shape [B, H, W]."""
+        """Return λ of all cells at a step, counted from 0, shape [B, H, W]."""
         if self.field is not None:
             return self.field
         return self._realisation.field_at(step)
 
     def init(self, start: Tensor) -> SimulationState:
-        """Return the state at the start, from robot states [B, S]."""
+        """Return the state of episodes that start at robot states [B, S]."""
         zero = torch.zeros(len(start), dtype=torch.int64, device=start.device)
         return SimulationState(start.clone(), zero, zero, zero)
 
     def step(
         self, now: SimulationState, action: Tensor
     ) -> tuple[SimulationState, Tensor]:
-        """Advance the running episodes by one step; ended ones do not change.
+        """Advance the running episodes by one step; ended episodes do not change.
 
         Args:
             now: current state; not modified.
-            action: actions, clipped to the bounds, shape [B, A].
+            action: actions, which are clipped to the robot's bounds, shape [B, A].
 
         Returns:
-            The next state, and λ under each robot in this step, shape [B].
+            The next state, and λ under each robot during the step, shape [B].
         """
         traversability = self._realisation.at(now.state, now.step)
-        # A user's robot may write into its arguments.
         action = action.clamp(self._low, self._high)
-        moved = self.robot(now.state.clone(), action, traversability)
-        state = torch.where(now.running[:, None], moved, now.state)
+        # The state is cloned, since a custom robot may modify its arguments.
+        moved_state = self.robot(now.state.clone(), action, traversability)
+        state = torch.where(now.running[:, None], moved_state, now.state)
         step = now.step + now.running
-        arrived = distance(state, self._goal_m) < self._goal_radius_m
-        inside = self._grid.contains(state[:, 0], state[:, 1])
+        is_at_goal = distance(state, self._goal_m) < self._goal_radius_m
+        is_on_map = self._grid.contains(state[:, 0], state[:, 1])
         outcome = torch.where(step >= self.steps, Outcome.TIMEOUT, Outcome.RUNNING)
         dwell_steps = now.dwell_steps
-        immobile = self._immobile
-        if immobile is not None:
-            immobilises = traversability < immobile.below
+        rule = self._immobile_rule
+        if rule is not None:
+            immobilises = traversability < rule.below
             dwell_steps = torch.where(immobilises, dwell_steps + 1, 0)
-            is_stuck = dwell_steps >= steps_in(immobile.for_s, self.robot.dt_s)
-            outcome = torch.where(is_stuck, Outcome.IMMOBILISED, outcome)
-        outcome = torch.where(inside, outcome, Outcome.OUT_OF_BOUNDS)
-        outcome = torch.where(arrived, Outcome.SUCCESS, outcome)
+            is_immobilised = dwell_steps >= steps_in(rule.for_s, self.robot.dt_s)
+            outcome = torch.where(is_immobilised, Outcome.IMMOBILISED, outcome)
+        outcome = torch.where(is_on_map, outcome, Outcome.OUT_OF_BOUNDS)
+        outcome = torch.where(is_at_goal, Outcome.SUCCESS, outcome)
         outcome = torch.where(now.running, outcome, now.outcome)
         return SimulationState(state, outcome, step, dwell_steps), traversability
 
     def unhindered(self, now: SimulationState, action: Tensor) -> Tensor:
-        """Return the commanded motion: states after an action at λ = 1, shape [B, S]."""
+        """Return the states that an action would lead to at λ = 1, shape [B, S].
+
+        Args:
+            now: current state; not modified.
+            action: actions, which are clipped to the robot's bounds, shape [B, A].
+        """
         ones = torch.ones_like(now.state[:, 0])
         action = action.clamp(self._low, self._high)
         return self.robot(now.state.clone(), action, ones)
 
-    def exchange_(self, members: Tensor, others: "Simulation") -> None:
-        """Replace episodes by those of another simulation, in place.
+    def exchange_(self, indices: Tensor, replacements: "Simulation") -> None:
+        """Replace M episodes by those of another simulation, in place.
 
         Args:
-            members: indices of the episodes, int64, shape [M].
-            others: simulation of M episodes of the same task and world.
+            indices: indices of the replaced episodes, int64, shape [M].
+            replacements: simulation of M episodes with the same task and world.
         """
         for name in ("_goal_m", "time_budget_s", "steps"):
             values = getattr(self, name)
-            other_values = getattr(others, name)
-            setattr(self, name, values.index_copy(0, members, other_values))
-        self._realisation.exchange_(members, others._realisation)
+            other_values = getattr(replacements, name)
+            setattr(self, name, values.index_copy(0, indices, other_values))
+        self._realisation.exchange_(indices, replacements._realisation)
 
 
 def end(now: SimulationState, which: Tensor, outcome: Outcome) -> SimulationState:
-    """Return the state with some running episodes ended by an outcome.
+    """Return a state in which the running episodes of a mask have ended.
 
     Args:
-        now: current state.
-        which: mask of the episodes, bool, shape [B].
-        outcome: an outcome that the simulation cannot determine itself.
+        now: current state; not modified.
+        which: mask of the episodes to end, bool, shape [B].
+        outcome: outcome of these episodes, which the simulation cannot determine, such
+            as `Outcome.PLANNER_FAILURE`.
     """
-    ends = now.running & which
-    return replace(now, outcome=torch.where(ends, outcome, now.outcome))
+    ends_now = now.running & which
+    return replace(now, outcome=torch.where(ends_now, outcome, now.outcome))

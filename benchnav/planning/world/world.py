@@ -1,6 +1,6 @@
-"""Worlds (how λ affects a robot), presets of a world and its rules, and endpoints.
+"""Worlds, presets of a world with its rules, and endpoints of episodes.
 
-Letters in shapes: B episodes.
+A world defines how λ varies and how it affects a robot. Letters in shapes: B episodes.
 """
 
 from collections.abc import Mapping
@@ -18,7 +18,8 @@ from benchnav.planning.free_space import FreeSpace, Immobile, Rules
 
 NOISES = ("resampled", "stored", "frozen")
 
-MAX_STEPS = 10**6  # of an episode; a day with time steps of 0.1 s has 864 000
+MAX_STEPS = 10**6
+"""Maximum number of steps of an episode; at 0.1 s per step, 28 hours."""
 
 _BUDGETS = ("time_budget_s", "time_budget_ratio")
 
@@ -30,8 +31,8 @@ class Endpoints(Batch):
     Args:
         start_m: start (x, y) in metres, shape [B, 2].
         goal_m: goal (x, y) in metres, shape [B, 2].
-        reference_time_s: grid reference times at 1 m/s in seconds, NaN without one,
-            shape [B].
+        reference_time_s: reference time of the fastest grid path at 1 m/s in seconds,
+            NaN if the dataset has none, shape [B].
     """
 
     start_m: Tensor
@@ -41,23 +42,25 @@ class Endpoints(Batch):
 
 @dataclass(frozen=True, kw_only=True)
 class World:
-    """Model of λ; the defaults are the paper's, where low λ only slows a robot.
+    """Model of λ; by default that of the paper, in which low λ only slows a robot.
 
     Args:
-        noise: `resampled` at each step; `stored`, the map's own realised λ; or
-            `frozen`, drawn once per episode as a correlated field with each cell's own
-            distribution.
-        correlation_m: correlation length ℓ of frozen noise in metres: normal scores of
-            cells at distance d have the correlation exp(−d²/2ℓ²).
+        noise: source of λ. `resampled`: λ is drawn at each step. `stored`: λ is the
+            value in the dataset. `frozen`: λ is drawn once per episode, as a correlated
+            field in which each cell has its own distribution.
+        correlation_m: correlation length ℓ ≥ 0 of frozen noise in metres. With the
+            Gaussian kernel, normal scores of cells at distance d have the correlation
+            exp(−d²/2ℓ²).
         kernel: kernel of frozen noise: `gaussian`, or `matern32`, a rougher field with
-            the same correlation at distance ℓ; beliefs assume the Gaussian kernel.
-        immobile: rule by which episodes end as immobilised; None without such a rule.
-        time_budget_s: time budget T in seconds; an episode that has not reached the
-            goal by then fails.
-        time_budget_ratio: T in multiples of the map's grid reference time at the
-            robot's top speed, instead of `time_budget_s`.
-        preset: name of the entry of `PRESETS` from which the world was derived, and
-            whose rules apply.
+            the same correlation at distance ℓ. Beliefs assume the Gaussian kernel.
+        immobile: rule by which terrain immobilises a robot and ends its episode; None
+            if terrain only slows robots.
+        time_budget_s: time budget T in seconds, after which an episode fails; None to
+            use `time_budget_ratio`.
+        time_budget_ratio: T as a multiple of the map's grid reference time at the
+            robot's top speed; None to use `time_budget_s`.
+        preset: name of the preset from which the world was derived, and whose rules
+            apply.
     """
 
     noise: str = "resampled"
@@ -86,8 +89,9 @@ class World:
         is_ratio = self.time_budget_s is None
         expect(
             is_ratio != (self.time_budget_ratio is None),
-            "either `time_budget_s` or `time_budget_ratio`, got "
-            f"{self.time_budget_s} and {self.time_budget_ratio}.",
+            "exactly one of `time_budget_s` and `time_budget_ratio`, got "
+            f"{self.time_budget_s} and {self.time_budget_ratio}. "
+            "Set the other to None.",
         )
         name = "time_budget_ratio" if is_ratio else "time_budget_s"
         value = getattr(self, name)
@@ -98,7 +102,7 @@ class World:
         """Return the paper's world: λ is resampled at each step and only slows a robot.
 
         Args:
-            **changes: fields whose values differ from the preset's.
+            **changes: fields, by name, that replace those of the preset.
         """
         return _changed_preset("paper", changes)
 
@@ -107,13 +111,13 @@ class World:
         """Return a world of constant λ in which low λ immobilises a robot.
 
         Args:
-            **changes: fields whose values differ from the preset's.
+            **changes: fields, by name, that replace those of the preset.
         """
         return _changed_preset("stakes", changes)
 
     @property
     def spec(self) -> dict[str, Any]:
-        """The preset by name, and all fields that differ from it, for `read_world`."""
+        """Name of the preset and all fields that differ from it, for `read_world`."""
         base = plain(PRESETS[self.preset].world)
         spec: dict[str, Any] = {"preset": self.preset}
         for name, value in plain(self).items():
@@ -122,17 +126,18 @@ class World:
         return spec
 
     def budget_s(self, reference_time_s: Tensor, top_speed_mps: float) -> Tensor:
-        """Return T of each episode.
+        """Return the time budget of each episode.
 
         Args:
-            reference_time_s: grid reference times at 1 m/s, NaN without one, shape [B].
+            reference_time_s: grid reference times at 1 m/s in seconds, NaN if missing,
+                shape [B].
             top_speed_mps: top speed of the robot in m/s.
 
         Returns:
             Time budgets in seconds, float64, shape [B].
 
         Raises:
-            ConfigError: If T is a multiple of a missing reference time.
+            ConfigError: If `time_budget_ratio` is set and a reference time is missing.
         """
         reference_time_s = reference_time_s.double()
         if self.time_budget_s is not None:
@@ -142,9 +147,9 @@ class World:
         if bool(is_missing.any()):
             raise ConfigError(
                 "Expected a reference time on each map for `time_budget_ratio`, "
-                f"got none on {int(is_missing.sum())} of {len(is_missing)} maps, whose "
-                "recipe does not require solvable maps. Create "
-                "such maps: benchnav-datagen create RECIPE id=NAME "
+                f"got none on {int(is_missing.sum())} of {len(is_missing)} maps, since "
+                "their recipe does not require solvable maps. Create solvable "
+                "maps: benchnav-datagen create RECIPE id=NAME "
                 "splits.SPLIT.solvable=true; or set "
                 "`time_budget_s`, as in world={'preset': 'stakes', 'time_budget_s': "
                 "60}."
@@ -152,7 +157,14 @@ class World:
         return self.time_budget_ratio * reference_time_s / top_speed_mps
 
     def steps(self, budget_s: Tensor, dt_s: float) -> Tensor:
-        """Return time budgets in time steps, int64, shape of `budget_s`.
+        """Return time budgets as numbers of time steps.
+
+        Args:
+            budget_s: time budgets in seconds, any shape.
+            dt_s: time step in seconds.
+
+        Returns:
+            Numbers of steps, int64, shape of `budget_s`.
 
         Raises:
             ConfigError: If a time budget has less than one step, or more than
@@ -162,21 +174,23 @@ class World:
         is_too_short = ~(steps >= 1)  # true for NaN
         if bool(is_too_short.any()):
             raise ConfigError(
-                f"Expected a time budget of at least one time step of {dt_s:g} s, got "
-                f"{float(budget_s.min()):g} s."
+                f"Expected a time budget of at least one time step, {dt_s:g} s, got "
+                f"{float(budget_s.min()):g} s. "
+                "Raise `time_budget_s` or `time_budget_ratio`."
             )
         if bool((steps > MAX_STEPS).any()):
             raise ConfigError(
                 f"Expected a time budget of at most {MAX_STEPS:,} time steps of "
-                f"{dt_s:g} s, got {float(budget_s.max()):g} s."
+                f"{dt_s:g} s, got {float(budget_s.max()):g} s. "
+                "Lower `time_budget_s` or `time_budget_ratio`."
             )
         return steps.long()
 
     def to_dict(self) -> dict[str, Any]:
         """Return all settings that affect episodes, as plain data for JSON.
 
-        Settings that the noise does not use are omitted. The first kernel is omitted
-        too: version 1 had no other, and ids must not change.
+        Settings that the noise does not use are omitted. The kernel `gaussian` is also
+        omitted, since version 1 had only this kernel, and ids must not change.
         """
         unused = {"preset"}
         if self.noise != "frozen":
@@ -192,12 +206,12 @@ class World:
 
 @dataclass(frozen=True, kw_only=True)
 class Preset:
-    """A world, and the rules of a task that belong to it.
+    """World with the default rules of its tasks.
 
     Args:
-        purpose: purpose in one line.
-        world: the model of λ.
-        rules: rules of the task.
+        purpose: description in one line.
+        world: model of λ.
+        rules: default rules of a task in this world.
     """
 
     purpose: str
@@ -230,21 +244,22 @@ PRESETS: Mapping[str, Preset] = {
 def _changed_preset(name: str, changes: Mapping[str, Any]) -> World:
     no_budget = {}
     if changes.keys() & set(_BUDGETS):
-        # Each setting of the time budget replaces the other.
+        # A changed time budget replaces that of the preset.
         no_budget = dict.fromkeys(_BUDGETS)
     return replace(PRESETS[name].world, **{**no_budget, **changes})
 
 
 def read_world(world: Any, task: Any = None) -> tuple[World, Rules, str]:
-    """Read a world and the rules that belong to it.
+    """Return a world and the rules of its tasks.
 
     Args:
-        world: name of a preset, or a mapping of changes with the preset's name under
-            `preset`; by default they change the paper's world.
-        task: mapping of changes to the preset's rules; None without changes.
+        world: name of a preset; or a mapping of fields that replace those of a preset,
+            with the preset's name under `preset`, by default `paper`; or a `World`.
+        task: mapping of fields that replace the preset's rules; None for no changes.
 
     Returns:
-        World, rules, and their name in tables: the preset's name and all changes.
+        The world, its rules, and their label in tables: the preset's name and all
+        changes.
 
     Raises:
         ConfigError: If a preset or field does not exist, or a value has the wrong type.
@@ -253,22 +268,24 @@ def read_world(world: Any, task: Any = None) -> tuple[World, Rules, str]:
         world = world.spec
     expect(
         isinstance(world, Mapping | str),
-        f"`world` as a mapping of settings, got {world!r}.",
+        f"`world` as the name of a preset or a mapping of settings, got {world!r}.",
     )
     changes = {"preset": world} if isinstance(world, str) else dict(world)
     name = changes.pop("preset", "paper")
     check_known("a world", name, PRESETS)
     preset = PRESETS[name]
     budgets = [key for key in _BUDGETS if changes.get(key) is not None]
-    if len(budgets) == 1:  # each setting of the time budget replaces the other
+    if len(budgets) == 1:
+        # A changed time budget replaces that of the preset.
         changes |= dict.fromkeys(set(_BUDGETS) - set(budgets))
     as_option = "`{}`".format
     changed_world = read(World, changes, as_option, "world", preset.world)
     for key in ("correlation_m", "kernel"):
         expect(
             key not in changes or changed_world.noise == "frozen",
-            f"`world.{key}` with `world.noise` frozen, got it with "
-            f"{changed_world.noise!r}.",
+            f"`world.noise` 'frozen' with `world.{key}`, got "
+            f"{changed_world.noise!r}. Set `world.noise` to 'frozen', or omit "
+            f"`world.{key}`.",
         )
     task = {} if task is None else task
     rules = read(Rules, task, as_option, "task", preset.rules)
@@ -279,7 +296,7 @@ def read_world(world: Any, task: Any = None) -> tuple[World, Rules, str]:
 
 
 def _differences(preset: Any, value: Any) -> list[str]:
-    """Return fields that differ from the preset, as they are written in tables."""
+    """Return the fields that differ from the preset, as `name=value` for tables."""
     changed = []
     for entry in fields(preset):
         name = entry.name

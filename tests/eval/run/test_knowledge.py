@@ -44,7 +44,7 @@ from benchnav.planning.sensing.sensor import (
     Sensor,
 )
 from benchnav.planning.world.outcome import Outcome
-from benchnav.planning.world.realisation import joined
+from benchnav.planning.world.realisation import are_connected
 from benchnav.planning.world.simulation import Simulation
 from benchnav.planning.world.world import Endpoints, World
 from tests.planning.planners.driving import generator
@@ -117,7 +117,9 @@ def drives(seed: int = 0, replan_every_s: float = 0.5, **changes: Any) -> Drives
         start_m=start, goal_m=goal, reference_time_s=torch.full((40,), torch.nan)
     )
     field = truth.from_normal(made.scores(COVARIANCE, 40, seed).float())
-    kept = joined(field >= IMMOBILE.below, COVARIANCE.grid, places).nonzero()[:BATCH, 0]
+    kept = are_connected(field >= IMMOBILE.below, COVARIANCE.grid, places).nonzero()[
+        :BATCH, 0
+    ]
     truth, field, places = truth.select(kept), field[kept], places.select(kept)
     start, goal, terrain = places.start_m, places.goal_m, made.terrain(truth, field)
     rules = replace(RULES, replan_every_s=replan_every_s)

@@ -110,14 +110,14 @@ def test_a_learned_policys_graph_is_not_kept() -> None:
 
 
 WHOLE = {
-    "nothing": ((None,), "Expected (action, plan_state, Plan) from `plan`, got NoneType."),
+    "nothing": ((None,), "Expected `plan` to return (action, plan_state, Plan), got NoneType."),
     "two values": ((ahead(), None), "got 2 values."),
     "a list": (([[1.0, 0.0]] * BATCH, None, Plan.empty(BATCH)), "of shape [3, 2] on cpu, got list."),
     "one action for all": ((ahead()[:1], None, Plan.empty(BATCH)), "got torch.float32 of shape [1, 2] on cpu."),
     "one number an action": ((ahead()[:, :1], None, Plan.empty(BATCH)), "got torch.float32 of shape [3, 1] on cpu."),
     "doubles": ((ahead().double(), None, Plan.empty(BATCH)), "got torch.float64 of shape [3, 2] on cpu."),
     "elsewhere": ((ahead().to("meta"), None, Plan.empty(BATCH)), "got torch.float32 of shape [3, 2] on meta."),
-    "no plan": ((ahead(), None, None), "Expected a Plan as the last output, got NoneType."),
+    "no plan": ((ahead(), None, None), "Expected `plan` to return a Plan as its third value, got NoneType."),
     "a status for all": (
         (ahead(), None, Plan.empty(BATCH, status=torch.zeros(1, dtype=torch.int64))),
         "`Plan.status` as torch.int64 of shape [3] on cpu, got torch.int64 of shape [1] on cpu.",

@@ -21,7 +21,7 @@ from benchnav.planning.planners import compilation
 from benchnav.planning.planners.astar.astar_mppi import AStarMPPI, AStarMPPIConfig
 from benchnav.planning.planners.cost_risk import (
     advance_entrapped,
-    framed_fields,
+    pad_fields,
     tail_cost,
     within_reach,
 )
@@ -29,7 +29,7 @@ from benchnav.planning.planners.mppi import MPPI, MPPIState
 from benchnav.planning.planners.mppi_config import MPPIConfig
 from benchnav.planning.planners.mppi_rollouts import (
     Dwell,
-    Ends,
+    TerminalInputs,
     advance_chunk,
     cost_spread,
     roll_out,
@@ -129,7 +129,7 @@ def test_ground_that_is_not_free_has_its_penalty_on_every_field() -> None:
         free=problem.free
         & (torch.rand(problem.free.shape, generator=generator(1)) > 0.5),
     )
-    ground = framed_fields(problem, fields(problem, 3)).unflatten(0, (2, 3))
+    ground = pad_fields(problem, fields(problem, 3)).unflatten(0, (2, 3))
     assert torch.equal(
         ground > 0, (problem.padded_ground > 0)[:, None].expand_as(ground)
     )
@@ -190,7 +190,7 @@ def test_the_tail_over_drawn_fields_is_that_over_all_that_there_are() -> None:
     noise = plan_state.noise.at(0)
 
     def costs_on(fields: Tensor) -> Tensor:
-        ground = framed_fields(posed, fields[None])
+        ground = pad_fields(posed, fields[None])
         return roll_out(
             posed,
             posed.start,
@@ -241,7 +241,8 @@ def test_fields_are_drawn_anew_at_each_step_and_once_if_that_is_asked_for() -> N
         assert len(other.keys) == once
         assert (
             torch.equal(
-                planner._ground(revised, problem.start).abs().max(), other.fields.max()
+                planner._padded_ground(revised, problem.start).abs().max(),
+                other.fields.max(),
             )
             or not once
         )
@@ -372,7 +373,7 @@ def test_cells_that_rollouts_cannot_reach_are_not_looked_up_and_change_nothing(
     planner = MPPI(replace(SMALL, risk_on="cost", fields=4))
     plan_state = planner.init(problem, generator())
     found, _, _ = planner.plan(first(problem), plan_state)
-    ground = planner._ground(plan_state, problem.start)
+    ground = planner._padded_ground(plan_state, problem.start)
     # in 1.5 s of 8 m × 8 m
     assert 0.5 < float((ground.abs() < 1e-20).double().mean()) < 0.9
     monkeypatch.setattr(
@@ -380,7 +381,10 @@ def test_cells_that_rollouts_cannot_reach_are_not_looked_up_and_change_nothing(
     )
     wanted, _, _ = planner.plan(first(problem), plan_state)
     assert torch.equal(found, wanted)
-    assert float((planner._ground(plan_state, problem.start) > 0).double().mean()) > 0.7
+    assert (
+        float((planner._padded_ground(plan_state, problem.start) > 0).double().mean())
+        > 0.7
+    )
 
 
 def test_what_is_within_reach_is_what_top_speed_reaches() -> None:
@@ -509,7 +513,9 @@ def test_rollouts_that_have_stopped_have_no_last_cost() -> None:
     sampled = Sampled(
         torch.zeros(1, 1, 2), torch.zeros(1, 2, 4), *problem.action_bounds
     )
-    weights, _ = weigh(states, cost, sampled, Ends(*given, going=going), 1.0, 0.1)
+    weights, _ = weigh(
+        states, cost, sampled, TerminalInputs(*given, is_mobile=going), 1.0, 0.1
+    )
     last = problem.terminal_cost(states, problem.goal_m[:, None])
     assert float(last.min()) > 1
     wanted = torch.softmax(-(cost + torch.where(going, last, 0)), dim=1)
@@ -529,12 +535,12 @@ def test_a_step_off_free_ground_on_one_field_does_not_set_the_temperature() -> N
         problem = varied(1)
         states = problem.goal_m[:, None].repeat(20, 4, 1)
         states = torch.cat((states, torch.zeros(20, 4, 1)), 2)
-        ground = framed_fields(problem, fields(problem, 20))
+        ground = pad_fields(problem, fields(problem, 20))
         sampled = Sampled(
             torch.zeros(1, 1, 2), torch.zeros(1, 2, 4), *problem.action_bounds
         )
         target = problem.goal_m[:, None].repeat(20, 1, 1)
-        ends = Ends(ground, target, problem.grid, GoalDistance(), 20, level)
+        ends = TerminalInputs(ground, target, problem.grid, GoalDistance(), 20, level)
         weights, _ = weigh(states, cost[0], sampled, ends, None, 1.0)
         assert float(weights[0, 0] / weights[0, 1]) == pytest.approx(
             math.exp(-2 / wanted), rel=1e-4
@@ -555,11 +561,11 @@ def test_samples_that_are_held_on_more_fields_than_the_best_do_not_set_the_tempe
     )
     going = torch.ones(2, 4, dtype=torch.bool)
     going[1, 2] = False
-    ground = framed_fields(problem, fields(problem, 2))
+    ground = pad_fields(problem, fields(problem, 2))
     sampled = Sampled(
         torch.zeros(1, 1, 2), torch.zeros(1, 2, 4), *problem.action_bounds
     )
-    ends = Ends(
+    ends = TerminalInputs(
         ground,
         problem.goal_m[:, None].repeat(2, 1, 1),
         problem.grid,
@@ -646,9 +652,9 @@ def test_a_robot_remembers_for_how_long_it_was_held() -> None:
     [
         ({"risk_on": "field"}, "`risk_on` 'map' or 'cost'"),
         ({"risk_on": "cost", "level": 1.0}, "`level` in"),
-        ({"level": 0.5}, "`risk_on: cost` for `level`"),
-        ({"once": True}, "`risk_on: cost` for `level`"),
-        ({"fields": 128}, "`risk_on: cost` for `level`, `fields`"),
+        ({"level": 0.5}, "`risk_on` 'cost' for MPPI with `level`"),
+        ({"once": True}, "`risk_on` 'cost' for MPPI with `level`"),
+        ({"fields": 128}, "`risk_on` 'cost' for MPPI with `level`, `fields`"),
         ({"risk_on": "cost", "level": 0.8, "fields": 49}, "= 50 for MPPI, got 49"),
         ({"risk_on": "cost", "fields": 0}, "`fields` > 0"),
     ],
@@ -669,11 +675,11 @@ def test_risk_that_cannot_be_told_is_refused(
             "CVaR 0.8 of J over 128 fields of λ",
         ),
         ({"risk_on": "cost"}, "mean of J over 64 fields of λ"),
-        ({"entrapment": True}, "J, immobilised rollouts pay the rest of the time"),
-        ({"cost_to_go": "map"}, "J, the last state pays A*'s cost to go under λ̂"),
+        ({"entrapment": True}, "J, plus the remaining time of immobilised rollouts"),
+        ({"cost_to_go": "map"}, "J, plus A*'s cost to go from the last state under λ̂"),
         (
             {"risk_on": "cost", "cost_to_go": "expected-time"},
-            "mean of J over 64 fields of λ, the last state pays A*'s cost to go under expected-time",
+            "mean of J over 64 fields of λ, plus A*'s cost to go from the last state under λ̂ of expected-time",
         ),
     ],
 )

@@ -18,7 +18,7 @@ from benchnav.planning.planners.astar.astar_mppi import AStarMPPI, AStarMPPIConf
 from benchnav.planning.planners.mppi import MPPI
 from benchnav.planning.planners.mppi_config import MPPIConfig
 from benchnav.planning.planners.mppi_rollouts import (
-    Ends,
+    TerminalInputs,
     advance_chunk,
     roll_out,
     weigh,
@@ -50,7 +50,7 @@ def posed(
 
 def last_cost(problem: Problem, of: Problem, states: Tensor) -> Tensor:
     """Of the last states by A*'s paths on the map of another problem, and the penalty."""
-    costs = astar.framed(of, astar.search(of))
+    costs = astar.pad_costs(of, astar.search(of))
     paths = astar.cost_at(problem.grid, costs, states[..., 0], states[..., 1])
     return paths + PENALTY * ~problem.free_at(states)
 
@@ -99,7 +99,7 @@ def test_all_fields_share_the_cost_to_go(closed: float, temperature: float) -> N
     fields = 0.3 + 0.7 * torch.rand(2, count, 16, 16, generator=generator(4))
     states = problem.start[:, None, None].repeat(1, count, 5, 1)
     states[..., :2] += 3 * torch.rand(2, count, 5, 2, generator=generator(5))
-    costs = astar.framed(problem, astar.search(problem))
+    costs = astar.pad_costs(problem, astar.search(problem))
     cost = torch.rand(2, count, 5, generator=generator(6))
     mean, noise = torch.zeros(2, 1, 2), torch.zeros(1, 2, 5)
     ground = torch.stack(
@@ -108,13 +108,13 @@ def test_all_fields_share_the_cost_to_go(closed: float, temperature: float) -> N
     )
     target = problem.goal_m[:, None].repeat_interleave(count, 0)
     sampled = Sampled(mean, noise, *problem.action_bounds)
-    ends = Ends(
+    ends = TerminalInputs(
         ground.flatten(0, 1),
         target,
         problem.grid,
         problem.objective,
         count,
-        to_go=costs,
+        cost_to_go=costs,
     )
     weights, _ = weigh(
         states.flatten(0, 1), cost.flatten(0, 1), sampled, ends, temperature, 0.1
@@ -136,9 +136,9 @@ def test_a_map_that_changes_has_another_cost_to_go() -> None:
     before = planner.init(problem, generator())
     changed = replace(problem, risk_map=problem.risk_map.flip(1))
     after = planner.revise(before, changed)
-    wanted = astar.framed(changed, astar.search(changed))
-    assert torch.equal(after.to_go, wanted)
-    assert not torch.equal(before.to_go, wanted)
+    wanted = astar.pad_costs(changed, astar.search(changed))
+    assert torch.equal(after.cost_to_go, wanted)
+    assert not torch.equal(before.cost_to_go, wanted)
 
 
 @pytest.mark.parametrize("cost", [False, True])
@@ -186,7 +186,7 @@ def test_an_episode_alone_does_as_it_does_in_a_batch(wanted: str) -> None:
         first(problem.select(member)), planner.select(state, member)
     )
     assert torch.equal(together[member], alone)
-    assert planner.select(after, member).to_go.shape == (1, 2, 18 * 18)
+    assert planner.select(after, member).cost_to_go.shape == (1, 2, 18 * 18)
 
 
 class OwnUnit(GoalDistance):

@@ -10,7 +10,7 @@ from benchnav.core.errors import ConfigError
 from benchnav.planning.free_space import FreeSpace, Immobile, Rules
 from benchnav.planning.objective import GoalDistance, Objective
 from benchnav.planning.planners import mppi, mppi_rollouts
-from benchnav.planning.planners.cost_risk import framed_fields
+from benchnav.planning.planners.cost_risk import pad_fields
 from benchnav.planning.planners.mppi import MPPI, MPPIState
 from benchnav.planning.planners.mppi_config import MPPIConfig
 from benchnav.planning.planners.noise_bank import NoiseBank, draw_bank
@@ -389,7 +389,7 @@ def test_noise_for_another_number_of_actions_is_asked_for_by_name() -> None:
 
     problem = factories.problem(torch.full((1, 16, 16), 0.85), robot=Three())
     with pytest.raises(
-        ConfigError, match=r"`noise` of MPPI with 3 values, for .*crab_mps"
+        ConfigError, match=r"`noise` of MPPI with 3 values, one for each of .*crab_mps"
     ):
         MPPI(replace(SMALL, noise=(0.5, 0.5))).init(problem, generator())
     MPPI(replace(SMALL, noise=(0.5, 0.5, 0.2))).init(problem, generator())
@@ -469,8 +469,8 @@ def test_no_tensor_is_made_on_another_device(
             mean,
             mean[:, 0, 0],
             mean[:, 0, 0] > 0,
-            ground=None,
-            to_go=None,
+            constant_fields=None,
+            cost_to_go=None,
             noise=bank,
             key=0,
             step=0,
@@ -694,7 +694,7 @@ def test_a_turn_replaces_only_a_mean_that_is_no_better_than_standing() -> None:
     mean = state.mean.clone()
     mean[2, :, 0] = 0.5
     state = replace(state, mean=mean)
-    turned, follows = planner._turned(
+    turned, follows = planner._mean_or_turns(
         first(problem), state, problem.goal_m, problem.padded_ground, None
     )
     assert follows.tolist() == [False, False, False, True]
@@ -706,7 +706,7 @@ def test_a_turn_replaces_only_a_mean_that_is_no_better_than_standing() -> None:
     for member, chosen in enumerate(turned):
         alone = problem.select(torch.tensor([member]))
         kept = planner.select(state, torch.tensor([member]))
-        single, _ = planner._turned(
+        single, _ = planner._mean_or_turns(
             first(alone), kept, alone.goal_m, alone.padded_ground, None
         )
         torch.testing.assert_close(single[0], chosen)
@@ -782,13 +782,13 @@ def test_a_dubins_path_keeps_to_ground_that_holds_the_robot(
         fields[:1], (13.0, 10.0), (7.0, 10.5), Bicycle(), rules=rules
     )
     problem = replace(with_start(problem, 13.0, 10.0, 0.0), immobile=immobile)
-    ground = framed_fields(problem, fields[None])
+    ground = pad_fields(problem, fields[None])
     actions, turns = follow_dubins(problem, problem.start, problem.goal_m, ground, 50)
     assert bool(turns) == (side is not None)
     assert side is None or actions[0, 0, 1].sign() == side
     closed = replace(problem, free=fields[:1] > 0.05)
     actions, turns = follow_dubins(
-        closed, closed.start, closed.goal_m, framed_fields(closed, fields[None]), 50
+        closed, closed.start, closed.goal_m, pad_fields(closed, fields[None]), 50
     )
     free = {0: 1, 1: -1 if kept[0] else 1, 2: None}[len(sides)]
     assert bool(turns) == (free is not None)

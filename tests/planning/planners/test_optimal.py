@@ -658,7 +658,7 @@ def test_other_robots_and_maps_that_change_are_refused(kind: type[Optimal]) -> N
     backward = Unicycle(speed_mps=(-1.0, 1.0))
     with pytest.raises(
         ConfigError,
-        match=f"`speed_mps` from 0 on for planner '{kind.name}', got from -1 on",
+        match=f"`speed_mps` with minimum 0 for planner '{kind.name}', got minimum -1",
     ):
         kind().init(factories.problem(ground, robot=backward), generator())
     posed = factories.problem(ground, rules=replace(RULES, goal_radius_m=0.35))

@@ -202,8 +202,8 @@ def test_removed_squares_lie_deeper_than_a_robot_gets_and_reach_is_the_greatest_
     field = generator.choice([0.05, 0.5, 1.0], (40, 30))
     field = field.repeat(3, 0).repeat(3, 1)[:40, :30]
     exits = field > 0.05
-    kept = lower_bound._near(exits, squares, deepest_m)
-    reach = lower_bound._reached(field, squares, step_m, 0.0)
+    kept = lower_bound._within(exits, squares, deepest_m)
+    reach = lower_bound._max_reaching(field, squares, step_m, 0.0)
     rows, columns = np.indices(squares.shape)
     for row, column in generator.integers(0, squares.shape, (150, 2)):
         apart = 0.05 * np.hypot(

@@ -4,7 +4,11 @@ import pytest
 import torch
 
 from benchnav.planning.objective import distance
-from benchnav.planning.world.outcome import STUCK_DISTANCE_M, Outcome, tell_standstill
+from benchnav.planning.world.outcome import (
+    STUCK_DISTANCE_M,
+    Outcome,
+    classify_standstill,
+)
 from benchnav.planning.world.simulation import Simulation
 from benchnav.planning.world.world import World
 from tests import factories
@@ -29,7 +33,11 @@ def tell(
     positions = torch.stack((2 + x, torch.full_like(x, 3.0)), dim=2)
     steps = torch.tensor([len(moved_mps)])
     return Outcome(
-        int(tell_standstill(torch.tensor([outcome]), steps, positions, drove, dt_s)[0])
+        int(
+            classify_standstill(torch.tensor([outcome]), steps, positions, drove, dt_s)[
+                0
+            ]
+        )
     )
 
 
@@ -101,7 +109,7 @@ def test_a_robot_that_spins_in_place_is_stalled() -> None:
         states.append(now.state)
     assert now.state[0, 2] > 9
     positions = torch.stack(states, dim=1)[..., :2]
-    told = tell_standstill(
+    told = classify_standstill(
         now.outcome, now.step, positions, torch.stack(driven, dim=1), 0.1
     )
     assert told.tolist() == [Outcome.STALLED, Outcome.STUCK]
@@ -114,7 +122,7 @@ def test_going_round_in_a_wide_circle_is_moving_and_in_a_narrow_one_is_not() -> 
             (5 + radius * angle.cos(), 5 + radius * angle.sin()), dim=1
         )[None]
         drove = torch.full((1, 200), 2 * math.pi * radius / 50, dtype=torch.float64)
-        told = tell_standstill(
+        told = classify_standstill(
             torch.tensor([Outcome.TIMEOUT]), torch.tensor([200]), positions, drove, DT_S
         )
         assert told.tolist() == [expected]
@@ -130,7 +138,9 @@ def test_an_episode_shorter_than_the_window_and_one_without_steps_are_told() -> 
     assert tell([0.0] * 5, [2.0] * 5) == Outcome.STUCK
     assert tell([0.0] * 5, [0.1] * 5) == Outcome.STALLED
     ended, steps = torch.tensor([Outcome.PLANNER_ERROR]), torch.tensor([0])
-    none = tell_standstill(ended, steps, torch.zeros(1, 1, 2), torch.zeros(1, 0), DT_S)
+    none = classify_standstill(
+        ended, steps, torch.zeros(1, 1, 2), torch.zeros(1, 0), DT_S
+    )
     assert none.tolist() == [Outcome.PLANNER_ERROR]
 
 
@@ -142,7 +152,7 @@ def test_each_episode_of_a_batch_is_told_by_itself() -> None:
     x[3] = torch.arange(201) * 0.01
     drove = torch.tensor([[0.1], [0.1], [0.0], [0.1]]).expand(4, 200)
     steps = torch.full((4,), 200)
-    told = tell_standstill(
+    told = classify_standstill(
         outcome, steps, torch.stack((x, torch.zeros_like(x)), dim=2), drove, DT_S
     )
     assert told.tolist() == [
@@ -169,9 +179,11 @@ def test_the_last_ten_seconds_of_an_episode_are_those_before_its_own_end() -> No
         ..., None
     ] * torch.tensor([1.0, 0.0])
     outcome, steps = torch.tensor([Outcome.TIMEOUT] * 2), torch.tensor([150, 300])
-    told = tell_standstill(outcome, steps, positions, torch.full((2, 300), 0.1), DT_S)
+    told = classify_standstill(
+        outcome, steps, positions, torch.full((2, 300), 0.1), DT_S
+    )
     assert told.tolist() == [Outcome.TIMEOUT, Outcome.STUCK]
-    told = tell_standstill(
+    told = classify_standstill(
         outcome, steps, positions, 0.01 * (moved + 1) * (moved == 0), DT_S
     )
     assert told.tolist() == [Outcome.TIMEOUT, Outcome.STUCK]
@@ -185,5 +197,5 @@ def test_what_the_wheels_did_after_an_episodes_end_is_not_looked_at() -> None:
     drove[0, 150:] = 0.0
     drove[1, :] = 0.0
     outcome, steps = torch.tensor([Outcome.TIMEOUT] * 2), torch.tensor([150, 300])
-    told = tell_standstill(outcome, steps, torch.zeros(2, 301, 2), drove, DT_S)
+    told = classify_standstill(outcome, steps, torch.zeros(2, 301, 2), drove, DT_S)
     assert told.tolist() == [Outcome.STUCK, Outcome.STALLED]

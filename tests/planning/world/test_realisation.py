@@ -12,7 +12,7 @@ from benchnav.core.grid import Grid
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Terrain
 from benchnav.planning.free_space import Immobile
-from benchnav.planning.world.realisation import Realisation, draw_frozen, joined
+from benchnav.planning.world.realisation import Realisation, are_connected, draw_frozen
 from benchnav.planning.world.world import Endpoints, World
 from tests import factories
 
@@ -332,7 +332,7 @@ def wall_with_noise(batch: int) -> Terrain:
 def test_ground_that_immobilises_the_robot_on_every_way_is_drawn_again() -> None:
     terrain, places = wall_with_noise(300), across(300)
     field, attempts = draw_frozen(terrain, IMMOBILISING, places, KEY, range(300))
-    assert joined(field >= 0.1, terrain.grid, places).all()
+    assert are_connected(field >= 0.1, terrain.grid, places).all()
     assert 2 < attempts.double().mean() < 6
     assert attempts.min() == 1
     first, once = draw_frozen(terrain, FREE, places, KEY, range(300))
@@ -340,7 +340,7 @@ def test_ground_that_immobilises_the_robot_on_every_way_is_drawn_again() -> None
     # Those whose first draw had a way keep it; the others' first draw had none.
     kept = attempts == 1
     assert torch.equal(field[kept], first[kept])
-    assert not joined(
+    assert not are_connected(
         first[~kept] >= 0.1, terrain.grid, places.select(torch.nonzero(~kept)[:, 0])
     ).any()
 
@@ -376,7 +376,13 @@ def test_ground_is_joined_over_edges_and_not_corners() -> None:
     places = factories.places(
         torch.tensor([[3.5, 3.5]] * 5), torch.tensor([[0.5, 0.5]] * 5)
     )
-    assert joined(maps, grid, places).tolist() == [True, False, False, False, True]
+    assert are_connected(maps, grid, places).tolist() == [
+        True,
+        False,
+        False,
+        False,
+        True,
+    ]
 
 
 def test_start_is_x_and_y_and_not_row_and_column() -> None:
@@ -384,7 +390,7 @@ def test_start_is_x_and_y_and_not_row_and_column() -> None:
     row = torch.zeros(1, 4, 6).bool()
     row[0, 1] = True
     places = factories.places(torch.tensor([[5.5, 1.5]]), torch.tensor([[0.5, 1.5]]))
-    assert joined(row, grid, places).tolist() == [True]
+    assert are_connected(row, grid, places).tolist() == [True]
 
 
 def test_a_correlation_longer_than_a_quarter_of_the_map_is_refused_in_metres() -> None:

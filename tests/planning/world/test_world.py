@@ -43,7 +43,7 @@ def test_a_time_budget_is_in_seconds_or_in_reference_times_at_top_speed() -> Non
     for both in ({}, {"time_budget_s": None}):
         world = {"time_budget_ratio": 3.0 if not both else None, **both}
         with pytest.raises(
-            ConfigError, match="either `time_budget_s` or `time_budget_ratio`"
+            ConfigError, match="exactly one of `time_budget_s` and `time_budget_ratio`"
         ):
             World(**world)
 
@@ -87,7 +87,7 @@ def test_a_kernel_is_in_the_plain_data_where_it_is_not_that_of_all_worlds_before
     assert label == "stakes kernel=matern32"
     with pytest.raises(
         ConfigError,
-        match=r"`world.kernel` with `world.noise` frozen, got it with 'resampled'",
+        match=r"`world.noise` 'frozen' with `world.kernel`, got 'resampled'",
     ):
         read_world({"kernel": "matern32"})
     with pytest.raises(
@@ -112,7 +112,7 @@ def test_a_time_budget_that_is_none_is_refused(budget: float) -> None:
 
 
 def test_a_time_budget_without_a_step_is_refused() -> None:
-    with pytest.raises(ConfigError, match=r"at least one time step of 0.1 s, got 0.01"):
+    with pytest.raises(ConfigError, match=r"at least one time step, 0.1 s, got 0.01"):
         World().steps(torch.tensor([9.0, 0.01]), 0.1)
 
 

@@ -137,7 +137,7 @@ def planned_ground(setup: Setup, setting: str = "cost") -> Tensor:
     config = planner_config(setting, setup)
     planner = ManyTrialsMPPI(config, setup)
     posed = pose(draw_vegetation(0, np.arange(2), 0.4), [setting], setup)
-    return planner._ground(planner.init(posed, rng.generator(0)), posed.start)
+    return planner._padded_ground(planner.init(posed, rng.generator(0)), posed.start)
 
 
 @pytest.mark.parametrize("motions", ["one", "two"])

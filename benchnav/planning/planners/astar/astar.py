@@ -1,13 +1,17 @@
 """A*: cheapest paths over the cells of a 2.5D map.
 
-The exact cost to go h* of every cell is computed once per λ̂ map, on the host, by a
+The exact cost to go h* of every cell is computed once per λ̂ map, on the CPU, by a
 compiled Dijkstra search backward from the goal. A* with h* as its heuristic expands
-only the cells of a cheapest path. Hence replanning from any robot position only follows
-pointers. Non-free cells cost their penalty per metre, on the half of an edge that lies
-in them, so that every cell has a path. A step between two non-free cells that touch at a
-corner costs the penalty on its whole length (`gridgraph.squeezes`). Sources: Hart,
-Nilsson and Raphael (1968); paper IV-A1. Letters in shapes: B episodes, H×W cells, N
-points, E edges.
+only the cells of a cheapest path. Hence each cell stores the next cell of its path, and
+replanning only reads these cells.
+
+An edge connects the centres of two neighbouring cells, and half of it lies in each. A
+half in a non-free cell costs the penalty per metre in addition, so that every cell has
+a path. A diagonal edge between two non-free cells that touch at its middle costs the
+penalty on its whole length (`gridgraph.squeezes`).
+
+Sources: Hart, Nilsson and Raphael (1968); paper IV-A1. Letters in shapes: B episodes,
+H×W cells, N cells of a padded map or points of a path, E edges, J positions.
 """
 
 from collections.abc import Callable, Iterable
@@ -31,7 +35,7 @@ from benchnav.planning.objective import distance
 from benchnav.planning.problem import Problem
 
 Cells = TypeVar("Cells", ndarray, Tensor)  # flat indices of cells
-_OUTSIDE = 100 * PENALTY  # cost to go off the map, where robots do not move
+_OFF_MAP_COST = 100 * PENALTY  # cost to go off the map
 
 
 @dataclass(frozen=True)
@@ -39,10 +43,10 @@ class CostToGo(Batch):
     """Cheapest paths from every cell to the goal.
 
     Args:
-        cost: cost of the path to the goal region, by the objective's `path_cost`,
-            penalties included, shape [B, H, W].
-        following: flat index of the next cell, the cell itself where the path ends,
-            int64, shape [B, H·W].
+        cost: cost of the path to the goal region by the objective's `path_cost`,
+            including penalties, shape [B, H, W].
+        following: flat index of the next cell of the path, or of the cell itself where
+            the path ends, int64, shape [B, H·W].
     """
 
     cost: Tensor
@@ -50,9 +54,9 @@ class CostToGo(Batch):
 
 
 def edge_costs(problem: Problem) -> Tensor:
-    """Return costs of moving between neighbouring cells.
+    """Return the costs of the edges between neighbouring cells.
 
-    Each half of an edge costs what its own cell's λ̂ implies.
+    The cost of each half of an edge depends on λ̂ of the cell in which it lies.
 
     Args:
         problem: B problems.
@@ -67,26 +71,29 @@ def edge_costs(problem: Problem) -> Tensor:
     source, target, cells = gridgraph.neighbour_pairs(*grid.shape)
     length_cells = torch.from_numpy(cells).to(problem.start.device)
     length_m = length_cells * grid.resolution_m
-    layers = [partial(_of_cells, values.flatten(1)) for values in _layers(problem)]
+    layers = [partial(_values_at, values.flatten(1)) for values in _layers(problem)]
     return _costs(problem, source, target, length_m, *layers)
 
 
 def revised_edge_costs(problem: Problem, before: Tensor, changed: Tensor) -> Tensor:
-    """Return `edge_costs` after changes of some cells, computed only for edges near them.
+    """Return `edge_costs` after some cells have changed, in less time.
+
+    Only edges near changed cells are computed.
 
     Args:
         problem: B problems.
         before: costs of edges before the change, float64, shape [B, E]; not modified.
-        changed: mask of cells whose λ̂, free mask or elevation changed, with at least
-            one cell, bool, shape [B, H, W].
+        changed: mask of cells whose λ̂, free mask or elevation changed, bool, shape
+            [B, H, W]; at least one cell must have changed.
     """
     grid = problem.grid
     source, target, cells = gridgraph.neighbour_pairs(*grid.shape)
-    # A diagonal step also depends on the two cells next to it, which touch its source.
-    near = max_pool2d(changed.float(), 3, stride=1, padding=1) > 0
-    is_affected = _of_cells(near.flatten(1), source)
-    member, edge = is_affected.nonzero(as_tuple=True)
-    first_cell = member * near[0].numel()
+    # All cells on which an edge depends are neighbours of its source. This includes the
+    # two cells next to a diagonal edge.
+    has_changed_neighbour = max_pool2d(changed.float(), 3, stride=1, padding=1) > 0
+    is_affected = _values_at(has_changed_neighbour.flatten(1), source)
+    episode, edge = is_affected.nonzero(as_tuple=True)
+    first_cell = episode * has_changed_neighbour[0].numel()
     edges = edge.cpu().numpy()
     begin = torch.from_numpy(source[edges]).to(edge.device)
     end = torch.from_numpy(target[edges]).to(edge.device)
@@ -94,13 +101,13 @@ def revised_edge_costs(problem: Problem, before: Tensor, changed: Tensor) -> Ten
     length_m = length_cells * grid.resolution_m
     layers = []
     for values in _layers(problem):
-        layers.append(partial(_of_flat_cells, values.flatten(), first_cell))
+        layers.append(partial(_values_on_maps, values.flatten(), first_cell))
     costs = _costs(problem, begin, end, length_m, *layers)
-    return before.index_put((member, edge), costs)
+    return before.index_put((episode, edge), costs)
 
 
 def _layers(problem: Problem) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the inputs of edge costs, each of shape [B, H, W]."""
+    """Return the maps on which edge costs depend, each of shape [B, H, W]."""
     return problem.traversability, problem.elevation_m, problem.free
 
 
@@ -113,19 +120,19 @@ def _costs(
     elevation_of: Callable[[Cells], Tensor],
     free_of: Callable[[Cells], Tensor],
 ) -> Tensor:
-    """Return costs of some edges.
+    """Return the costs of edges.
 
     Args:
         problem: B problems.
-        source: cells at which the edges begin, flat indices.
-        target: cells at which the edges end, flat indices.
+        source: flat indices of the cells at which the edges begin.
+        target: flat indices of the cells at which the edges end.
         length_m: lengths of the edges in metres.
         traversability_of: function of cells that returns their λ̂.
         elevation_of: function of cells that returns their elevation in metres.
         free_of: function of cells that returns whether they are free.
 
     Returns:
-        Costs, float64, of the shape that the functions return.
+        Costs, float64; their shape is that of the functions' results.
     """
     rise_m = elevation_of(target).double() - elevation_of(source).double()
     grade = rise_m / length_m
@@ -140,29 +147,37 @@ def _costs(
 
 
 def _cost_per_m(problem: Problem, traversability: Tensor, grade: Tensor) -> Tensor:
-    """Return the objective's `path_cost`, checked; float64, of the shape of the grade."""
+    """Return the objective's `path_cost` after checks.
+
+    Returns:
+        Cost per metre, float64, shape of `grade`.
+
+    Raises:
+        ConfigError: If `path_cost` returns another shape, or values that are not finite
+            and above 0.
+    """
     objective = problem.objective
     cost = objective.path_cost(traversability.double(), grade)
     name = f"`path_cost` of {type(objective).__name__}"
     shape = list(cost.shape) if isinstance(cost, Tensor) else type(cost).__name__
     expect(
         shape == list(grade.shape),
-        f"{name} of the shape of λ̂ and grade, {list(grade.shape)}, got {shape}. "
-        "Return a cost for each segment of a path.",
+        f"{name} to return a tensor of the same shape as λ̂ and grade, "
+        f"{list(grade.shape)}, got {shape}. Return a cost for each segment of a path.",
     )
     min_cost, max_cost = torch.stack(cost.aminmax())
     if not 0 < min_cost <= max_cost < torch.inf:
         raise ConfigError(
-            f"Expected {name} as finite numbers > 0, got {min_cost:g} to {max_cost:g}. "
-            "Return a cost > 0 per metre."
+            f"Expected {name} to return finite values > 0, got {min_cost:g} to "
+            f"{max_cost:g}. Return a cost > 0 per metre."
         )
     return cost
 
 
-def _of_cells(values: Tensor, cells: np.ndarray) -> Tensor:
-    """Return values [B, H·W] of some cells, shape [B, E].
+def _values_at(values: Tensor, cells: np.ndarray) -> Tensor:
+    """Return the values [B, H·W] at flat indices of cells, shape [B, E].
 
-    On the host NumPy is used, which takes a tenth of PyTorch's time.
+    On the CPU, NumPy takes a tenth of PyTorch's time.
     """
     if values.device.type == "cpu":
         return torch.from_numpy(np.take(values.numpy(), cells, axis=1))
@@ -170,37 +185,38 @@ def _of_cells(values: Tensor, cells: np.ndarray) -> Tensor:
     return values[:, index]
 
 
-def _of_flat_cells(values: Tensor, first_cell: Tensor, cells: Tensor) -> Tensor:
-    """Return values [B·H·W] of N cells of any maps.
+def _values_on_maps(values: Tensor, first_cell: Tensor, cells: Tensor) -> Tensor:
+    """Return the values of N cells, each on a map of its own, shape [N].
 
     Args:
-        values: values of all maps.
+        values: values of all cells of all maps, shape [B·H·W].
         first_cell: index in `values` of the first cell of each cell's map, shape [N].
-        cells: index of each cell in its map, shape [N].
+        cells: flat index of each cell on its map, shape [N].
     """
     return values[first_cell + cells]
 
 
 def search(problem: Problem, costs: Iterable[Tensor] | None = None) -> CostToGo:
-    """Return cheapest paths to the goal's own cell and to those within its radius.
+    """Return cheapest paths to the goal region.
 
-    The search runs on the host. Costs on another device are copied to the host, and the
-    result is copied back, once each.
+    The goal region consists of the cell that contains the goal, and of all cells whose
+    centre is within the goal radius. The search runs on the CPU. Costs on another
+    device are copied to the CPU once, and the result is copied back once.
 
     Args:
         problem: B problems.
-        costs: costs of edges, B of shape [E]; None for `edge_costs`.
+        costs: costs of the edges of each problem, B tensors of shape [E]; None for
+            `edge_costs`.
 
     Returns:
-        Cost to go, of the problem's dtype and device.
+        Cost to go, with the problem's dtype and device.
     """
     grid = problem.grid
     goal_m = problem.goal_m.cpu()
     cells = torch.arange(grid.height * grid.width)
     centres = cell_centres(grid, cells)
     goals = distance(centres, goal_m[:, None]) < problem.goal_radius_m
-    # On coarse grids no centre may be within the radius; the goal's own cell always is
-    # a goal.
+    # On coarse grids, no centre may be within the goal radius.
     goals.scatter_(1, cell_at(grid, goal_m)[:, None], True)
     if costs is None:
         costs = edge_costs(problem)
@@ -210,40 +226,41 @@ def search(problem: Problem, costs: Iterable[Tensor] | None = None) -> CostToGo:
     is_end = following == gridgraph.NO_CELL
     following = np.where(is_end, cells.numpy(), following)
     start = problem.start
-    to_go = torch.from_numpy(cost).to(start)
-    return CostToGo(to_go, torch.from_numpy(following).to(start.device))
+    costs_to_go = torch.from_numpy(cost).to(start)
+    return CostToGo(costs_to_go, torch.from_numpy(following).to(start.device))
 
 
-def framed(problem: Problem, field: CostToGo) -> Tensor:
-    """Return padded cost to go and padded costs per level metre, for `cost_at`.
+def pad_costs(problem: Problem, field: CostToGo) -> Tensor:
+    """Return padded maps of the cost to go and of the cost per level metre.
 
     Args:
         problem: B problems.
         field: cheapest paths of the problems.
 
     Returns:
-        Shape [B, 2, N], N = (H + 2)·(W + 2).
+        Maps for `cost_at`, shape [B, 2, N] with N = (H + 2)·(W + 2).
     """
     traversability = problem.traversability
     level = torch.zeros_like(traversability)
     per_m = problem.objective.path_cost(traversability, level)
     per_m = per_m + PENALTY * ~problem.free
     costs = torch.stack((field.cost, per_m.to(field.cost)), dim=1)
-    return problem.grid.pad(costs, outside=_OUTSIDE)
+    return problem.grid.pad(costs, outside=_OFF_MAP_COST)
 
 
 def cost_at(grid: Grid, costs: Tensor, x_m: Tensor, y_m: Tensor) -> Tensor:
     """Return the cost to go from any position.
 
-    A path leads straight from the position to the centre of its cell or of a neighbour,
-    and from that centre to the goal. The cost to go is the minimum over these centres.
-    A line costs half of each of the two cells' costs per metre, as an edge does. Hence
-    at a centre the cost is that of its cell (if grades cost nothing), and between
-    centres it has no jumps as large as a cell. In cells where paths end it is 0.
+    A path leads straight from the position to the centre of its cell or of a
+    neighbouring cell, and from that centre to the goal. The cost to go is the minimum
+    over these centres. As for an edge, the cost per metre of the straight line is the
+    mean of those of its first and its last cell. Hence the cost to go at a centre is
+    that of the cell (if grades cost nothing), and has no large jumps between centres.
+    In the goal region it is 0.
 
     Args:
         grid: grid of the maps.
-        costs: padded costs from `framed`, shape [B, 2, N].
+        costs: padded costs from `pad_costs`, shape [B, 2, N].
         x_m: x of the positions in metres, shape [B, J].
         y_m: y of the positions in metres, shape [B, J].
 
@@ -264,9 +281,9 @@ def cost_at(grid: Grid, costs: Tensor, x_m: Tensor, y_m: Tensor) -> Tensor:
     cost_per_m = {side: grid.lookup(per_m, *centre) for side, centre in centres.items()}
     for (up, right), (centre_x, centre_y) in centres.items():
         end_cost = cost_per_m[up, right]
-        # Two non-free cells that touch at a corner block the diagonal between them, see
-        # `edge_costs`. If they are the cell itself and its neighbour across an edge, an
-        # end of the line is not free.
+        # Two non-free cells that touch at a corner block the diagonal line between
+        # them, see `edge_costs`. For a line to a neighbour across an edge, these two
+        # cells are the ends of the line, which are not both free.
         min_corner_cost = torch.minimum(cost_per_m[up, 0.5], cost_per_m[0.5, right])
         max_end_cost = torch.maximum(own_cost, end_cost)
         squeezed = (min_corner_cost >= PENALTY) & (max_end_cost < PENALTY)
@@ -279,13 +296,13 @@ def cost_at(grid: Grid, costs: Tensor, x_m: Tensor, y_m: Tensor) -> Tensor:
 
 
 def cell_at(grid: Grid, state: Tensor) -> Tensor:
-    """Return flat indices of cells of states [*B, S] or positions, int64, shape [*B]."""
+    """Return flat indices of the cells at states or positions, int64, shape [*B]."""
     row, column = grid.cell_of(state[..., 0], state[..., 1])
     return row * grid.width + column
 
 
 def cell_centres(grid: Grid, cell: Tensor) -> Tensor:
-    """Return centres (x, y) in metres of cells, by flat index [*B], shape [*B, 2]."""
+    """Return centres (x, y) in metres of cells, from flat indices [*B], [*B, 2]."""
     row = cell // grid.width
     column = cell % grid.width
     return torch.stack(grid.centre_of(row, column), dim=-1)
@@ -300,8 +317,8 @@ def path_cells(field: CostToGo, cell: Tensor, count: int) -> Tensor:
         count: number of cells to return.
 
     Returns:
-        Flat indices that begin with the first cell and repeat the last one, int64,
-        shape [B, count].
+        Flat indices, int64, shape [B, count]. They begin with the first cell, and
+        repeat the last cell of a path.
     """
     cells = [cell[:, None]]
     for _ in range(count - 1):
@@ -311,9 +328,15 @@ def path_cells(field: CostToGo, cell: Tensor, count: int) -> Tensor:
 
 
 def cell_points(problem: Problem, field: CostToGo, cells: Tensor) -> Tensor:
-    """Return centres (x, y) of cells, or the goal where a path ends, shape [B, N, 2].
+    """Return centres of cells, or the goal where a path ends.
 
-    Cells are flat indices, [B, N].
+    Args:
+        problem: B problems.
+        field: cheapest paths.
+        cells: flat indices of cells, shape [B, N].
+
+    Returns:
+        Points (x, y) in metres, shape [B, N, 2].
     """
     ended = field.following.gather(1, cells) == cells
     centres = cell_centres(problem.grid, cells).to(problem.start)
@@ -330,8 +353,8 @@ def path_points(problem: Problem, field: CostToGo, state: Tensor, count: int) ->
         count: number of points to return.
 
     Returns:
-        (x, y) in metres of the robot, of the centre of each cell after its own, and of
-        the goal, repeated, shape [B, count, 2].
+        Points (x, y) in metres, shape [B, count, 2]: the robot, the centres of the next
+        cells, and the goal, which is repeated.
     """
     first_cell = cell_at(problem.grid, state)
     cells = path_cells(field, first_cell, count)

@@ -1,4 +1,4 @@
-"""A*+DWA: a global path over the map's cells, followed by the dynamic window approach.
+"""A*+DWA: DWA drives to waypoints on a global path over the map's cells.
 
 Source: paper IV-A1.
 """
@@ -22,7 +22,7 @@ class AStarDWAConfig(GuideConfig):
 
 
 class AStarDWA(Guided[DWAState]):
-    """A* provides waypoints to the dynamic window approach.
+    """Planner in which A* provides waypoints to the dynamic window approach (DWA).
 
     Args:
         config: settings.

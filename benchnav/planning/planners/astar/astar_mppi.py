@@ -1,7 +1,6 @@
-"""A*+MPPI: a global path over the map's cells, followed by MPPI.
+"""A*+MPPI: MPPI drives to waypoints on a global path over the map's cells.
 
-The paper runs MPPI without a global path. It also combines global and local planners,
-but not A* and MPPI.
+The paper runs MPPI only without a global path.
 """
 
 from dataclasses import dataclass, field
@@ -29,22 +28,22 @@ class AStarMPPIConfig(GuideConfig):
         expect(
             self.explore == 0 or self.mppi.cost_to_go == "objective",
             f"`explore` = 0 for A*+MPPI with `cost_to_go` {self.mppi.cost_to_go!r}, "
-            "which minimises costs to the goal "
-            f"and not to waypoints of A*, got {self.explore}.",
+            f"since MPPI then does not drive to waypoints of A*, got {self.explore}. "
+            "Set `explore` to 0, or `cost_to_go` to 'objective'.",
         )
 
 
 class AStarMPPI(Guided[MPPIState]):
-    """A* provides waypoints to model predictive path integral control.
+    """Planner in which A* provides waypoints to MPPI.
 
-    If `cost_to_go` is an option other than `objective`, MPPI minimises costs to the
-    goal, and A*'s path is used only in recovery.
+    If `cost_to_go` of MPPI is not `objective`, MPPI minimises costs to the goal, and
+    A*'s path is used only in recovery.
 
     Args:
         config: settings.
     """
 
-    steers = STEERS  # MPPI steers any robot, but the recovery only these.
+    steers = STEERS  # MPPI can steer any robot, but the recovery only these robots.
 
     def __init__(self, config: AStarMPPIConfig | None = None) -> None:
         """Store the settings."""

@@ -1,15 +1,18 @@
-"""The dynamic window approach (DWA): the best constant (v, ω) within reach.
+"""The dynamic window approach (DWA): the best constant (v, ω) that is reachable.
 
-The acceleration limits decide which velocities are within reach. Two parts are from Fox,
-Burgard and Thrun (1997), "The dynamic window approach to collision avoidance": the
-window, the velocity pairs that the robot can reach within one step, and the search for
-the pair with the best arc. A robot without limits reaches all pairs within its bounds.
-The scoring of arcs is ours: each pair is rolled out for the whole horizon through F
-under λ̂, and scored by J toward a waypoint and by its final heading. There are no
-admissible velocities by braking distance, and no terms for clearance and speed. A pair
-that enters non-free cells before it reaches the waypoint pays the penalty of each such
-step. DWA is therefore slow in narrow passages, and needs a recovery when it stalls.
-Letters in shapes: B episodes, M velocity pairs, T horizon steps, S state dimensions.
+The window consists of the velocity pairs (v, ω) that a robot can reach within one step,
+by its acceleration limits. DWA chooses the pair with the best arc. A robot without
+acceleration limits can reach all pairs within its bounds. Source: Fox, Burgard and
+Thrun (1997), "The dynamic window approach to collision avoidance".
+
+The cost of an arc differs from the source. Each pair is rolled out for the whole
+horizon through F under λ̂. Its cost is J toward a waypoint plus a cost of its final
+heading. Each step in a non-free cell before the waypoint has a penalty. Braking
+distance, clearance and speed are not considered. DWA is therefore slow in narrow
+passages, and needs a recovery when it stalls.
+
+Letters in shapes: B episodes, M velocity pairs, N cells of a padded map, T horizon
+steps, S state dimensions.
 """
 
 import math
@@ -40,25 +43,25 @@ from benchnav.planning.problem import (
 from benchnav.planning.robots import component_wise, steps_in
 from benchnav.planning.sensing.sensor import Step
 
-_CHUNK_STEPS = 10  # a chunk of the horizon that compiles in seconds
-_WORTH_COMPILING = 100  # minimum number of pairs
-_DRAW_EVERY = 5  # stride of a trajectory's drawn positions
+_CHUNK_STEPS = 10  # number of steps that are compiled together
+_MIN_COMPILED_PAIRS = 100  # minimum number of pairs for which rollouts are compiled
+_PLOT_STRIDE = 5  # number of steps between the positions of a trajectory in figures
 
 
 @dataclass(frozen=True, kw_only=True)
 class DWAConfig:
-    """Settings of DWA. The defaults are ours, since the paper states no values.
+    """Settings of DWA; the defaults are this project's, since the paper has no values.
 
     Args:
         speeds: number of linear velocities in the window.
         turn_rates: number of angular velocities in the window; an odd number includes
             straight driving.
-        horizon_s: duration of a pair in seconds, rounded to a number of steps T ≥ 1.
-        heading_weight: cost of a radian between the last heading and the direction of
-            the waypoint, as a fraction of the cost J of standing for the horizon. It
-            lets a robot turn in place, although a turn changes no distance.
-        arrival_m: distance to the waypoint in metres below which a trajectory adds no
-            further cost, so that a near waypoint does not slow the robot.
+        horizon_s: duration of a rollout in seconds, rounded to a number of steps T ≥ 1.
+        heading_weight: cost per radian between the final heading and the direction of
+            the waypoint, as a fraction of J of standing for the horizon. This cost
+            makes a robot turn in place, although a turn does not change the distance.
+        arrival_m: distance to the waypoint in metres within which a rollout has no
+            further costs, so that a near waypoint does not slow the robot.
     """
 
     speeds: int = 10
@@ -79,7 +82,7 @@ class DWAState(Batch):
     """Plan state of DWA.
 
     Args:
-        problem: the problem.
+        problem: problems of B episodes.
         velocity: current (v, ω) of the robots, shape [B, 2].
     """
 
@@ -100,29 +103,29 @@ class DWA(LocalPlanner[DWAState]):
         """Store the settings."""
         self.config = config or DWAConfig()
         pairs = self.config.speeds * self.config.turn_rates
-        # States, cost, under_way, pairs, padded_ground and target have an episode
-        # dimension.
+        # These arguments have an episode dimension: states, cost, under_way, pairs,
+        # padded_ground and target.
         batched = (0, 1, 2, 3, 4, 5)
-        self._rollout = Fused(rollout, pairs, _WORTH_COMPILING, batched=batched)
+        self._rollout = Fused(rollout, pairs, _MIN_COMPILED_PAIRS, batched=batched)
 
     @property
     def compiled(self) -> bool | None:
-        """Whether it runs compiled; None before the first step."""
+        """Whether rollouts run compiled; None before the first step."""
         return self._rollout.compiled
 
     def uses(self, task: Task) -> frozenset[str]:
-        """Return λ̂ and the input of free space; see `Planner`."""
+        """Return the names of λ̂ and of the input of free space; see `Planner`."""
         return frozenset({"risk_map", task.rules.free_space.source})
 
     def init(self, problem: Problem, generator: torch.Generator) -> DWAState:
-        """Return the plan state of standing robots; draws nothing. See `LocalPlanner`."""
+        """Return the plan state of standing robots; see `LocalPlanner`."""
         no_velocity = problem.start.new_zeros(len(problem), 2)
         return DWAState(problem, no_velocity)
 
     def plan_toward(
         self, step: Step, plan_state: DWAState, target_m: Tensor
     ) -> tuple[Tensor, DWAState, Plan]:
-        """Return the window's best pair; see `LocalPlanner`."""
+        """Return the pair of the window with the minimum cost; see `LocalPlanner`."""
         config = self.config
         problem = plan_state.problem
         state = step.state
@@ -134,9 +137,9 @@ class DWA(LocalPlanner[DWAState]):
         if step.draw:
             horizon = steps_in(config.horizon_s, problem.dt_s)
             actions = window.mT[:, None].expand(-1, horizon, -1, -1)
-            drawn = rollout_path(problem, state, actions)
-            path = drawn.take_along_dim(best[..., None], 1)[:, 0]
-            layers = {"path": path, "samples": drawn[:, :, ::_DRAW_EVERY]}
+            paths = rollout_path(problem, state, actions)
+            path = paths.take_along_dim(best[..., None], 1)[:, 0]
+            layers = {"path": path, "samples": paths[:, :, ::_PLOT_STRIDE]}
         plan = Plan.empty(len(problem), state.device, **layers)
         return action, plan_state, plan
 
@@ -156,7 +159,7 @@ def reachable(problem: Problem, velocity: Tensor) -> tuple[Tensor, Tensor]:
     """
     speed, turn_rate = velocity.unbind(1)
     rates = problem.robot.action_rates or (math.inf, math.inf)
-    # Floats, since a tensor of them would be copied to the device at every step.
+    # The limits are floats, since a tensor would be copied to the device at each step.
     max_change = rates[0] * problem.dt_s
     max_turn_change = rates[1] * problem.dt_s
     low = torch.stack((speed - max_change, turn_rate - max_turn_change), dim=1)
@@ -193,7 +196,7 @@ class Arcs(NamedTuple):
 
     Args:
         states: robot states, shape [B, M, S].
-        cost: cost so far, shape [B, M].
+        cost: cost of the previous steps, shape [B, M].
         under_way: mask of pairs that have not reached the target, bool, shape [B, M].
     """
 
@@ -211,15 +214,15 @@ def rollout(
     arrival_m: float,
     steps: int,
 ) -> Arcs:
-    """Roll out each pair for some steps, and add the costs of the pairs under way.
+    """Roll out each pair, and add the costs of pairs that have not reached the target.
 
     Args:
-        arcs: rollouts so far.
+        arcs: rollouts up to this step.
         pairs: pairs (v, ω), shape [B, M, 2].
-        padded_ground: padded maps of the problem, shape [B, N].
+        padded_ground: maps as in `Problem.padded_ground`, shape [B, N].
         target: waypoints (x, y) in metres, shape [B, 1, 2].
-        dynamics: dynamics of the problem.
-        arrival_m: distance in metres at which a pair has reached the target.
+        dynamics: grid, robot and objective.
+        arrival_m: distance in metres within which a pair has reached the target.
         steps: number of steps to roll out.
     """
     states, cost, under_way = arcs
@@ -244,7 +247,7 @@ def score(
     config: DWAConfig,
     advance: Callable[..., Arcs] = rollout,
 ) -> Tensor:
-    """Return the summed costs of the window's pairs.
+    """Return the costs of the window's pairs over the horizon.
 
     Args:
         problem: B problems.
@@ -252,7 +255,7 @@ def score(
         window: pairs (v, ω), shape [B, M, 2].
         target_m: waypoints (x, y) in metres, shape [B, 2].
         config: settings.
-        advance: `rollout`, or its compiled form.
+        advance: `rollout`, which may be compiled.
 
     Returns:
         Cost of each pair, shape [B, M].
@@ -272,7 +275,7 @@ def score(
         count = min(_CHUNK_STEPS, steps - first)
         arcs = advance(arcs, pairs, ground, target, dynamics, arrival_m, count)
     states, cost, under_way = arcs
-    # The unit of the heading's weight: J, without penalties, of robots that stand for
+    # The unit of the heading weight is J, without penalties, of a robot that stands for
     # the horizon.
     no_action = problem.start.new_zeros(len(problem), 2)
     standing = no_action.clamp(*problem.action_bounds)
@@ -280,9 +283,9 @@ def score(
     stage = problem.objective.stage(state, standing, traversability, target_m)
     terminal = problem.objective.terminal(state, traversability, target_m)
     unit = (steps * stage + terminal).abs()
-    # Angle from the last heading to the waypoint as seen from the robot's current
-    # position. It is not wrapped, since a robot that spins would otherwise score another
-    # full turn like stopping.
+    # The error is the angle from the final heading to the direction of the waypoint, as
+    # seen from the current position. It is not wrapped. Otherwise an additional full
+    # turn would have no cost.
     turned = states[..., 2] - begin[..., 2]
     heading_error = (turn_toward(begin, target) - turned).abs()
     weight = config.heading_weight * unit

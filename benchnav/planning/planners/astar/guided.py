@@ -1,9 +1,9 @@
 """A global path that provides waypoints to any local planner.
 
-A* returns the cheapest path from the robot's position, and the local planner drives to a
-waypoint on it. A robot that stalls under its local planner is steered along the path.
-Source: paper IV-A1, after Fan et al. (2021), "STEP". Letters in shapes: B episodes, A
-action dimensions.
+A* returns the cheapest path from the robot's position, and the local planner drives to
+a waypoint on this path. If the robot stalls, it is steered along the path instead
+(module `recovery`). Source: paper IV-A1, after Fan et al. (2021), "STEP". Letters in
+shapes: B episodes, A action dimensions.
 """
 
 from dataclasses import dataclass, replace
@@ -35,7 +35,7 @@ class GuideConfig:
 
     Args:
         lookahead_m: maximum distance along the path to the waypoint, in metres.
-        explore: optimism about uncertain terrain, as a multiple of the spread of λ; see
+        explore: multiple of the spread of λ that is added to λ̂ in path costs, ≥ 0; see
             `optimistic`.
     """
 
@@ -45,7 +45,7 @@ class GuideConfig:
     explore: float = 0.0
 
     def __post_init__(self) -> None:
-        """Validate the look-ahead and the optimism."""
+        """Validate the settings."""
         check_finite("A*", self, ("lookahead_m",), ("explore",))
 
 
@@ -54,13 +54,13 @@ class GuidedState(Batch, Generic[Local]):
     """Plan state of a guided planner.
 
     Args:
-        problem: the problem, with the λ̂ that path costs use.
-        edge_costs: costs of moving between neighbouring cells, float64, shape [B, E];
-            see `astar.edge_costs`.
+        problem: problems of B episodes, with the λ̂ that path costs use.
+        edge_costs: costs of the E edges between neighbouring cells, float64, shape
+            [B, E]; see `astar.edge_costs`.
         field: cheapest paths to the goal.
         ground: costs per metre in each cell.
         local: the local planner's plan state.
-        recovery: recovery of robots that stall.
+        recovery: standing times of the robots, and recoveries in progress.
     """
 
     problem: Problem
@@ -90,10 +90,7 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
         return self.local.compiled
 
     def uses(self, task: Task) -> frozenset[str]:
-        """Return the inputs of the local planner, of free space and of path costs.
-
-        See `Planner`.
-        """
+        """Return the inputs that the local planner, free space and path costs need."""
         inputs = self.local.uses(task) | {task.rules.free_space.source}
         if self._cost_uses_map(task):
             inputs |= {"risk_map"}
@@ -103,7 +100,7 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
 
     @staticmethod
     def _cost_uses_map(task: Task) -> bool:
-        """Return whether the cost of a path depends on λ̂, on level terrain or slopes."""
+        """Return whether the objective's cost of a path depends on λ̂."""
         min_traversability = task.rules.min_traversability
         traversability = torch.linspace(min_traversability, 1.0, 9).expand(3, 9)
         grade = torch.tensor([-0.3, 0.0, 0.3])[:, None].expand(3, 9)
@@ -112,7 +109,7 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
         return bool(differs.any())
 
     def follows(self, task: Task) -> str:
-        """Return what A* and the local planner minimise instead of J; see `Planner`."""
+        """Return the costs that A* and the local planner minimise instead of J."""
         objective = task.objective
         local_aim = self.local.follows(task)
         name = self.local.name
@@ -127,20 +124,20 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
         objective = task.objective
         if not has_path_cost(objective):
             remarks.append(
-                f"A* returns the shortest path: {type(objective).__name__} has no "
+                f"A* returns the shortest path, since {type(objective).__name__} has no "
                 "`path_cost`"
             )
         if not self._cost_uses_map(task) and task.rules.free_space.by == "mean":
             remarks.append(
-                "A* finds the same path under every risk setting, since its cost does "
-                "not use λ̂ and the mean decides which cells are free; "
-                f"the risk setting affects only {self.local.name} (under objective "
-                "travel_time it also affects the path)"
+                "A* finds the same path under every risk setting, since path costs do "
+                "not depend on λ̂, and free cells are derived from the mean; "
+                f"the risk setting affects only {self.local.name} (with objective "
+                "travel_time, it also affects the path)"
             )
         return tuple(remarks)
 
     def init(self, problem: Problem, generator: torch.Generator) -> GuidedState[Local]:
-        """Return the plan state after a search of the maps; see `Planner`."""
+        """Return the plan state with the cheapest paths; see `Planner`."""
         local = self.local.init(self._local_problem(problem), generator)
         recovery = Recovery.none(problem.start)
         problem = optimistic(problem, self.config.explore)
@@ -157,7 +154,7 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
         field = plan_state.field
         state = step.state
         lookahead_m = self.config.lookahead_m
-        # The robot, and as many points as can lie within the look-ahead.
+        # The robot, and as many points as can lie within the look-ahead distance.
         count = 2 + int(lookahead_m / problem.grid.resolution_m)
         points = astar.path_points(problem, field, state, count)
         target, straight = choose_waypoint(plan_state.ground, points, lookahead_m)
@@ -169,7 +166,7 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
         steered = steer_toward(state, recovery.target_m, problem.robot)
         action = torch.where(recovery.active[:, None], steered, action)
         if step.draw:
-            # Long enough for a path that crosses the map twice; longer ones are cut.
+            # Longer paths than this, which crosses the map twice, are truncated.
             max_points = 2 * (problem.grid.height + problem.grid.width)
             reference = astar.path_points(problem, field, state, max_points)
             plan = replace(plan, reference=reference)
@@ -179,9 +176,9 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
     def revise(
         self, plan_state: GuidedState[Local], problem: Problem
     ) -> GuidedState[Local]:
-        """Return the plan state after a search of changed maps; see `Planner`.
+        """Return the plan state with cheapest paths on the new maps; see `Planner`.
 
-        The local planner's motion is kept.
+        Maps that have not changed are not searched again.
         """
         local = self.local.revise(plan_state.local, self._local_problem(problem))
         before = plan_state.problem
@@ -210,13 +207,14 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
         self, plan_state: GuidedState[Local], members: Tensor
     ) -> GuidedState[Local]:
         """Return the plan state of some episodes; see `Planner`."""
-        # Only the local planner knows which of its tensors have an episode dimension.
+        # The local plan state is selected by the local planner, since only that planner
+        # knows which of its tensors have an episode dimension.
         shared: GuidedState[Any] = replace(plan_state, local=None)  # type: ignore[arg-type]
         local = self.local.select(plan_state.local, members)
         return replace(shared.select(members), local=local)
 
     def _local_problem(self, problem: Problem) -> Problem:
-        """Return the local planner's problem: J to the goal, or to the next waypoint."""
+        """Return the local planner's problem, with J to the goal or to waypoints."""
         if self.local.seeks_goal:
             return problem
         objective = toward_waypoints(problem.objective)
@@ -225,12 +223,12 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
 
 
 def optimistic(problem: Problem, explore: float) -> Problem:
-    """Return the problem with λ̂ raised, up to 1, by a multiple of its spread.
+    """Return the problem with λ̂ raised, up to 1, by a multiple of the spread of λ.
 
-    Paths through uncertain terrain then become cheaper. A robot observes the terrain
-    before it drives there and can still turn away. The bonus applies at any distance.
-    Under a belief that learns, sensed terrain and terrain correlated with it have hardly
-    any spread left. Under a belief that does not learn, the spread stays during the
+    Paths through uncertain terrain then become cheaper, at any distance from the robot.
+    The robot observes such terrain before it drives there, and can still turn away. If
+    the belief learns, sensed terrain and terrain that is correlated with it have only a
+    small spread. If the belief does not learn, the spread stays the same during the
     episode, and the bonus only favours risk. The free mask does not change.
 
     Args:

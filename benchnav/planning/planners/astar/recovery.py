@@ -1,7 +1,7 @@
 """Recovery of robots that stall under a local planner.
 
-A robot that its planner has not moved for a second is steered along the path, cell by
-cell, until it has left its position. A robot that drives but is slowed by the terrain
+A robot that its planner has not driven for a second is steered along the path, cell by
+cell, until it has left its position. A robot that is driven, but slowed by the terrain,
 continues with its planner. Recovery is not part of the paper. Letters in shapes: B
 episodes, S state and A action dimensions.
 """
@@ -23,12 +23,12 @@ from benchnav.planning.planners.astar.astar import (
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Robot
 
-# A recovery begins if a robot has moved less than `_STANDING_M` in `_PATIENCE_S`, at a
-# commanded speed below the fraction `_IDLE` of its top speed.
+# A recovery begins if a robot has moved less than `_STANDING_M` in `_PATIENCE_S`, and
+# its mean commanded speed in that time was below the fraction `_IDLE` of its top speed.
 _STANDING_M = 0.05
 _PATIENCE_S = 1.0
 _IDLE = 0.2
-# A point of the path is reached within this fraction of a cell's width.
+# A robot has reached a point of the path within this fraction of a cell's width.
 _REACHED = 0.1
 # A recovery ends if the robot has moved `_LEFT_M`, or after `_RECOVERY_S`.
 _LEFT_M = 0.5
@@ -40,12 +40,14 @@ class Recovery(Batch):
     """Standing times of robots, and the recoveries in progress.
 
     Args:
-        anchor_m: position (x, y) in metres that a robot has not left, shape [B, 2].
-        steps: number of steps at that position, int64, shape [B].
+        anchor_m: position (x, y) in metres that the robot has not left since, shape
+            [B, 2].
+        steps: number of steps since then, int64, shape [B].
         driven_m: commanded distance in these steps in metres, shape [B].
         active: mask of robots in recovery, bool, shape [B].
         target_m: target (x, y) of the recovery in metres, shape [B, 2].
-        cell: flat index of the path's cell at or after the target, int64, shape [B].
+        cell: flat index of the cell to whose centre the robot drives, int64, shape [B];
+            the target is this centre, or a point of the cell's border before it.
     """
 
     anchor_m: Tensor
@@ -57,7 +59,7 @@ class Recovery(Batch):
 
     @classmethod
     def none(cls, state: Tensor) -> "Recovery":
-        """Return the state of robots, shape [B, S], before the first step."""
+        """Return the recovery state before the first step, for robot states [B, S]."""
         zero_m = torch.zeros_like(state[:, 0])
         zero = zero_m.long()
         nowhere = torch.full_like(state[:, :2], torch.inf)
@@ -65,12 +67,13 @@ class Recovery(Batch):
 
 
 def watch(recovery: Recovery, state: Tensor, action: Tensor, robot: Robot) -> Recovery:
-    """Return the recovery state with recoveries started and ended.
+    """Return the recovery state in which recoveries have begun or ended.
 
     Args:
-        recovery: state up to the last step.
+        recovery: recovery state after the last step.
         state: current robot states, shape [B, S].
-        action: next actions of the local planner, the speed first, shape [B, A].
+        action: next actions of the local planner, whose first dimension is the speed,
+            shape [B, A].
         robot: robot with its time step and top speed.
     """
     limit_m = torch.where(recovery.active, _LEFT_M, _STANDING_M)
@@ -99,15 +102,17 @@ def aim(
     state: Tensor,
     straight: Tensor,
 ) -> Recovery:
-    """Return the recovery state with targets along the path, from cell centre to centre.
+    """Return the recovery state with the next targets along the path.
 
-    If the line to the next cell crosses more expensive terrain, the first target is the
-    middle of the edge, or the corner, that both cells share. A robot keeps its target
-    until it is there.
+    A recovery leads from cell centre to cell centre. Its first target is the centre of
+    the next cell. If the line to this centre crosses more expensive terrain, the first
+    target is the gate: the middle of the edge, or the corner, that the robot's cell and
+    the next cell share. A robot keeps its target until it has reached it.
 
     Args:
         recovery: state from `watch`, with the targets of the last step.
-        begun: mask of robots whose recovery began earlier, bool, shape [B].
+        begun: mask of robots that were already in recovery in the last step, bool,
+            shape [B].
         problem: B problems.
         field: cheapest paths to the goal.
         state: current robot states, shape [B, S].
@@ -116,7 +121,7 @@ def aim(
     """
     grid = problem.grid
     arrived = distance(state, recovery.target_m) < _REACHED * grid.resolution_m
-    # A robot at a centre drives to the next one, and a robot at a gate to its cell's.
+    # From a centre, a robot drives to the next centre; from a gate, to `recovery.cell`.
     cells = path_cells(field, recovery.cell, 2)
     points = cell_points(problem, field, cells)
     was_centre = (recovery.target_m == points[:, 0]).all(dim=1)

@@ -1,10 +1,10 @@
 """Waypoints of local planners, chosen on A*'s path.
 
-The waypoint is the farthest point of the path, within the look-ahead, to which a
-straight line costs at most 1.1 times the path under A*'s own costs. Both costs are
-integrated exactly over the cells that the line and the path cross, so no corner between
-two sampled points is missed.
-Letters in shapes: B episodes, J lines, N points, H×W cells.
+The waypoint is the farthest point of the path, within the look-ahead distance, to which
+a straight line costs at most 1.1 times as much as the path, by A*'s costs. The costs of
+lines and paths are integrated exactly over the cells that they cross, so that even a
+short crossing of a cell's corner is counted. Letters in shapes: B episodes, J lines, N
+points, H×W cells.
 """
 
 import math
@@ -20,18 +20,18 @@ from benchnav.planning.free_space import PENALTY
 from benchnav.planning.planners.astar.astar import cell_at, cell_centres
 from benchnav.planning.problem import Problem
 
-_SHORT_CUT = 1.1  # maximum cost of a straight line relative to the path
+_MAX_COST_RATIO = 1.1  # maximum cost of a straight line, relative to that of the path
 
 
 @dataclass(frozen=True)
 class GroundCosts(Batch):
-    """Costs of a metre of straight line in each cell; maps are padded by `Grid.pad`.
+    """Costs per metre of straight line in each cell, on maps padded by `Grid.pad`.
 
-    A metre costs path_cost(λ̂, gradient · direction) + penalty_per_m.
+    The cost per metre is path_cost(λ̂, gradient · direction) + penalty_per_m.
 
     Args:
         grid: size and resolution of the maps.
-        path_cost: function of λ̂ and grade that returns the cost of a metre.
+        path_cost: function of λ̂ and grade that returns the cost per metre.
         traversability: λ̂, shape [B, (H + 2)·(W + 2)].
         penalty_per_m: penalty of non-free cells, shape [B, (H + 2)·(W + 2)].
         rise_x: rise per metre along x, shape [B, (H + 2)·(W + 2)].
@@ -47,7 +47,7 @@ class GroundCosts(Batch):
 
 
 def ground_costs(problem: Problem) -> GroundCosts:
-    """Return A*'s costs per metre, for B problems."""
+    """Return A*'s costs per metre on the maps of B problems."""
     grid = problem.grid
     elevation_m = problem.elevation_m
     gradient = torch.gradient(elevation_m, spacing=grid.resolution_m, dim=(1, 2))
@@ -72,8 +72,8 @@ def line_costs(
         ground: costs per metre.
         start_m: starts (x, y) of the lines in metres, shape [B, J, 2].
         end_m: ends (x, y) of the lines in metres, shape [B, J, 2].
-        crossings: maximum number of columns, and of rows, that a line enters after its
-            first.
+        crossings: maximum number of columns that a line enters after its first column,
+            and of rows that it enters after its first row.
 
     Returns:
         Cost, shape [B, J].
@@ -99,46 +99,47 @@ def line_costs(
 def choose_waypoint(
     ground: GroundCosts, points_m: Tensor, lookahead_m: float
 ) -> tuple[Tensor, Tensor]:
-    """Return the waypoint of each path: its farthest point that a line should lead to.
+    """Return the waypoint of each path: its farthest point with a cheap straight line.
 
-    A line should lead to a point if it costs at most 1.1 times the path to that point.
+    A straight line from the robot to a point of its path is cheap if it costs at most
+    1.1 times as much as the path to that point.
 
     Args:
         ground: A*'s costs per metre.
-        points_m: the robot, the centres of the next cells of its path, and the goal,
-            (x, y) in metres, shape [B, N, 2].
-        lookahead_m: look-ahead along the path in metres.
+        points_m: points (x, y) in metres, shape [B, N, 2]: the robot, the centres of
+            the next cells of its path, and the goal.
+        lookahead_m: maximum distance along the path to the waypoint in metres.
 
     Returns:
-        Waypoints (x, y) in metres, the path's next point if no line is cheap enough,
-        shape [B, 2]; and a mask of episodes in which the line to that next point is
-        cheap enough, bool, shape [B].
+        Waypoints (x, y) in metres, shape [B, 2], which are the path's next point if no
+        line is cheap; and a mask of episodes in which the line to that next point is
+        cheap, bool, shape [B].
     """
     grid = ground.grid
     robot = points_m[:, :1]
     ahead = points_m[:, 1:]
     next_point = ahead[:, :1]
     count = ahead.shape[1]
-    # The gate is the edge or corner that the robot's cell shares with the next cell. It
-    # is half-way between their centres.
+    # The gate is the middle of the edge, or the corner, that the robot's cell shares
+    # with the next cell. It is half-way between their centres.
     centre = cell_centres(grid, cell_at(grid, robot)).to(robot)
     gate = 0.5 * (centre + next_point)
-    # Straight lines to each point, the path's legs, and the first leg through the gate.
+    # Lines from the robot to each point, between successive points of the path, and
+    # from the robot to the next point through the gate.
     begin = torch.cat((robot.expand_as(ahead), ahead[:, :-1], robot, gate), dim=1)
     end = torch.cat((ahead, ahead[:, 1:], gate, next_point), dim=1)
-    # Maximum number of columns or rows that a line within the look-ahead enters.
+    # Maximum number of columns or rows that a line of the look-ahead distance enters.
     crossings = math.ceil(lookahead_m / grid.resolution_m) + 1
     costs = line_costs(ground, begin, end, crossings)
     line_cost, leg_cost, gate_cost = costs.split((count, count - 1, 2), dim=1)
-    # The line to a neighbour across a corner may cut a cell that the path does not
-    # touch.
+    # The line to a diagonal neighbour may cross a cell that the path does not touch.
     gate_cost = gate_cost.sum(dim=1, keepdim=True)
     first_cost = torch.minimum(line_cost[:, :1], gate_cost)
     path_cost = torch.cat((first_cost, leg_cost), dim=1).cumsum(dim=1)
     leg_m = torch.linalg.vector_norm(points_m.diff(dim=1), dim=2)
     in_range = leg_m.cumsum(dim=1) <= lookahead_m
     rank = torch.arange(count, device=ahead.device)
-    is_cheap = line_cost <= _SHORT_CUT * path_cost
+    is_cheap = line_cost <= _MAX_COST_RATIO * path_cost
     farthest = torch.where(is_cheap & in_range, rank, 0).amax(dim=1)
     waypoint = ahead.take_along_dim(farthest[:, None, None], 1)[:, 0]
     return waypoint, is_cheap[:, 0]
@@ -147,9 +148,10 @@ def choose_waypoint(
 def _grid_cuts(
     start_m: Tensor, offset_m: Tensor, resolution_m: float, crossings: int
 ) -> Tensor:
-    """Return sorted fractions of lines at which they begin, cross grid lines, and end.
+    """Return fractions of each line at which it begins, crosses grid lines and ends.
 
-    Shape [B, J, 2·crossings + 2].
+    Returns:
+        Fractions in [0, 1], sorted, shape [B, J, 2·crossings + 2].
     """
     count = torch.arange(crossings, device=start_m.device) + 1
     begin = start_m[..., None]
@@ -157,7 +159,8 @@ def _grid_cuts(
     low = torch.minimum(begin, begin + along)
     crossed = ((low / resolution_m).floor() + count) * resolution_m
     fractions = (crossed - begin) / along
-    # Along an axis no grid line of that axis is crossed: the fraction is NaN or infinite.
+    # A line parallel to grid lines does not cross them: the fraction is NaN or
+    # infinite.
     fractions = fractions.nan_to_num(1.0, 1.0, 1.0)
     fractions = fractions.clamp(0, 1).flatten(2)
     first = torch.zeros_like(fractions[..., :1])

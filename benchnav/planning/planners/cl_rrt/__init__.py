@@ -1,1 +1,1 @@
-"""Closed-loop rapidly-exploring random trees."""
+"""Closed-loop rapidly-exploring random trees (CL-RRT)."""

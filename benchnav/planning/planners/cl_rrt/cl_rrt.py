@@ -1,15 +1,16 @@
 """Closed-loop rapidly-exploring random trees (CL-RRT).
 
-A tree grows by simulations of the robot with its controller. A node is chosen for a
-sampled point, and a Dubins reference is drawn from the node to the point. The closed
-loop of pure pursuit and a PID on speed (`pursuit`) follows the reference through F with
-predicted traversability. An edge is kept as far as it is free of collision. The robot
-then runs the same controller on the same references. The best path has the minimum
-simulated time; J is not used. Source: Kuwata et al. (2009), "Real-time motion planning
-with applications to autonomous urban driving"; paper IV-A2.
+A tree grows by simulations of the robot with its controller. For a sampled point, a
+node of the tree is chosen, and a Dubins path leads from the node to the point: the
+reference. The controller, pure pursuit and a PID on speed (`pursuit`), follows the
+reference through F with predicted traversability. The simulated motion is an edge,
+which is kept up to a collision. The robot later runs the same controller on the same
+references. The best path has the minimum simulated time; J is not used. Source: Kuwata
+et al. (2009), "Real-time motion planning with applications to autonomous urban
+driving"; paper IV-A2.
 
-See also `tree`, whose `search` makes one plan, and `edges`, which simulates. This module
-is the execution loop of the source, algorithm 2: when to plan, and from which state.
+`tree.search` computes one plan, and `edges` simulates. This module is the execution
+loop of the source, algorithm 2, which decides when to plan, and from which state.
 
 - The source grows one tree all the time, simulates its best path again from the latest
   state, and stops if no path is safe. Here a tree is grown only when a plan is due (at
@@ -17,34 +18,36 @@ is the execution loop of the source, algorithm 2: when to plan, and from which s
   then discarded. A node need not be a state at which the robot can stop safely.
 - References are Dubins paths; the source draws straight lines and uses Dubins lengths
   only in its heuristics.
-- λ̂ may decrease along a path to the goal. If the remaining path then costs over a tenth
-  more than on the map on which it was chosen, a new tree is grown, and the cheaper of
-  both paths is driven. Both costs are times along the predicted positions under the new
-  λ̂. Without a new path the next steps try again, up to `most_failures` times. A partial
-  path is left at once. Hence a constant map costs no tree, and a slowly changing map
-  only a few.
-- Sampled points have no heading, so references are the shortest paths to a point with
-  free heading: the minimum of the Dubins length over all end headings. No random
-  heading causes a detour.
+- λ̂ may decrease along a path to the goal. If the remaining path then costs over a
+tenth
+  more than on the map on which it was chosen, the path is doubted: a new tree is grown,
+  and the robot drives the cheaper of the old and the new path. Both costs are times
+  along the predicted positions under the new λ̂. If no new path is found, the next
+  steps try again, up to `most_failures` times. A partial path is left at once. Hence a
+  constant map needs no further tree, and a slowly changing map only a few.
+- Sampled points have no heading, so a reference is the shortest path to a point with
+any
+  final heading. Hence no random heading causes a detour.
 - After a plan without a path to the goal, the robot follows the best partial path. The
   next steps plan again. Each plan halves the radius of the references, down to the
-  robot's tightest turn or the spacing of their points. At full radius a robot that faces
-  non-free cells may have no path, and a robot that can slow down can turn tighter. After
-  `most_failures` such plans a partial path is driven until slightly before its end.
-  There is no further plan from non-free cells, because a robot that slid into a wall
-  could leave it on the other side.
-- If `most_failures` consecutive plans found no partial path either, the next ones may
-  cross: their edges continue over non-free cells, with a penalty per metre, and the
-  cheapest path is driven as a partial one. Until then the tree stays in free cells, so
-  that a free path is used if one is found. After the crossing the robot searches for a
-  free path again. The planner never gives up.
-- Edges are added in rounds: all samples of a round, of all episodes, are simulated at
+  robot's tightest turn or the spacing of their points. With the full radius, a robot
+  that faces non-free cells may have no path, whereas at a lower speed it can turn more
+  tightly. After `most_failures` such plans, the partial path is driven until slightly
+  before its end. A robot in a non-free cell does not plan again, because a robot that
+  slid into a wall could leave the wall on the other side.
+- If `most_failures` consecutive plans found no partial path either, the edges of the
+  next plans may cross non-free cells, with a penalty per metre, and the cheapest path
+  is driven as a partial path. Until then the tree stays in free cells, so that a free
+  path is used if one is found. After the crossing, the robot searches for a free path
+  again. The planner never gives up.
+- Edges are added in rounds: all edges of a round, in all episodes, are simulated at
   once. Samples are a pure function of the plan state's seed and step, and the same for
   all episodes of a batch.
-- A path has at most one edge per round, so that a plan reaches as far as `rounds` edges
-  (100 m by default); a goal farther away is approached along partial paths.
+- A path has at most one edge per round, so its maximum length is that of `rounds` edges
+  (100 m by default). A goal farther away is approached along partial paths.
 
-Letters in shapes: B episodes, M of which plan, D edges of a path, R edges of a round.
+Letters in shapes: B episodes, M episodes that plan, D edges of a path, K segments of a
+path, N cells of a padded map, R edges of a round, S state dimensions.
 """
 
 import math
@@ -73,9 +76,8 @@ from benchnav.planning.problem import Problem, Task, motion_traversability
 from benchnav.planning.robots import SPEED, TURN_RATE
 from benchnav.planning.sensing.sensor import Step
 
-_STALL_M = 0.25  # minimum progress within `stall_s`
-# Minimum relative increase in the cost of the remaining path for a comparison with a new
-# path.
+_STALL_M = 0.25  # minimum progress within `stall_s`, in metres
+# Minimum relative increase in the cost of the remaining path by which it is doubted.
 _RISE = 0.1
 
 
@@ -84,22 +86,23 @@ class CLRRTState(Batch):
     """Plan state of CL-RRT.
 
     Args:
-        problem: the problem.
-        route: route that the robots follow.
-        edge: index of the current edge of the path, int64, shape [B].
+        problem: problems of B episodes.
+        route: routes that the robots follow.
+        edge: index of the current edge of each path, int64, shape [B].
         tracking: state of the controller.
-        progress_m: arc length along the reference of that edge in metres, shape [B].
+        progress_m: arc length along the reference of the current edge in metres, shape
+            [B].
         failures: number of consecutive plans without a path to the goal, int64, shape
             [B].
-        mark_m: progress along the path in metres when the robot last had progress of
-            `_STALL_M`, shape [B].
-        mark_step: step at that progress, int64, shape [B].
+        mark_m: distance along the path in metres at which the robot last had advanced
+            by `_STALL_M`, shape [B].
+        mark_step: step at which the robot was there, int64, shape [B].
         ground: `Problem.padded_ground` when the path was chosen, shape [B, N].
         doubted: mask of paths that have become more expensive and must be compared with
-            new ones, bool, shape [B].
+            new paths, bool, shape [B].
         follower: the controller.
         seed: seed of the samples.
-        step: number of steps planned so far.
+        step: number of planned steps.
     """
 
     problem: Problem
@@ -131,11 +134,11 @@ class CLRRT(Planner[CLRRTState]):
         self.config = config or CLRRTConfig()
 
     def uses(self, task: Task) -> frozenset[str]:
-        """Return λ̂ and the input of free space; see `Planner`."""
+        """Return the names of λ̂ and of the input of free space; see `Planner`."""
         return frozenset({"risk_map", task.rules.free_space.source})
 
     def follows(self, task: Task) -> str:
-        """Return what the tree minimises instead of J; see `Planner`."""
+        """Return the cost that the tree minimises instead of J; see `Planner`."""
         if isinstance(task.objective, TravelTime):
             return ""
         return "simulated time to the goal"
@@ -163,8 +166,8 @@ class CLRRT(Planner[CLRRTState]):
         """Return a plan state without a path, so that the first step plans.
 
         Raises:
-            ConfigError: If the robot cannot follow references, or cannot turn as tightly
-                as `turning_radius_m`.
+            ConfigError: If the robot cannot follow references, or cannot turn as
+                tightly as `turning_radius_m`.
         """
         config = self.config
         check_steers(self, problem.robot, "cl_rrt")
@@ -197,7 +200,7 @@ class CLRRT(Planner[CLRRTState]):
     def plan(
         self, step: Step, plan_state: CLRRTState
     ) -> tuple[Tensor, CLRRTState, Plan]:
-        """Return actions along the path, after a new plan if one is due; see `Planner`."""
+        """Return actions along the path, with new plans where necessary."""
         problem = plan_state.problem
         state = step.state
         now = self._follow(state, plan_state)
@@ -215,7 +218,7 @@ class CLRRT(Planner[CLRRTState]):
         route = now.route
         follower = now.follower
         reference = _reference(route, now.edge)
-        # Only the progress along references that begin in this step is still 0.
+        # A progress of 0 means that the reference begins in this step.
         progress = now.progress_m
         advanced = follower.advance(reference, state, progress)
         progress = torch.where(progress > 0, progress, advanced)
@@ -236,10 +239,10 @@ class CLRRT(Planner[CLRRTState]):
         return plan_state.select(members)
 
     def revise(self, plan_state: CLRRTState, problem: Problem) -> CLRRTState:
-        """Return the plan state under another λ̂; see `Planner`.
+        """Return the plan state under an updated λ̂; see `Planner`.
 
-        Paths of unchanged cost are kept, more expensive paths to the goal are doubted,
-        and paths that are no longer free are left.
+        A path that is no longer free, or a partial path that has become more expensive,
+        is left. A path to the goal that has become more expensive is doubted.
         """
         route = plan_state.route
         points, length_m = self._ahead(route, problem, problem.start)
@@ -262,10 +265,10 @@ class CLRRT(Planner[CLRRTState]):
     def _ahead(
         self, route: Route, problem: Problem, state: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return the segments of paths ahead of robots; those behind have length 0.
+        """Return the segments of paths; those behind the robots have length 0.
 
         Returns:
-            Midpoints and lengths of all segments, as returned by `Route.segments`.
+            Midpoints and lengths of all segments, as `Route.segments` returns them.
         """
         points, length_m = route.segments(0.5 * problem.grid.resolution_m)
         distance_m = distance(points, state[:, None, :2])
@@ -275,7 +278,7 @@ class CLRRT(Planner[CLRRTState]):
         return points, torch.where(index >= nearest, length_m, 0)
 
     def _cost(self, now: CLRRTState, ground: Tensor, length_m: Tensor) -> Tensor:
-        """Return costs of paths in seconds, by the rule for edges of a tree, shape [B].
+        """Return the costs of paths in seconds, as for edges of a tree, shape [B].
 
         Args:
             now: plan state with the robot and its follower.
@@ -297,7 +300,7 @@ class CLRRT(Planner[CLRRTState]):
         return self._cost(now, ground, length_m)
 
     def _follow(self, state: Tensor, now: CLRRTState) -> CLRRTState:
-        """Advance the progress to the robots' states, and to the next edge at an end."""
+        """Return the plan state with the robots' progress; at an end, the next edge."""
         route = now.route
         reference = _reference(route, now.edge)
         progress = now.follower.advance(reference, state, now.progress_m)
@@ -309,7 +312,7 @@ class CLRRT(Planner[CLRRTState]):
         progress = torch.where(done, 0, progress)
         along_m = edge * self.config.step_m + progress
         passed = along_m >= now.mark_m + _STALL_M
-        # A robot that crosses non-free cells searches for a free path after it.
+        # After a robot has crossed non-free cells, it searches for a free path.
         astray = (route.depth > 0) & ~now.problem.free_at(state)
         return replace(
             now,
@@ -323,7 +326,7 @@ class CLRRT(Planner[CLRRTState]):
     def _off_route(self, state: Tensor, now: CLRRTState) -> Tensor:
         """Return a mask of robots that need a plan, bool, shape [B].
 
-        They are at the end of the path, too far from it, or stalled.
+        Such a robot is at the end of its path, too far from the path, or stalled.
         """
         config = self.config
         offset = now.route.path - state[:, None, :2]
@@ -338,16 +341,17 @@ class CLRRT(Planner[CLRRTState]):
     def _replan(
         self, state: Tensor, now: CLRRTState, due: Tensor, lost: Tensor
     ) -> CLRRTState:
-        """Plan for the episodes that are due, and return the next plan state.
+        """Return the plan state after new plans for some episodes.
 
-        Robots off their route follow the new path. The others change to it only if it
-        leads to the goal and, if the path is doubted, only if it is also cheaper.
+        A robot that needs a plan follows the new path. Another robot changes to the new
+        path only if it leads to the goal; if its old path is doubted, the new path must
+        also be cheaper.
 
         Args:
             state: states of all robots, shape [B, S].
             now: plan state.
             due: indices of the episodes to plan for, int64, shape [M].
-            lost: mask of due episodes that are off their route, bool, shape [M].
+            lost: mask of robots that need a plan (`_off_route`), bool, shape [M].
         """
         most_failures = self.config.most_failures
         used_up = lost & (now.route.depth[due] > 0)
@@ -366,7 +370,7 @@ class CLRRT(Planner[CLRRTState]):
         changes = lost | (reaches_goal & better)
         taken = changes.nonzero()[:, 0]
         members = due[taken]
-        # After the last attempt a doubted path is kept as it is.
+        # After the last attempt, a doubted path is kept and no longer doubted.
         stays = compared & (failures >= most_failures)
         failures = torch.where(stays, 0, failures)
         ground = now.problem.padded_ground[due]
@@ -386,7 +390,7 @@ class CLRRT(Planner[CLRRTState]):
     def _search(
         self, root: Tensor, now: CLRRTState, members: Tensor, failures: Tensor
     ) -> Route:
-        """Return the best paths of trees grown from root states [M, S]."""
+        """Return the best routes of trees whose roots are states [M, S]."""
         config = self.config
         problem = now.problem
         if len(members) < len(problem):
@@ -406,7 +410,7 @@ class CLRRT(Planner[CLRRTState]):
     def _closed_loop(
         self, problem: Problem, follower: PathFollower, failures: Tensor
     ) -> ClosedLoop:
-        """Return the closed loop of trees after a number of failed plans, int64 [B]."""
+        """Return the closed loop of trees, given numbers of failed plans, int64 [B]."""
         config = self.config
         full_m = config.turning_radius_m
         min_m = max(follower.tightest_m, min(full_m, SPACING_M))
@@ -423,7 +427,7 @@ class CLRRT(Planner[CLRRTState]):
 
 
 def _reference(route: Route, edge: Tensor) -> Reference:
-    """Return the reference of an edge of each path, from indices [B]."""
+    """Return the reference of an edge of each path, from indices of edges [B]."""
     n_paths, depth, count, _ = route.rows.shape
     first = torch.arange(n_paths, device=edge.device) * depth
     row = first + edge.clamp(max=depth - 1)

@@ -9,23 +9,24 @@ from benchnav.planning.planners.planner import check_finite
 
 @dataclass(frozen=True, kw_only=True)
 class CLRRTConfig:
-    """Settings of CL-RRT. The defaults are ours, since the paper states no values.
+    """Settings of CL-RRT; the paper has no values, so the defaults are this project's.
 
     Args:
-        expansions: number of edges tried in a plan.
-        expansions_per_round: number of edges simulated at once; divides `expansions`.
+        expansions: number of edges that a plan simulates, a multiple of
+            `expansions_per_round`.
+        expansions_per_round: number of edges that are simulated at once.
         step_m: maximum length of an edge along its reference in metres.
         edge_time_s: maximum duration of an edge in seconds.
-        goal_bias: fraction of the edges that aim at the goal, 0–1.
+        goal_bias: fraction of the edges that lead toward the goal, in [0, 1].
         turning_radius_m: turning radius of the references in metres, halved after each
             plan without a path to the goal.
-        replan_distance_m: distance from the nearest predicted position beyond which a
-            robot plans again, in metres.
-        stall_s: time without progress after which a robot plans again, in seconds.
+        replan_distance_m: distance from the nearest predicted position in metres beyond
+            which a robot plans again.
+        stall_s: time without progress in seconds after which a robot plans again.
         most_failures: maximum number of consecutive plans without a path to the goal.
-            Then the robot drives a partial path to its end or, without one, edges may
-            cross non-free cells.
-        follower: settings of the controller, in simulation and in execution.
+            After them, the robot drives a partial path to its end. If there is no
+            partial path either, edges may cross non-free cells.
+        follower: settings of the controller, for simulation and for execution.
     """
 
     expansions: int = 500
@@ -55,15 +56,14 @@ class CLRRTConfig:
         expect(
             self.expansions % self.expansions_per_round == 0,
             "`expansions` as a multiple of `expansions_per_round` = "
-            f"{self.expansions_per_round} for CL-RRT, got "
-            f"{self.expansions}.",
+            f"{self.expansions_per_round} for CL-RRT, got {self.expansions}.",
         )
         expect(
             0 <= self.goal_bias <= 1,
-            f"`goal_bias` in 0–1 for CL-RRT, got {self.goal_bias}.",
+            f"`goal_bias` in [0, 1] for CL-RRT, got {self.goal_bias}.",
         )
 
     @property
     def rounds(self) -> int:
-        """Number of rounds of a plan, also the maximum number of edges of a path: D."""
+        """Number of rounds of a plan, and maximum number of edges of a path, D."""
         return self.expansions // self.expansions_per_round

@@ -1,4 +1,4 @@
-"""Edges of the tree: references are drawn, simulated in closed loop and truncated.
+"""Edges of the tree: references, their closed-loop simulation, and collisions.
 
 An edge is the simulated motion of a robot whose controller follows a reference from a
 node. The robot moves through F with predicted traversability, step by step. The edge
@@ -7,12 +7,13 @@ collides.
 
 - An edge collides if it leaves the map, *enters* a non-free cell, or passes in one time
   step between two non-free cells that touch at a corner (`gridgraph.squeezes`). An edge
-  that begins in a non-free cell, because the truth differs from the prediction, may
-  leave it and continue.
-- A loop that may cross does not collide with non-free cells. The length of an edge in or
-  between such cells is measured, since each metre of it has a penalty.
-- If an edge collides, the first half of its free part is kept, as the source keeps
-  feasible nodes along the path: in narrow passages no edge of full length is free.
+  that begins in a non-free cell, because λ differs from the prediction, may leave the
+  cell and continue.
+- If edges may cross non-free cells (`ClosedLoop.crossing`), they do not collide with
+such
+  cells. Each metre of an edge in or between such cells has a penalty.
+- If an edge collides, the first half of its free part is kept, since in narrow passages
+  no edge of full length is free. The source likewise keeps feasible nodes along a path.
 
 Source: Kuwata et al. (2009), algorithm 1, lines 4–10. Letters in shapes: B episodes, R
 edges simulated at once, T time steps, N points of a reference, P drawn points of an
@@ -41,8 +42,8 @@ from benchnav.planning.planners.dubins import dubins_segments_to_point, sample_s
 from benchnav.planning.problem import Problem, motion_traversability
 from benchnav.planning.robots import steps_in
 
-DRAWN_M = 0.5  # between the drawn points of an edge
-_CHECK_STEPS = 8  # between checks whether all edges of a round have ended
+DRAWN_M = 0.5  # distance between the stored points of an edge, in metres
+_CHECK_STEPS = 8  # steps between checks whether all edges of a round have ended
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +54,8 @@ class ClosedLoop:
         problem: B problems.
         follower: the controller.
         radius_m: turning radius of the references in metres, shape [B].
-        crossing: whether edges may enter non-free cells, bool, shape [B].
+        crossing: mask of episodes whose edges may enter non-free cells, bool, shape
+            [B].
         step_m: maximum length of an edge along its reference in metres.
         edge_time_s: maximum duration of an edge in seconds.
     """
@@ -67,7 +69,7 @@ class ClosedLoop:
 
     @property
     def drawn_points(self) -> int:
-        """Number of drawn points P of an edge."""
+        """Number of stored points P of an edge."""
         return 1 + math.ceil(self.step_m / DRAWN_M)
 
 
@@ -91,13 +93,15 @@ class Edges:
     """Simulated edges.
 
     Args:
-        at: closed-loop state at the end.
-        exists: mask of edges of more than 0 steps, bool, shape [B, R].
-        time_s: duration in seconds, shape [B, R].
-        blocked_m: metres in non-free cells, shape [B, R].
+        at: closed-loop states at the ends of the edges.
+        exists: mask of edges with at least one step, bool, shape [B, R].
+        time_s: durations in seconds, shape [B, R].
+        blocked_m: lengths in or between non-free cells in metres, shape [B, R].
         arrived: mask of edges that end at the goal, bool, shape [B, R].
-        end_m: arc length along the reference at the end in metres, shape [B, R].
-        drawn: positions along the edge, NaN past its end, shape [B, R, P, 2].
+        end_m: arc length along the reference at the end of each edge in metres, shape
+            [B, R].
+        drawn: stored positions along the edges, NaN past their ends, shape
+            [B, R, P, 2].
     """
 
     at: LoopState
@@ -112,7 +116,7 @@ class Edges:
 def draw_references(
     loop: ClosedLoop, pose: Tensor, target_m: Tensor
 ) -> tuple[Reference, Tensor]:
-    """Return the shortest paths to points with free heading.
+    """Return references: the shortest paths to points with any final heading.
 
     Args:
         loop: closed loop with the turning radii and the maximum length of an edge.
@@ -125,7 +129,7 @@ def draw_references(
     """
     radius_m = loop.radius_m[:, None]
     curvature, lengths_m = dubins_segments_to_point(pose, target_m, radius_m)
-    # The controller looks ahead past the end of an edge.
+    # The look-ahead point of the controller may be beyond the end of an edge.
     reach_m = loop.step_m + loop.follower.lookahead_m
     count = 2 + math.ceil(reach_m / SPACING_M)
     poses = sample_segments(pose, curvature, lengths_m, SPACING_M, count)
@@ -136,7 +140,7 @@ def draw_references(
 def drive(
     loop: ClosedLoop, begin: LoopState, reference: Reference, length_m: Tensor
 ) -> Edges:
-    """Return edges simulated along references, as far as they are free of collision.
+    """Return edges that are simulated along references, up to a collision.
 
     Args:
         loop: robots, controller and terrain.
@@ -153,8 +157,8 @@ def drive(
     collided = collided | barred_squeeze.cummax(dim=0).values
     at_goal = distance(path, problem.goal_m[:, None]) < problem.goal_radius_m
     over = (progress >= end_m) | at_goal
-    over[-1] = True  # no edge continues past the log
-    last = _first(over)  # the step at which each edge ends
+    over[-1] = True  # No edge continues after the last simulated step.
+    last = _first(over)  # step at which each edge ends
     half = (_first(collided) - 1).clamp(min=0) // 2
     last = torch.where(_at(collided, last), half, last)
     before = (last - 1).clamp(min=0)
@@ -221,7 +225,7 @@ def _squeezed(problem: Problem, path: Tensor, free: Tensor) -> Tensor:
         free: mask of robots in free cells, bool, shape [T, B, R].
 
     Returns:
-        Bool, shape [T, B, R].
+        Mask, bool, shape [T, B, R].
     """
     cells = cell_at(problem.grid, path).movedim(0, -1)
     source = cells[..., :-1].flatten(1)
@@ -235,7 +239,7 @@ def _squeezed(problem: Problem, path: Tensor, free: Tensor) -> Tensor:
 
 
 def _blocked_m(path: Tensor, free: Tensor, squeezed: Tensor) -> Tensor:
-    """Return metres in or between non-free cells up to each step, shape [T, B, R]."""
+    """Return lengths in or between non-free cells up to each step, in m, [T, B, R]."""
     is_free_step = free[:-1] & ~squeezed[1:]
     step_m = distance(path[1:], path[:-1])
     blocked_m = torch.where(is_free_step, 0, step_m)
@@ -243,7 +247,7 @@ def _blocked_m(path: Tensor, free: Tensor, squeezed: Tensor) -> Tensor:
 
 
 def _first(condition: Tensor) -> Tensor:
-    """Return the first step at which a mask [T, B, R] is true, or 0; int64, [B, R]."""
+    """Return the first step at which a mask [T, B, R] is true, else 0; shape [B, R]."""
     return condition.to(torch.uint8).argmax(dim=0)
 
 
@@ -255,7 +259,7 @@ def _at(log: Tensor, step: Tensor) -> Tensor:
 
 
 def _thin(path: Tensor, progress: Tensor, last: Tensor, count: int) -> Tensor:
-    """Return simulated positions at equal progress, the last position included.
+    """Return the positions at equal steps of progress, and the last position.
 
     Args:
         path: positions (x, y) in metres, shape [T, B, R, 2].

@@ -1,19 +1,22 @@
 """Path following: pure pursuit steers, and a PID controls the speed.
 
-Pure pursuit drives the arc that is tangent to the robot's heading and meets the path one
-look-ahead distance ahead. The PID compares the achieved speed with the target speed.
-Within the bounds it thus compensates for terrain that slows the robot. If an arc needs a
-turn rate out of bounds, the speed is reduced and the arc is kept. Traversability that
-scales both velocities alike thus affects when the robot is at a point of the path, and
-hardly its route. The robot is driven by (v, ω), as a unicycle. If its turn rate changes
-only within a limit, a short look-ahead would make it oscillate about the path. Hence
-the look-ahead distance is at least the distance that it drives while its turn rate
-builds up.
+Pure pursuit drives the arc that is tangent to the robot's heading and meets the path
+one look-ahead distance ahead. The PID compares the achieved speed with the target
+speed. Hence it compensates for terrain that slows the robot, within the bounds of the
+speed. If an arc needs a turn rate out of bounds, the speed is reduced and the arc is
+kept. Hence traversability, which scales both velocities by the same factor, affects the
+time at which a robot reaches a point of the path, but hardly its route.
 
-The robot's progress is a state: an arc length along the path, which each step advances
-to the robot's projection on the path's tangent. It never decreases, so paths may cross
-themselves. Sources: Coulter (1992), "Implementation of the pure pursuit path tracking
-algorithm"; paper IV-A2. Letters in shapes: N points, S state and A action dimensions.
+The actions of the robot are (v, ω), as those of a unicycle. If its angular acceleration
+is limited, a short look-ahead would make it oscillate about the path. Hence the
+look-ahead distance is at least the distance that it drives while its turn rate builds
+up.
+
+The robot's progress is an arc length along the path. Each step advances it to the
+robot's projection on the path's tangent. It never decreases, so a path may cross
+itself. Sources: Coulter (1992), "Implementation of the pure pursuit path tracking
+algorithm"; paper IV-A2. Letters in shapes: *B any leading dimensions, N points of a
+path, R rows of all paths, S state dimensions.
 """
 
 import math
@@ -27,7 +30,7 @@ from benchnav.core.errors import expect
 from benchnav.planning.planners.planner import check_finite
 from benchnav.planning.robots import SPEED, TURN_RATE, Robot
 
-SPACING_M = 0.1  # between the points of a reference
+SPACING_M = 0.1  # distance between the points of a reference, in metres
 _MIN_CURVATURE = 1e-6
 _MIN_SQUARE_M2 = 1e-6
 
@@ -38,8 +41,8 @@ class FollowerConfig:
 
     Args:
         lookahead_m: minimum look-ahead distance along the path in metres.
-        lookahead_s: minimum look-ahead distance as the time in seconds to drive it at
-            the target speed. The longer of both distances is used.
+        lookahead_s: minimum time in seconds to drive the look-ahead distance at the
+            target speed.
         speed_mps: target speed in m/s; if None, the robot's top speed forward.
         speed_kp: proportional gain of the PID, whose output is added to the target
             speed.
@@ -63,7 +66,7 @@ class FollowerConfig:
 
 @dataclass(frozen=True)
 class Reference:
-    """Paths to follow, stored as rows of one table so that a lookup is one gather.
+    """Paths to follow, all stored in one table.
 
     Args:
         rows: points (x, y, cos θ, sin θ) of all paths, `SPACING_M` apart, shape [R, 4].
@@ -112,12 +115,12 @@ class Reference:
 
 @dataclass(frozen=True)
 class Tracking(Batch):
-    """State of a follower from step to step, except its progress.
+    """State of the controller, except the progress.
 
     Args:
-        position_m: position of the robot one step ago, shape [*B, 2].
+        position_m: position (x, y) of the robot one step ago in metres, shape [*B, 2].
         integral: integral term of the speed in m/s, shape [*B].
-        error_mps: error of the speed one step ago, shape [*B].
+        error_mps: error of the speed one step ago in m/s, shape [*B].
     """
 
     position_m: Tensor
@@ -152,9 +155,9 @@ class PathFollower:
         has_actions = names == (SPEED, TURN_RATE)
         expect(
             has_actions and high[0] > 0 and low[1] < 0 < high[1],
-            f"a robot with actions ({SPEED}, {TURN_RATE}), the first up to more than "
-            "0 and the second to both sides, "
-            f"got ({', '.join(names)}) from {tuple(low)} to {tuple(high)}. "
+            f"a robot with actions ({SPEED}, {TURN_RATE}) that drives forward and turns "
+            f"to both sides, got ({', '.join(names)}) from {tuple(low)} to "
+            f"{tuple(high)}. "
             "Use a planner that samples actions, such as mppi.",
         )
         self.config = config
@@ -181,7 +184,7 @@ class PathFollower:
             progress_m: progress before the motion in metres, shape [*B].
 
         Returns:
-            The new progress in metres, shape [*B]. It is limited so that the look-ahead
+            The new progress in metres, shape [*B], at most such that the look-ahead
             point is on the reference.
         """
         near_x, near_y, cos, sin = reference.at(progress_m).unbind(-1)
@@ -199,7 +202,7 @@ class PathFollower:
         tracking: Tracking,
         progress_m: Tensor,
     ) -> tuple[Tensor, Tracking]:
-        """Return an action and the next tracking.
+        """Return the next actions and the next state of the controller.
 
         Args:
             reference: paths, shape [*B].

@@ -1,22 +1,24 @@
 """The tree of CL-RRT and the search that grows it.
 
-`search` makes a whole plan. It plants a root, then grows the tree in rounds: it chooses
-nodes and a target for each, draws references, simulates the robot along them (`edges`)
-and adds the ends of the edges as nodes. Finally it selects the best route. A tree is a
-value: a table of nodes, and each round returns a longer table.
+`search` computes a whole plan. It begins with a root and grows the tree in rounds. A
+round chooses nodes and a target for each, simulates the robot along references to the
+targets (`edges`), and adds the ends of the edges as nodes. Finally the best route is
+selected. A tree is an immutable table of nodes; each round returns a longer table.
 
 - Nodes are chosen by Kuwata's mix of two heuristics: the nearest node in Dubins length
   (explore), or the node through which the point is reached soonest (optimise). 70 % of
-  the choices explore before a path to the goal is known, and 30 % afterwards. Nodes that
-  cannot improve on the best path are excluded.
-- Edges to the goal start from nodes that have not tried it yet, the most promising
-  first. An attempt is deterministic, so a second one from the same node would be a copy.
-  The source tries the goal from each new node.
-- A path costs its simulated time, plus `PENALTY` for each metre in non-free cells.
+  the choices explore before a path to the goal is found, and 30 % afterwards. Nodes
+  that cannot improve on the best path are excluded.
+- Edges to the goal start from nodes without such an edge, the most promising nodes
+  first. A simulation is deterministic, so a second edge from the same node would be a
+  copy. The source tries an edge to the goal from each new node.
+- The cost of a path is its simulated time, plus `PENALTY` for each metre in non-free
+  cells.
 
 Source: Kuwata et al. (2009), section IV and algorithm 1. Letters in shapes: B episodes,
-R edges of a round, V nodes, E edges of a finished tree, D edges of a path, N points of
-a reference, Q drawn points of a reference, P drawn points of an edge.
+R edges of a round, V nodes, E edges of a finished tree, D edges of a path, K segments
+of a path, N points of a reference, Q stored points of a reference, P stored points of
+an edge, S state dimensions.
 """
 
 import math
@@ -41,12 +43,13 @@ from benchnav.planning.planners.cl_rrt.pursuit import SPACING_M, Tracking
 from benchnav.planning.planners.dubins import dubins_length_to_point
 from benchnav.planning.planners.planner import PlanStatus
 
-# Fraction of choices that explore, before and after a path to the goal is known.
+# Fraction of choices that explore, before and after a path to the goal is found.
 _EXPLORE = (0.7, 0.3)
-_PARTIAL_GAIN_M = 0.5  # minimum gain toward the goal of a partial path
-# A partial path is left this far before its end, which may be close to non-free cells.
+_PARTIAL_GAIN_M = 0.5  # minimum gain of a partial path toward the goal, in metres
+# A partial path is left at this distance from its end in metres, since the end may be
+# close to non-free cells.
 _MARGIN_M = 0.3
-_FAR_M = 1e4  # longer than any path on a map
+_FAR_M = 1e4  # length in metres that exceeds that of any path on a map
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,9 +57,9 @@ class Choice:
     """Edges that a round tries.
 
     Args:
-        parent: node at which each begins, int64, shape [B, R].
-        target_m: end point (x, y) of its reference in metres, shape [B, R, 2].
-        aimed: mask of edges to the goal, bool, shape [B, R].
+        parent: index of the node at which each edge begins, int64, shape [B, R].
+        target_m: end point (x, y) of each edge's reference in metres, shape [B, R, 2].
+        aimed: mask of edges whose target is the goal, bool, shape [B, R].
     """
 
     parent: Tensor
@@ -70,7 +73,8 @@ class Tree(Choice, Edges):
 
     Node 0 is the root, and each other node is the end of the edge that leads to it. The
     inherited fields describe these edges, with V instead of R in their shapes. Times
-    and metres in non-free cells count from the root; the time of a rejected edge is inf.
+    and metres in non-free cells count from the root; the time of a rejected edge is
+    inf.
 
     Args:
         to_goal_m: Dubins length from each node to the goal in metres, inf for rejected
@@ -86,7 +90,7 @@ class Tree(Choice, Edges):
 
     @property
     def best(self) -> tuple[Tensor, Tensor]:
-        """Cost of the best path to the goal, inf without one, and its node, each [B]."""
+        """Cost of the best path to the goal, inf without a path, and its last node."""
         cost_to_goal = torch.where(self.arrived, self.cost, math.inf)
         return cost_to_goal.min(dim=1)
 
@@ -96,15 +100,16 @@ class Route(Batch):
     """Plan of each episode.
 
     Args:
-        status: `PlanStatus`: OK if the path leads to the goal and enters only free
-            cells, else PARTIAL.
+        status: `PlanStatus` of each episode, shape [B]: OK if the path leads to the
+            goal over free cells only, else PARTIAL.
         depth: number of edges of the path, 0 without a path, int64, shape [B].
         rows: references of the edges, as rows of `Reference`, shape [B, D, N, 4].
         end_m: arc length in metres at which each reference is left for the next, shape
             [B, D].
-        path: predicted positions (x, y), unused ones NaN, shape [B, D·P, 2].
-        tree: predicted positions (x, y) along all edges, unused ones NaN, shape
-            [B, E, P, 2].
+        path: predicted positions (x, y) along the path in metres, shape [B, D·P, 2]; NaN
+            after its end.
+        tree: predicted positions (x, y) along all edges in metres, shape [B, E, P, 2];
+            unused positions are NaN.
     """
 
     status: Tensor
@@ -118,8 +123,8 @@ class Route(Batch):
         """Split paths into short straight segments.
 
         Args:
-            max_m: maximum length of a segment in metres between points that are
-                `DRAWN_M` apart.
+            max_m: maximum length of a segment in metres, if the points of the path are
+                at most `DRAWN_M` apart.
 
         Returns:
             Midpoints (x, y), shape [B, K, 2], and lengths, shape [B, K], in metres.
@@ -182,7 +187,7 @@ def search(
 
 
 def plant(loop: ClosedLoop, root: Tensor, tracking: Tracking) -> Tree:
-    """Return a tree of only the root; arguments as for `search`."""
+    """Return a tree with only the root; the arguments are those of `search`."""
     free = loop.problem.free_at(root)
     begin = LoopState(state=root, tracking=tracking, free=free)
     at = map_tensors(begin, lambda values: values[:, None])
@@ -211,11 +216,11 @@ def choose(
 
     Args:
         loop: robots, controller and terrain.
-        tree: tree of the rounds so far.
+        tree: tree of the previous rounds.
         sample_m: points (x, y) to reach in metres, shape [R, 2].
-        chance: uniform draws in [0, 1), shape [R].
-        goal_edges: number of the R edges that lead to the goal instead of a point,
-            fewer if fewer nodes have not tried the goal.
+        chance: uniform draws in [0, 1) that select the heuristics, shape [R].
+        goal_edges: maximum number of the R edges whose target is the goal instead of a
+            point; only nodes without an edge to the goal are used.
     """
     problem = loop.problem
     goal_m = problem.goal_m[:, None]
@@ -228,7 +233,7 @@ def choose(
     # These nodes cannot improve on the best path.
     closed = tree.cost + straight_m / top_mps >= best_cost
     closed_m = torch.where(closed, math.inf, 0.0)
-    # Time from the root, as the length driven in it at the target speed.
+    # Time from the root, as the distance driven in this time at the target speed.
     spent_m = loop.follower.wanted_mps * tree.time_s
     spent_m = torch.where(closed, 0, spent_m)
 
@@ -244,7 +249,7 @@ def choose(
     node = (length_m + before_m).argmin(dim=-1)
     target_m = sample_m.expand(len(node), -1, -1)
 
-    # Lines 13–20: the goal.
+    # Lines 13–20 of algorithm 1: edges to the goal.
     n_aimed = min(goal_edges, tree.parent.shape[1])
     no_attempts = torch.zeros_like(tree.time_s)
     aimed = tree.aimed.to(tree.time_s)
@@ -268,9 +273,10 @@ def stand(tree: Tree, node: Tensor) -> LoopState:
 
 
 def add(loop: ClosedLoop, tree: Tree, choice: Choice, edges: Edges) -> Tree:
-    """Return the tree with the ends of edges as its next nodes.
+    """Return the tree with the ends of edges as further nodes.
 
-    Rejected edges are added too, so that all episodes have tables of one size.
+    Rejected edges are also added, so that the tables of all episodes have the same
+    size.
     """
     exists = edges.exists
     time_s = tree.time_s.gather(1, choice.parent) + edges.time_s
@@ -288,13 +294,12 @@ def add(loop: ClosedLoop, tree: Tree, choice: Choice, edges: Edges) -> Tree:
 
 
 def best_route(loop: ClosedLoop, tree: Tree, rounds: int) -> Route:
-    """Return the cheapest path to the goal or, without one, the best partial path.
+    """Return the cheapest path to the goal, or else the best partial path.
 
     Args:
         loop: robots, controller and terrain.
         tree: finished tree.
-        rounds: number of rounds of the tree, also the maximum number of edges of a
-            path: D.
+        rounds: number of rounds of the tree, and maximum number of edges of a path, D.
     """
     cost, cheapest = tree.best
     is_reached = cost < math.inf
@@ -303,7 +308,7 @@ def best_route(loop: ClosedLoop, tree: Tree, rounds: int) -> Route:
     for _ in range(rounds):
         parent = tree.parent.gather(1, chain[-1])
         chain.append(parent)
-    backward = torch.cat(chain, dim=1)  # ends in zeros
+    backward = torch.cat(chain, dim=1)  # The last entries are 0, the root.
     depth = (backward > 0).sum(dim=1)
     order = depth[:, None] - 1 - torch.arange(rounds, device=depth.device)
     forward = backward.gather(1, order.clamp(min=0))
@@ -333,7 +338,7 @@ def best_route(loop: ClosedLoop, tree: Tree, rounds: int) -> Route:
 
 
 def no_route(loop: ClosedLoop, rounds: int, edges: int) -> Route:
-    """Return routes without a path, of the same shapes as those of `search`."""
+    """Return routes without a path, with the same shapes as routes from `search`."""
     start = loop.problem.start
     tracking = Tracking.standing(start)
     root = plant(loop, start, tracking)
@@ -342,9 +347,10 @@ def no_route(loop: ClosedLoop, rounds: int, edges: int) -> Route:
 
 
 def _best_partial(tree: Tree) -> Tensor:
-    """Return the nodes nearest to the goal, those in free cells first.
+    """Return the node of each tree that is nearest to the goal, int64, shape [B].
 
-    The root is returned if the gain is less than `_PARTIAL_GAIN_M`.
+    Nodes in free cells take precedence. The root, 0, is returned if the gain is at most
+    `_PARTIAL_GAIN_M`.
     """
     penalty_m = torch.where(tree.at.free, 0.0, _FAR_M)
     remaining_m = tree.to_goal_m + penalty_m
@@ -360,12 +366,12 @@ def _to_goal_m(loop: ClosedLoop, state: Tensor) -> Tensor:
 
 
 def _take(values: Tensor, index: Tensor) -> Tensor:
-    """Return values [B, V, *F] at indices [B, R] of the second dimension, [B, R, *F]."""
+    """Return values [B, V, *F] at indices [B, R] of dimension 1, shape [B, R, *F]."""
     return values.take_along_dim(index if values.dim() == 2 else index[..., None], 1)
 
 
 def _pack(points: Tensor) -> Tensor:
-    """Return points [B, N, 2] with NaN points moved to the end, in stable order."""
+    """Return points [B, N, 2] in the same order, but with all NaN points at the end."""
     is_nan = points[..., 0].isnan().to(torch.uint8)
     order = is_nan.argsort(dim=1, stable=True)
     return _take(points, order)

@@ -1,1 +1,1 @@
-"""The optimal planner: value iteration over the poses of a unicycle."""
+"""Optimal planner: value iteration over the poses of a unicycle."""

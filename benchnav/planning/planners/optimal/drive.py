@@ -1,9 +1,9 @@
-"""Closed-loop simulation of planners on a known λ field, as in the world.
+"""Closed-loop simulation of planners on a known λ field, by the rules of the world.
 
-λ of a step is that at the robot's position when the step starts, also for
-immobilisation. Nothing is drawn, so a robot that repeats the actions in the same world
-repeats the drive.
-Letters in shapes: B episodes, T steps, S state and A action dimensions.
+λ of a step is λ at the robot's position at the start of the step, also for
+immobilisation. The simulation is deterministic, so a robot that repeats the actions in
+the same world repeats the drive. Letters in shapes: B episodes, T steps, S state and A
+action dimensions.
 """
 
 from collections.abc import Callable
@@ -23,13 +23,13 @@ from benchnav.planning.sensing.sensor import Step
 
 @dataclass(frozen=True, kw_only=True)
 class Drive(Batch):
-    """Drives from the start of each episode.
+    """Simulated drives of B episodes.
 
     Args:
-        states: states from the start, NaN after the end, shape [B, T + 1, S].
-        actions: actions from the start, NaN after the end, shape [B, T, A].
-        steps: number of steps until the goal is reached, infinite if it is not, shape
-            [B].
+        states: robot states from the start on, NaN after the end, shape [B, T + 1, S].
+        actions: actions from the start on, NaN after the end, shape [B, T, A].
+        steps: number of steps until the goal is reached, or infinity if it is not
+            reached, shape [B].
     """
 
     states: Tensor
@@ -45,16 +45,16 @@ def simulate(
     field: Tensor,
     rival: Drive | None = None,
 ) -> Drive:
-    """Simulate a planner to the end of every episode.
+    """Return the drives of a planner, simulated to the end of every episode.
 
     Args:
         plan: `plan` of a `Planner`.
         select: `select` of a `Planner`.
         plan_state: plan state from `init` of the planner.
         problem: B problems.
-        field: λ, shape [B, H, W].
-        rival: drive whose time at the goal ends the simulation of each episode; None
-            without such a drive.
+        field: λ of each cell, shape [B, H, W].
+        rival: drives that end the simulation of an episode as soon as they reach the
+            goal; None for no such drives.
     """
     grid = problem.grid
     immobile = problem.immobile
@@ -103,7 +103,10 @@ def simulate(
 
 
 def earlier(first: Drive, second: Drive) -> Drive:
-    """Return each episode's drive that reaches the goal earlier; the first at a tie."""
+    """Return the drive of each episode that reaches the goal earlier.
+
+    If both drives reach the goal at the same time, the first is returned.
+    """
     is_earlier = (second.steps < first.steps)[:, None, None]
     return Drive(
         states=torch.where(is_earlier, second.states, first.states),

@@ -1,14 +1,13 @@
 """The optimal planner: value iteration over the poses of a map.
 
 Value iteration computes the minimum cost to go of every pose once, and the robot
-follows it. `Optimal` takes λ̂ for λ ("certainty-equivalent"). Its time is the minimum
-under the predicted map, and no bound for the true terrain. `NearOptimal` receives λ
-itself, from the model `clairvoyant`, and uses the dwell time after which the world
-immobilises a robot. Its drives are feasible, so the minimum time is at most its time.
-Hence it is the near-optimal reference, and no lower bound. Both plan only for the
-paper's unicycle, which drives forward, and reject maps that change.
-Letters in shapes: B episodes, H×W cells, Q headings, K primitives, N points, L levels
-of dwell time.
+descends it. `Optimal` uses λ̂ as if it were λ. Its time is the minimum under the
+predicted map, and no bound for the true terrain. `NearOptimal` receives λ itself, from
+the model `clairvoyant`, and considers the dwell time after which the world immobilises
+a robot. It is the near-optimal reference, and no lower bound: its drives are feasible,
+so the minimum time is at most its time. Both plan only for the paper's unicycle, which
+drives forward, and reject maps that change. Letters in shapes: B episodes, H×W cells, Q
+headings, K primitives, N points, L levels of dwell time.
 """
 
 import math
@@ -41,8 +40,8 @@ from benchnav.planning.problem import Problem, Task
 from benchnav.planning.robots import SPEED, TURN_RATE, Robot, Unicycle
 from benchnav.planning.sensing.sensor import Step
 
-_MIN_TRAVERSABILITY = 1e-3  # smaller λ counts as this
-_ON_DRIVE = 1e-4  # maximum distance from a simulated drive, in m and rad
+_MIN_TRAVERSABILITY = 1e-3  # A smaller λ is replaced by this value.
+_MAX_DEVIATION = 1e-4  # maximum deviation from a simulated drive, in m and rad
 _MAX_LEVELS = 5
 
 
@@ -51,11 +50,12 @@ class OptimalConfig:
     """Settings of the optimal planner.
 
     Args:
-        headings: number Q of headings.
-        refine: cells of value iteration along each side of a cell of the map.
+        headings: number of headings Q, 8 to 256.
+        refine: number of cells of value iteration along each side of a map cell, 1 to
+            4.
         hazard: whether to minimise the expected time under each cell's distribution,
-            with the time limit as the cost of an immobilised robot, instead of the time
-            under λ̂.
+            with the time budget as the cost of an immobilised robot, instead of the
+            time under λ̂.
     """
 
     headings: int = 32
@@ -72,10 +72,11 @@ class NearOptimalConfig:
     """Settings of the near-optimal reference.
 
     Args:
-        headings: number Q of headings.
-        refine: cells of value iteration along each side of a cell of the map.
-        levels: number L of levels of dwell time with a cost to go each; 0 makes
-            immobilising terrain impassable.
+        headings: number of headings Q, 8 to 256.
+        refine: number of cells of value iteration along each side of a map cell, 1 to
+            4.
+        levels: number of levels of dwell time L, 0 to 5, each with a cost to go; 0
+            makes immobilising terrain impassable.
     """
 
     headings: int = 32
@@ -115,23 +116,23 @@ class Optimal(Planner[OptimalState]):
         self.config: Any = config or OptimalConfig()
 
     def uses(self, task: Task) -> frozenset[str]:
-        """Return the distribution with `hazard`, else λ̂ and the input of free space."""
+        """Return the names of the predicted inputs; see `Planner`."""
         if self.config.hazard:
             return frozenset({"distribution"})
         return frozenset({"risk_map", task.rules.free_space.source})
 
     def follows(self, task: Task) -> str:
-        """Return what it minimises; see `Planner`."""
+        """Return the cost that the planner minimises; see `Planner`."""
         if self.config.hazard:
             return "expected time, a loss as the time limit"
         return "time under λ̂"
 
     def init(self, problem: Problem, generator: torch.Generator) -> OptimalState:
-        """Return the plan state with the cost to go; draws nothing. See `Planner`.
+        """Return the plan state with the cost to go; see `Planner`.
 
         Raises:
-            ConfigError: If the robot is not a `Unicycle` that only drives forward and
-                turns equally fast to both sides, or a required input is missing.
+            ConfigError: If the robot, the goal radius or the world is not supported;
+                see the message.
         """
         robot = problem.robot
         headings = self.config.headings
@@ -143,7 +144,7 @@ class Optimal(Planner[OptimalState]):
         expect(
             radius >= min_radius,
             f"`goal_radius_m` of at least {min_radius:.2f}, half of a cell's diagonal, for "
-            f"planner {self.name!r}, got {radius:g}.",
+            f"planner {self.name!r}, got {radius:g}. Raise it, or raise `refine`.",
         )
         costs = self.costs_of(problem, grid)
         moves = Moves.of(robot, grid.resolution_m, headings)
@@ -164,19 +165,19 @@ class Optimal(Planner[OptimalState]):
         _, high = robot.action_high
         expect(
             low == -high,
-            f"equal `turn_rate_radps` to both sides for planner {self.name!r}, got "
-            f"{low:g} to {high:g}.",
+            "`turn_rate_radps` with the same maximum to both sides for planner "
+            f"{self.name!r}, got {low:g} to {high:g}.",
         )
         expect(
             min_speed == 0,
-            f"`speed_mps` from 0 on for planner {self.name!r}, got from "
-            f"{min_speed:g} on.",
+            f"`speed_mps` with minimum 0 for planner {self.name!r}, got minimum "
+            f"{min_speed:g}.",
         )
 
     def plan(
         self, step: Step, plan_state: OptimalState
     ) -> tuple[Tensor, OptimalState, Plan]:
-        """Return actions of the motion primitive of minimum cost; see `Planner`."""
+        """Return actions along the motion primitives of minimum cost; see `Planner`."""
         plan_state = self.observe(step, plan_state)
         problem = plan_state.problem
         dwell_s = plan_state.dwell_s
@@ -184,15 +185,14 @@ class Optimal(Planner[OptimalState]):
         member = torch.arange(len(dwell_s), device=dwell_s.device)
         primitives = primitives_from(pose, dwell_s, plan_state)
         cost, best = primitives.cost.min(1)
-        # The turn rate that completes the turn in this step.
+        # `rate` is the turn rate that completes the turn in this step.
         turning = self.turning_at(pose, plan_state).clamp(min=_MIN_TRAVERSABILITY)
         rate = primitives.turn[member, best] / (turning * problem.dt_s)
         low, high = problem.action_bounds
         drives = primitives.rolls[member, best] | (rate.abs() <= high[1])
         speed = torch.where(drives, high[0], 0.0)
         action = torch.stack((speed, rate.clamp(low[1], high[1])), 1)
-        # Without a path the robot drives straight, as other planners do, and the world
-        # decides how that ends.
+        # Without a path to the goal, the robot drives straight to the goal.
         is_stranded = cost >= self.no_path_cost(plan_state.costs)
         straight = steer_toward(step.state, problem.goal_m, problem.robot)
         action = torch.where(is_stranded[:, None], straight, action)
@@ -215,22 +215,22 @@ class Optimal(Planner[OptimalState]):
         return plan_state.select(members)
 
     def revise(self, plan_state: OptimalState, problem: Problem) -> OptimalState:
-        """Raise an error, since it plans once.
+        """Raise an error, since the planner plans only once.
 
         Raises:
             ConfigError: Always.
         """
         raise ConfigError(
-            f"Expected a fixed map for planner {self.name!r}, which plans once, got "
-            "one that changes. Use belief 'static' and sensor 'full'."
+            f"Expected a constant map for planner {self.name!r}, which plans once, got "
+            "an updated map. Use belief 'static' and sensor 'full'."
         )
 
     def no_path_cost(self, costs: Costs) -> Tensor:
-        """Return the minimum cost that means that there is no path, shape [B]."""
+        """Return the cost from which on a pose has no path to the goal, shape [B]."""
         return torch.full_like(costs.loss, UNREACHED / 2)
 
     def turning_at(self, pose: Tensor, plan_state: OptimalState) -> Tensor:
-        """Return λ that scales turns at the robots' poses [B, 3], shape [B]."""
+        """Return the λ that scales turns in place at poses [B, 3], shape [B]."""
         grid = plan_state.grid
         costs = plan_state.costs
         if costs.hazard is None:
@@ -239,7 +239,7 @@ class Optimal(Planner[OptimalState]):
         return 1 / grid.lookup(rate, pose[:, 0], pose[:, 1])
 
     def costs_of(self, problem: Problem, grid: Grid) -> Costs:
-        """Return the costs of driving, on the cells of value iteration."""
+        """Return the costs of driving on the cells of value iteration."""
         if not self.config.hazard:
             penalty_rate = PENALTY * problem.robot.top_speed_mps
             rate = 1 / problem.traversability + penalty_rate * ~problem.free
@@ -248,13 +248,13 @@ class Optimal(Planner[OptimalState]):
         if immobile is None:
             raise ConfigError(
                 "Expected a world that immobilises robots for `hazard` of "
-                f"{self.name!r}, got one that does not."
+                f"{self.name!r}, got a world without `immobile`."
             )
         below = immobile.below
         distribution = problem.distribution
         lost, _ = distribution.cdf_limits(below)
         lost = lost.clamp(max=1 - 1e-6)
-        # The expected rate, conditional on terrain that does not immobilise.
+        # Expected rate, given that the terrain does not immobilise the robot.
         total_time = distribution.expected_time(below)
         rate = (total_time - lost / below) / (1 - lost)
         rate = rate.clamp(min=1)
@@ -264,11 +264,11 @@ class Optimal(Planner[OptimalState]):
 
 
 class NearOptimal(Optimal):
-    """The near-optimal reference: a fast drive on λ itself.
+    """Near-optimal reference, which follows a fast drive on λ itself.
 
-    Three drives are simulated to their ends, with the immobilisation of the world: by
-    value iteration, by A*+DWA with its default settings, and by `straight`. The robot
-    follows the drive that reaches the goal first. Hence it succeeds whenever A*+DWA or
+    Three drives are simulated to their ends by the rules of the world: by value
+    iteration, by A*+DWA with its default settings, and by `straight`. The robot follows
+    the drive that reaches the goal first. Hence it succeeds whenever A*+DWA or
     `straight` succeeds on the same problem, and at least as early. Planners that draw
     samples may be faster. Value iteration steers a robot that has left the drive.
 
@@ -284,15 +284,15 @@ class NearOptimal(Optimal):
         self.config = config or NearOptimalConfig()
 
     def uses(self, task: Task) -> frozenset[str]:
-        """Return the distribution and λ̂, since both are λ itself; see `Planner`."""
+        """Return the names of the predicted inputs; see `Planner`."""
         return frozenset({"risk_map", "distribution"})
 
     def follows(self, task: Task) -> str:
-        """Return what it minimises; see `Planner`."""
+        """Return the cost that the planner minimises; see `Planner`."""
         return "time on λ itself"
 
     def init(self, problem: Problem, generator: torch.Generator) -> OptimalState:
-        """Return the plan state with simulated drives; draws nothing. See `Planner`.
+        """Return the plan state with the simulated drive; see `Planner`.
 
         Raises:
             ConfigError: If the robot is not supported, or the prediction is not λ
@@ -313,7 +313,7 @@ class NearOptimal(Optimal):
     def plan(
         self, step: Step, plan_state: OptimalState
     ) -> tuple[Tensor, OptimalState, Plan]:
-        """Return actions on the drive, or by value iteration off it; see `Planner`."""
+        """Return the drive's actions, or those of value iteration off the drive."""
         drive = plan_state.drive
         n_steps = plan_state.n_steps
         assert drive is not None
@@ -336,11 +336,12 @@ class NearOptimal(Optimal):
         return torch.where(follows[:, None], action, steered), following, plan
 
     def no_path_cost(self, costs: Costs) -> Tensor:
-        """Return twice the time limit T, as the cost of a missing path.
+        """Return twice the time budget T, shape [B]; see `Optimal`.
 
-        Costs without a path are interpolated into neighbouring cells and are then below
-        `UNREACHED`. T would be too low: the grid makes times slightly too long, so a
-        path with a cost just above T may succeed. See `Optimal`.
+        The costs of poses without a path are interpolated with those of neighbouring
+        poses, and may then be below `UNREACHED`. T itself would be too low: on the
+        grid, times are slightly too long, so a path with a cost just above T may
+        succeed.
         """
         return 2 * costs.loss
 
@@ -353,8 +354,8 @@ class NearOptimal(Optimal):
             is_certain = bool((distribution.stds == 0).all())
         if not is_certain:
             raise ConfigError(
-                f"Expected model 'clairvoyant' for planner {self.name!r}, which is "
-                "given λ itself, got a prediction that is not certain."
+                f"Expected model 'clairvoyant' for planner {self.name!r}, which needs λ "
+                "itself, got a model that predicts uncertain λ."
             )
         field = distribution.mean()
         rate = 1 / field.clamp(min=_MIN_TRAVERSABILITY)
@@ -378,15 +379,14 @@ def _follow(drive: Drive, n_steps: Tensor, state: Tensor) -> tuple[Tensor, Tenso
         state: states of the robots, shape [B, S].
 
     Returns:
-        Actions, 0 for robots off their drive, shape [B, A]; and the mask, bool, shape
-        [B].
+        Actions, 0 off the drive, shape [B, A]; and the mask, bool, shape [B].
     """
     member = torch.arange(len(n_steps), device=n_steps.device)
     index = n_steps.clamp(max=drive.actions.shape[1] - 1)
     action = drive.actions[member, index]
     deviation = (state - drive.states[member, index]).abs().amax(1)
-    # After the end of a drive both are NaN, and the comparison is false.
-    is_on = (n_steps == index) & (deviation < _ON_DRIVE)
+    # After the end of a drive its states are NaN, so that the comparison is false.
+    is_on = (n_steps == index) & (deviation < _MAX_DEVIATION)
     follows = is_on & ~action.isnan().any(1)
     return torch.where(follows[:, None], action, 0.0), follows
 
@@ -409,11 +409,11 @@ def _on_grid(
     Args:
         problem: B problems.
         grid: grid of value iteration.
-        rate: see `Costs`; this and the next maps are on the map's cells, shape
-            [B, H, W].
-        open_: see `Costs`.
-        hazard: see `Costs`.
-        immobile_s: see `Costs`.
+        rate: `Costs.rate` on the cells of the map; the other maps are also on these
+            cells, shape [B, H, W].
+        open_: `Costs.open` on these cells.
+        hazard: `Costs.hazard` on these cells.
+        immobile_s: `Costs.immobile_s` on these cells.
     """
     times = grid.height // problem.grid.height
     dtype = problem.start.dtype
@@ -433,8 +433,8 @@ def _on_grid(
     x, y = grid.centre_of(row[:, None], column)
     goal_x, goal_y = problem.goal_m.T[:, :, None, None]
     distance_m = torch.hypot(x - goal_x, y - goal_y)
-    # Cells within the goal's disc have one rate, so that `final` can subtract the cost of
-    # a path within the disc. Nothing immobilises a robot there.
+    # All cells within the goal's disc have the same rate, so that `final` can subtract
+    # the cost of a path within the disc. Terrain there does not immobilise a robot.
     ends = distance_m <= problem.goal_radius_m
     goal_rate = torch.where(ends, rate, UNREACHED).amin((1, 2), keepdim=True)
     rate = torch.where(ends, goal_rate, rate)

@@ -1,11 +1,11 @@
 """Motion primitives to nearby cell centres, by which a robot descends the cost to go.
 
-Between cell centres the interpolated cost to go is too low in front of slow terrain and
-too high in it. A robot that compared only its next actions might therefore oscillate.
-Hence motion primitives end at cell centres, up to some cells away. A primitive is a
-turn in place, an arc of the minimum radius at full speed, and a straight.
-Letters in shapes: B episodes, H×W cells, Q headings, K primitives, N points, L levels
-of dwell time.
+Between cell centres, the interpolated cost to go is too low in front of slow terrain
+and too high on it. A robot that compared only its next actions might therefore
+oscillate. Hence motion primitives end at the centres of cells at a distance of up to
+four cells. A primitive consists of a turn in place, an arc of the minimum radius at
+full speed, and a straight line. Letters in shapes: B episodes, H×W cells, Q headings, K
+primitives, N points, L levels of dwell time.
 """
 
 import math
@@ -22,10 +22,11 @@ from benchnav.planning.problem import Problem
 
 _NEAR_CELLS = 4  # maximum distance of a primitive's end in cells
 _POINTS = 16  # number N of points along a primitive
-# A turn in place ends when the bearing of the cell is at most one of these.
+# A primitive turns in place until the bearing of the cell is at most one of these
+# angles.
 _BEARINGS = (0.0, math.pi / 4, math.pi / 2)
-_ANGLE_TOLERANCE = 1e-4  # an arc this close to a full circle has length 0
-_MAX_DRAWN = 100  # maximum number of primitives of a drawn path
+_ANGLE_TOLERANCE = 1e-4  # An arc this close to a full circle, in rad, has length 0.
+_MAX_PLOTTED = 100  # maximum number of primitives of a path in a figure
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,14 +34,15 @@ class OptimalState(Batch):
     """Plan state of the optimal planner.
 
     Args:
-        problem: the problem.
-        grid: cells of value iteration, H×W.
+        problem: problems of B episodes.
+        grid: H×W cells of value iteration.
         costs: costs of driving on these cells.
-        to_go: cost to go of every state.
-        dwell_s: dwell times of the robots in seconds, shape [B].
-        n_steps: number of steps taken, int64, shape [B].
-        drive: simulated drive, which a robot follows as long as it is on it; None
-            without a simulation.
+        to_go: cost to go of every state of value iteration.
+        dwell_s: dwell times of the robots on immobilising terrain in seconds, shape
+            [B].
+        n_steps: number of planned steps, int64, shape [B].
+        drive: simulated drive, which a robot follows until it deviates from it; None if
+            no drive is simulated.
     """
 
     problem: Problem
@@ -59,8 +61,9 @@ class Primitives:
     Args:
         cost: cost of the primitive plus the cost to go at its end, shape [B, K].
         turn: angle by which the robot turns first, in radians, shape [B, K].
-        rolls: mask of primitives that drive while turning, bool, shape [B, K].
-        points: points (x, y) along the primitive in metres, the last at its end, shape
+        rolls: mask of primitives that begin without a turn in place, bool, shape
+            [B, K].
+        points: N points (x, y) along the primitive, and its end, in metres, shape
             [B, K, N + 1, 2].
         heading: heading θ at the end in radians, shape [B, K].
     """
@@ -89,7 +92,7 @@ def primitives_from(
     offset = torch.stack(grid.centre_of(row, column), -1) - position
     ahead, leftward = _in_robot_frame(pose[:, 2:], offset)
     bearing = torch.atan2(leftward, ahead)
-    # A turn in place, for each of `_BEARINGS`.
+    # There is a turn in place for each of `_BEARINGS`.
     turns = [(bearing.abs() - max_bearing).clamp(min=0) for max_bearing in _BEARINGS]
     turn_first = torch.cat(turns, 1)
     count = len(_BEARINGS)
@@ -99,7 +102,8 @@ def primitives_from(
     side = torch.where(bearing < 0, -1.0, 1.0).to(pose)
     first = pose[:, 2:] + side * turn_first
     ahead, leftward = _in_robot_frame(first, offset)
-    # The arc until the robot faces the cell, if the cell is outside the circle.
+    # The arc ends when the robot faces the cell. A cell within the turning circle
+    # cannot be reached.
     radius = torch.as_tensor(top / rate).to(pose)
     past = side * leftward - radius
     square = ahead.square() + past.square() - radius.square()
@@ -136,11 +140,14 @@ def primitives_from(
 
 
 def _in_robot_frame(heading: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
-    """Return offsets in the robots' frames: ahead, and to the left, shape [B, K] each.
+    """Return the components of offsets ahead of robots and to their left.
 
     Args:
-        heading: headings of the robots, shape [B, 1] or [B, K].
-        offset: (x, y) in metres, shape [B, K, 2].
+        heading: headings of the robots in radians, shape [B, 1] or [B, K].
+        offset: offsets (x, y) in metres, shape [B, K, 2].
+
+    Returns:
+        The two components in metres, each of shape [B, K].
     """
     x = offset[..., 0]
     y = offset[..., 1]
@@ -150,7 +157,7 @@ def _in_robot_frame(heading: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def path_of(plan_state: OptimalState, pose: Tensor, dwell_s: Tensor) -> Tensor:
-    """Return positions along the best primitives to the goal, NaN after the goal.
+    """Return positions along the cheapest primitives to the goal.
 
     Args:
         plan_state: plan state with costs and costs to go.
@@ -158,12 +165,12 @@ def path_of(plan_state: OptimalState, pose: Tensor, dwell_s: Tensor) -> Tensor:
         dwell_s: dwell times of the robots in seconds, shape [B].
 
     Returns:
-        Positions (x, y) in metres, shape [B, N, 2].
+        Positions (x, y) in metres, NaN after the goal, shape [B, N, 2].
     """
     problem = plan_state.problem
     path = [pose[:, None, :2]]
     member = torch.arange(len(pose), device=pose.device)
-    for _ in range(_MAX_DRAWN):
+    for _ in range(_MAX_PLOTTED):
         distance_m = torch.linalg.vector_norm(pose[:, :2] - problem.goal_m, dim=1)
         is_away = distance_m >= problem.goal_radius_m
         if not bool(is_away.any()):
@@ -180,9 +187,11 @@ def path_of(plan_state: OptimalState, pose: Tensor, dwell_s: Tensor) -> Tensor:
 
 
 def _near(pose: Tensor, grid: Grid) -> tuple[Tensor, Tensor, Tensor]:
-    """Return rows and columns of cells around robots, and a mask of those on the map.
+    """Return the cells around robots.
 
-    Each has the shape [B, K].
+    Returns:
+        Rows and columns of cells, int64, and a mask of cells on the map, bool, each of
+        shape [B, K].
     """
     around = torch.arange(-_NEAR_CELLS, _NEAR_CELLS + 1, device=pose.device)
     offsets = torch.cartesian_prod(around, around)
@@ -205,7 +214,7 @@ def _cost(
     cells: tuple[Tensor, ...],
     plan_state: OptimalState,
 ) -> Tensor:
-    """Return costs of primitives plus the costs to go at their ends, shape [B, K].
+    """Return the costs of primitives plus the costs to go at their ends, shape [B, K].
 
     Args:
         pose: poses (x, y, θ) of the robots, shape [B, 3].
@@ -256,7 +265,7 @@ def _value_at(
 ) -> Tensor:
     """Return the cost to go at cell centres, interpolated over headings, shape [B, K].
 
-    It is undefined for cells off the map.
+    Results for cells off the map have no meaning.
     """
     _, levels, headings, height, width = to_go.value.shape
     row = cells[0].clamp(0, height - 1)

@@ -1,20 +1,21 @@
 """Value iteration over (x, y, θ): the minimum cost to go of a unicycle on a cost map.
 
-A state is a cell centre and one of Q headings. An action lasts for about a cell: full
-speed along one of five arcs, or a turn in place by one heading. λ scales speed and turn
-rate by the same factor. Hence an arc is the same curve on all terrain, and takes 1/λ
-times as long. Relative to its start it passes the same cells everywhere. A sweep over
-all states is therefore a convolution of the values for each arc. Between cell centres,
-values are interpolated bilinearly over the open cells.
-Source: Falcone and Ferretti (2013), "Semi-Lagrangian approximation schemes for linear
-and Hamilton-Jacobi equations".
+A state is a cell centre and one of Q headings. An action covers about the width of a
+cell: full speed along one of five arcs (one of them straight), or a turn in place by
+one heading. λ scales speed and turn rate by the same factor. Hence an arc is the same
+curve on all terrain, and takes 1/λ times as long. Relative to its start, it passes the
+same cells everywhere. A sweep over all states is therefore a convolution of the values
+for each arc. Between cell centres, values are interpolated bilinearly over the open
+cells. Source: Falcone and Ferretti (2013), "Semi-Lagrangian approximation schemes for
+linear and Hamilton-Jacobi equations".
 
-If terrain immobilises a robot after some dwell time, a state has several costs to go:
-at each level, the minimum over drives that are still possible after that dwell time.
-Each is stored with the dwell time up to which its drive is possible. The dwell time is
-not rounded, so that the dwell times of successive moves add up exactly.
-Letters in shapes: B maps, H×W cells, Q headings, A actions, N points along an arc, R
-reach of an arc in cells, L levels of dwell time.
+If terrain immobilises a robot after some dwell time, a state has L costs to go, one for
+each level of dwell time. It is the minimum over the drives that are still possible if
+the current dwell time is at that level. It is stored with the maximum current dwell
+time for which its drive is possible. This maximum is not rounded to a level, so that
+the dwell times of successive actions add up exactly. Letters in shapes: B maps, H×W
+cells, Q headings, A actions, N points along an arc, R reach of an arc in cells, L
+levels of dwell time.
 """
 
 import math
@@ -30,25 +31,26 @@ from benchnav.planning.robots import Unicycle
 
 _POINTS = 8  # number N of points along an arc
 UNREACHED = 1e6
-"""Cost to go before a path is found, or without one."""
-# A larger cost to go is mostly interpolated from unreached states.
+"""Cost to go of a state for which no path has been found."""
+# A larger cost to go is mostly interpolated from states without a path.
 _MIXED = UNREACHED / 100
-_BARRED = 1e-9  # interpolation weight of a non-free cell
+_BARRED = 1e-9  # interpolation weight of a cell that is not open
 _TOLERANCE = 1e-3  # maximum change of a cost at convergence
 _CHECK_EVERY = 10  # sweeps between checks for convergence
 _MAX_SWEEPS = 40  # maximum number of sweeps per cell of the longer side
-_MIN_DWELL_S = 1e-6  # minimum remaining dwell time of a possible drive
-_CHUNK_MAPS = 8  # maximum number of maps whose intermediate results fit the CPU cache
+_MIN_DWELL_S = 1e-6  # minimum of the maximum current dwell time of a possible drive
+_CHUNK_MAPS = 8  # number of maps whose intermediate results fit into the CPU cache
 
 
 @dataclass(frozen=True)
 class Moves:
-    """Actions of a robot for about a cell at λ = 1.
+    """Actions of a robot, each of which covers about the width of a cell.
 
     Args:
         actions: actions (v, ω), shape [A, 2].
-        seconds: duration of each action, shape [A].
-        turns: number of headings by which each action turns, A numbers.
+        seconds: duration of each action at λ = 1 in seconds, shape [A].
+        turns: number of headings by which each action turns, positive to the left, A
+            numbers.
     """
 
     actions: Tensor
@@ -59,8 +61,9 @@ class Moves:
     def of(cls, robot: Unicycle, cell_m: float, headings: int) -> "Moves":
         """Return the actions of a unicycle.
 
-        Straight driving lasts for a cell. An arc turns by a whole number of headings,
-        as many as fit in a cell and at least one. A turn in place turns by one heading.
+        A straight line is as long as a cell is wide. An arc turns by a whole number of
+        headings, at least one, and is otherwise no longer than a cell. A turn in place
+        turns by one heading.
         """
         top, max_rate = robot.action_high
         bin_rad = 2 * math.pi / headings
@@ -83,11 +86,11 @@ class Moves:
         """Return displacements after fractions of each action.
 
         Args:
-            heading: θ in radians, shape [*K].
+            heading: initial headings θ in radians, shape [*K].
             fraction: fractions of the duration of actions, shape [N].
 
         Returns:
-            (x, y) in metres, shape [*K, A, N, 2].
+            Displacements (x, y) in metres, shape [*K, A, N, 2].
         """
         speed, rate = self.actions.T.to(heading)[..., None]
         time = self.seconds.to(heading)[:, None] * fraction
@@ -109,16 +112,16 @@ class Costs(Batch):
     """Costs of driving on maps.
 
     Args:
-        rate: cost of a motion that takes a second at λ = 1, shape [B, H, W].
-        open: mask of cells between which values are interpolated, bool, shape
-            [B, H, W].
-        final: cost to go in cells where paths end, negative within the goal's disc; NaN
-            in other cells, shape [B, H, W].
+        rate: cost per second of motion at λ = 1, shape [B, H, W].
+        open: mask of cells whose values are interpolated, bool, shape [B, H, W].
+        final: cost to go in cells where paths end, which is negative within the goal's
+            disc; NaN in other cells; shape [B, H, W].
         hazard: hazard of immobilisation per metre, −ln of the survival probability,
             shape [B, H, W]; None without a hazard.
         loss: cost of an immobilised robot, shape [B].
-        immobile_s: dwell time of a motion that takes a second at λ = 1, 0 on other
-            terrain, shape [B, H, W]; None if nothing immobilises a robot.
+        immobile_s: dwell time per second of motion at λ = 1, which is 0 on terrain that
+            does not immobilise, shape [B, H, W]; None if no terrain immobilises a
+            robot.
         lost_after_s: dwell time in seconds after which a robot is immobilised.
         levels: number L of levels of dwell time.
     """
@@ -138,11 +141,11 @@ class CostToGo(Batch):
     """Minimum cost to go of every state.
 
     Args:
-        value: cost to go, `UNREACHED` without a drive, shape [B, L, Q, H, W]. At level
-            l it is the minimum over drives that are still possible after l / L of the
-            dwell time that immobilises a robot.
-        max_dwell_s: current dwell time of a robot below which that drive reaches the
-            goal, of the same shape; None if nothing immobilises a robot.
+        value: cost to go, shape [B, L, Q, H, W]; `UNREACHED` if no drive reaches the
+            goal. At level l, it is the minimum over drives that are possible if the
+            current dwell time is l / L of the dwell time that immobilises a robot.
+        max_dwell_s: current dwell time in seconds below which the drive of `value` is
+            possible, of the same shape; None if no terrain immobilises a robot.
     """
 
     value: Tensor
@@ -173,16 +176,18 @@ def value_iteration(costs: Costs, moves: Moves, grid: Grid, headings: int) -> Co
 
 @dataclass(frozen=True)
 class _Arc:
-    """An action at all headings.
+    """An action from each of Q headings.
 
     Args:
         seconds: duration in seconds at λ = 1.
-        metres: length in metres.
+        metres: length in metres; 0 for a turn in place.
         turn: number of headings by which the robot turns.
-        passed: fraction of the arc in each cell around the first, shape
+        passed: fraction of the arc in each cell around its first cell, shape
             [Q, 1, 2R + 1, 2R + 1].
-        ends: interpolation weights of the cells around the end, of the same shape.
-        points: rows and columns of the N points along the arc, Q of each.
+        ends: interpolation weight of each of these cells at the end of the arc, of the
+            same shape.
+        points: for each of the N points along the arc, Q rows and Q columns of its
+            cell, one for each heading.
     """
 
     seconds: float
@@ -199,7 +204,7 @@ class _Arc:
 
 
 def _arcs(moves: Moves, grid: Grid, headings: int, like: Tensor) -> list[_Arc]:
-    # Fractions of an arc at which costs are read, and its end.
+    # Fractions of an arc at which costs are read; the last is its end.
     fractions = (torch.arange(_POINTS) + 0.5) / _POINTS
     fractions = torch.cat((fractions, torch.ones(1))).double()
     offsets_m = moves.offsets(headings_of(headings), fractions)
@@ -227,7 +232,7 @@ def _arcs(moves: Moves, grid: Grid, headings: int, like: Tensor) -> list[_Arc]:
 
 
 def _fractions_in(cells: Tensor, reach: int) -> Tensor:
-    """Return the fraction of an arc in each cell, from cells [Q, N, 2] of its points."""
+    """Return the fraction of an arc in each cell, from cells [Q, N, 2] of points."""
     width = 2 * reach + 1
     fractions = torch.zeros(len(cells), width, width)
     for heading, points in enumerate(cells.tolist()):
@@ -237,7 +242,7 @@ def _fractions_in(cells: Tensor, reach: int) -> Tensor:
 
 
 def _end_weights(ends: Tensor, reach: int) -> Tensor:
-    """Return bilinear weights of cells around ends (row, column), shape [Q, 2]."""
+    """Return bilinear weights of the cells around ends (row, column), ends [Q, 2]."""
     width = 2 * reach + 1
     weights = torch.zeros(len(ends), width, width)
     for heading, (end_row, end_column) in enumerate(ends.tolist()):
@@ -258,8 +263,8 @@ def _solve(costs: Costs, arcs: list[_Arc], grid: Grid) -> CostToGo:
     scales = []
     dwells = []
     survivals: list[Tensor | None] = []
-    # Off the map a second costs as much as a missing path, and weights are those of the
-    # border.
+    # Off the map, the cost per second is that of a missing path, and the interpolation
+    # weights are those of the map's border.
     rate = pad(costs.rate[:, None], frame, value=UNREACHED)
     framed = pad(weights, frame, mode="replicate")
     for arc in arcs:
@@ -323,8 +328,8 @@ def _solve(costs: Costs, arcs: list[_Arc], grid: Grid) -> CostToGo:
         if sweep % _CHECK_EVERY == 0:
             change = value_before - value
             if dwell is not None:
-                # Values between those of reached and unreached states decrease for many
-                # sweeps, but do not affect any path.
+                # Values that are interpolated between states with and without a path
+                # decrease for many sweeps, but do not affect any path.
                 change = torch.where(value < _MIXED, change, 0.0)
             max_change = change.flatten(1).amax(1)[:, None, None, None, None]
             converged = max_change < _TOLERANCE
@@ -335,16 +340,17 @@ def _solve(costs: Costs, arcs: list[_Arc], grid: Grid) -> CostToGo:
 
 @dataclass(frozen=True)
 class _Dwell:
-    """Dwell time along an arc, from every state.
+    """Dwell times along an arc, from every state.
 
     Args:
-        first_s: dwell time until the arc first leaves immobilising terrain, or its
-            whole duration, in seconds, shape [B, Q, H, W].
-        last_s: dwell time after the arc last entered such terrain, in seconds; 0 if it
-            ends on other terrain or never leaves; of the same shape.
+        first_s: dwell time before the arc first leaves immobilising terrain in seconds,
+            shape [B, Q, H, W]; the dwell time on the whole arc if it does not leave it.
+        last_s: dwell time after the arc last entered immobilising terrain in seconds,
+            of the same shape; 0 if the arc ends on other terrain, or does not leave
+            immobilising terrain.
         leaves: mask of arcs with a point on other terrain, bool, of the same shape.
-        is_lost: mask of arcs that immobilise a robot between both, bool, of the same
-            shape.
+        is_lost: mask of arcs on which a robot is immobilised after it has left
+            immobilising terrain once, bool, of the same shape.
         lost_after_s: dwell time in seconds after which a robot is immobilised.
     """
 
@@ -358,8 +364,8 @@ class _Dwell:
         """Return costs to go and maximum dwell times at the start of an arc.
 
         Args:
-            value: costs to go at its end, shape [B, L, Q, H, W].
-            max_dwell_s: maximum dwell times at its end, of the same shape.
+            value: costs to go at the end of the arc, shape [B, L, Q, H, W].
+            max_dwell_s: maximum dwell times at the end of the arc, of the same shape.
         """
         levels = value.shape[1]
         limit_s = self.lost_after_s
@@ -367,8 +373,8 @@ class _Dwell:
         dwell = max_end_s - self.first_s[:, None]
         is_lost = self.is_lost[:, None] | (max_dwell_s <= self.last_s[:, None])
         dwell = torch.where(is_lost, 0.0, dwell)
-        # Over levels, both the remaining dwell time and the cost increase, so the first
-        # drive that leaves enough dwell time is the cheapest.
+        # Both the maximum dwell time and the cost increase with the level. Hence the
+        # first level whose maximum dwell time suffices has the cheapest drive.
         first_levels = []
         for level in range(levels):
             min_dwell_s = max(level * limit_s / levels, _MIN_DWELL_S)

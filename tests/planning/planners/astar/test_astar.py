@@ -251,7 +251,7 @@ def test_a_wall_of_cells_that_touch_at_corners_is_a_wall(gap: bool) -> None:
     # centres.
     beside = torch.tensor([[[3.99, 3.99], [4.01, 4.01]]])
     near, far = astar.cost_at(
-        problem.grid, astar.framed(problem, field), *beside.unbind(-1)
+        problem.grid, astar.pad_costs(problem, field), *beside.unbind(-1)
     )[0].tolist()
     assert near > far + (2 if gap else 0.3 * PENALTY)
 
@@ -303,7 +303,7 @@ def test_the_cost_at_a_centre_is_that_of_its_cell() -> None:
     field = astar.search(problem)
     centres = astar.cell_centres(problem.grid, torch.arange(16 * 12)).expand(3, -1, -1)
     found = astar.cost_at(
-        problem.grid, astar.framed(problem, field), centres[..., 0], centres[..., 1]
+        problem.grid, astar.pad_costs(problem, field), centres[..., 0], centres[..., 1]
     )
     torch.testing.assert_close(found, field.cost.flatten(1), rtol=1e-5, atol=1e-4)
 
@@ -312,7 +312,7 @@ def test_the_cost_between_centres_is_the_least_of_lines_to_those_near() -> None:
     problem = random_problem(2, Unicycle(), by_time=True)
     field, points = astar.search(problem), everywhere(problem, 60)
     found = astar.cost_at(
-        problem.grid, astar.framed(problem, field), points[..., 0], points[..., 1]
+        problem.grid, astar.pad_costs(problem, field), points[..., 0], points[..., 1]
     )
     per_m, free = (
         1 / problem.risk_map.clamp(min=0.3) + PENALTY * ~problem.free,
@@ -351,7 +351,7 @@ def test_the_cost_between_centres_is_the_least_of_lines_to_those_near() -> None:
 
 def test_off_the_map_the_cost_is_above_all_on_it() -> None:
     problem = random_problem(2, Unicycle(), by_time=True)
-    costs = astar.framed(problem, astar.search(problem))
+    costs = astar.pad_costs(problem, astar.search(problem))
     outside = torch.tensor([-3.0, 20.0]).expand(3, 2)
     on_map = costs[:, 0].unflatten(1, (18, 14))[:, 1:-1, 1:-1]
     assert float(astar.cost_at(problem.grid, costs, outside, outside).min()) > float(
@@ -365,6 +365,6 @@ def test_a_robot_of_twice_the_speed_has_half_the_time_to_go() -> None:
         problem = random_problem(1, Unicycle(speed_mps=(0, speed)), by_time=True)
         problem = replace(problem, free=torch.ones_like(problem.free))
         points = everywhere(problem, 40)
-        costs = astar.framed(problem, astar.search(problem))
+        costs = astar.pad_costs(problem, astar.search(problem))
         found.append(astar.cost_at(problem.grid, costs, points[..., 0], points[..., 1]))
     torch.testing.assert_close(found[0], 2 * found[1])
