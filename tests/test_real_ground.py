@@ -165,9 +165,9 @@ def test_nothing_is_scored_against_a_truth_that_is_unknown(
                 in text
             )
             assert "are computed against measured λ" in text
-            assert ("this model predicts from the class table of the recipe" in text) == (
-                model == "oracle"
-            )
+            assert (
+                "this model predicts from the class table of the recipe" in text
+            ) == (model == "oracle")
         found = json.loads((tmp_path / model / "quality.json").read_text())
         assert found["truth"] == {"test/site": "unknown"}
         assert found["splits"]["test/site"]["rmse_expected"] is None

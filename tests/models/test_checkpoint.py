@@ -331,7 +331,7 @@ def test_a_save_never_replaces_what_is_no_checkpoint(
 ) -> None:
     (tmp_path / "precious").mkdir()
     (tmp_path / "precious" / "notes.txt").write_text("keep")
-    with pytest.raises(ConfigError, match="contains no config.json"):
+    with pytest.raises(ConfigError, match=r"contains no config\.json"):
         save_checkpoint(tmp_path / "precious", load_checkpoint(folder))
     assert (tmp_path / "precious" / "notes.txt").read_text() == "keep"
 

@@ -174,7 +174,7 @@ def test_a_users_own_model_is_recalibrated_and_kept(
     )
     check_model(f"{OWN}@{out}", shapes=((20, 37),))
     card = (out / "README.md").read_text()
-    assert "recalibrated by 3 maps" in card
+    assert "recalibrated on 3 maps" in card
     assert "ensemble" not in card
     assert json.loads((out / "config.json").read_text())["conformal"]["maps"] == 3
 
