@@ -164,10 +164,10 @@ def test_nothing_is_scored_against_a_truth_that_is_unknown(
                 "the true distribution of λ is unknown on test/site: RMSE E[λ] is a dash"
                 in text
             )
-            assert "are against measured λ" in text
-            assert ("this model predicts by the class table of the recipe" in text) == (
-                model == "oracle"
-            )
+            assert "are computed against measured λ" in text
+            assert (
+                "this model predicts from the class table of the recipe" in text
+            ) == (model == "oracle")
         found = json.loads((tmp_path / model / "quality.json").read_text())
         assert found["truth"] == {"test/site": "unknown"}
         assert found["splits"]["test/site"]["rmse_expected"] is None
@@ -213,7 +213,7 @@ def test_lambda_that_the_class_table_drew_is_not_called_measured(
     capfd.readouterr()
     assert call("train", "evaluate", "oracle", "--data", "real.h5") == 0
     said = capfd.readouterr().out
-    assert "λ drawn at least in part from the class table, not measured λ" in said
+    assert "λ that is at least partly drawn from the class table, not measured" in said
     # Beside such ground the truth of what a recipe made is as well known as before.
     made = (
         "create",

@@ -44,7 +44,8 @@ class TraversabilityModel(Specified, ABC):
     def member_probabilities(self, observation: Observation) -> Tensor | None:
         """Return class probabilities of each member of an ensemble.
 
-        The ensemble is calibrated as a whole.
+        These probabilities are not calibrated together; calibration applies to their
+        average.
 
         Args:
             observation: B maps of any size.
@@ -57,29 +58,29 @@ class TraversabilityModel(Specified, ABC):
 
 
 class ModelFamily(TraversabilityModel):
-    """Base class of models stored in checkpoints, under the registered name of the class."""
+    """Base class of models that checkpoints store, with the registered name of the class."""
 
     @classmethod
     @abstractmethod
     def from_checkpoint(cls, checkpoint: Checkpoint) -> "ModelFamily":
-        """Rebuild a model.
+        """Rebuild a model from a checkpoint.
 
         `load_model` reports exceptions of this method in one line.
 
         Raises:
-            CheckpointError: If a part is missing.
+            CheckpointError: If a part of the checkpoint is missing.
         """
 
 
 class PrivilegedModel(TraversabilityModel):
     """Base class of the models of this package that receive the truth.
 
-    They serve as references, to attribute failures.
+    As references, they show which failures are due to errors of prediction.
     """
 
     @abstractmethod
     def predict_terrain(self, terrain: Terrain) -> TraversabilityDistribution:
-        """Predict as `predict`, from the truth."""
+        """Return the distribution of λ from the true terrain, shape [B, H, W]."""
 
     def predict(self, observation: Observation) -> TraversabilityDistribution:
         """Raise an error: an observation does not contain the truth.
@@ -89,7 +90,7 @@ class PrivilegedModel(TraversabilityModel):
         """
         raise ConfigError(
             f"Expected the Terrain for the privileged model {type(self).__name__}, got an "
-            "Observation. Call `benchnav.models.predict`."
+            "Observation. Call `benchnav.models.predict` with the Terrain."
         )
 
 
@@ -101,10 +102,10 @@ def is_family(target: Any) -> TypeGuard[type[ModelFamily]]:
 def layers_of(observation: Observation, names: Collection[str]) -> dict[str, Tensor]:
     """Return the layers of an observation that a model needs, by name.
 
-    If the observation has no layer `seen`, all cells are taken as observed.
+    If the observation has no layer `seen`, all cells count as observed.
 
     Raises:
-        ConfigError: If a layer is missing.
+        ConfigError: If the observation lacks a layer.
     """
     layers = {
         "rgb": observation.rgb,
@@ -117,8 +118,8 @@ def layers_of(observation: Observation, names: Collection[str]) -> dict[str, Ten
     missing = [name for name in names if name not in layers]
     expect(
         not missing,
-        f"maps with the layers that the model was trained on, {' and '.join(missing)} "
-        f"among them, got {', '.join(layers)}. Use a dataset that has them.",
+        f"maps with the layers {' and '.join(missing)}, on which the model was trained, "
+        f"got maps with {', '.join(layers)}. Use a dataset with all these layers.",
     )
     return {name: layers[name] for name in names}
 
@@ -126,7 +127,7 @@ def layers_of(observation: Observation, names: Collection[str]) -> dict[str, Ten
 def predict(
     model: TraversabilityModel, terrain: Terrain, observation: Observation | None = None
 ) -> TraversabilityDistribution:
-    """Predict maps: privileged models from the Terrain, others from its Observation.
+    """Return a model's prediction for maps; only privileged models receive the Terrain.
 
     Args:
         model: any model.
@@ -149,17 +150,17 @@ def predict(
 def predict_observation(
     model: TraversabilityModel, observation: Observation
 ) -> TraversabilityDistribution:
-    """Predict maps from an observation only; privileged models raise an error."""
+    """Return a prediction from an observation; privileged models raise an error."""
     with exact_convolutions():
         predicted: Any = model.predict(observation)
     shape = [len(observation.rgb), *observation.grid.shape]
-    got = type(predicted).__name__
+    description = type(predicted).__name__
     if isinstance(predicted, TraversabilityDistribution):
         if list(predicted.shape) == shape:
             return predicted
-        got += f" of shape {list(predicted.shape)}"
+        description += f" of shape {list(predicted.shape)}"
     raise ConfigError(
-        f"Expected the model to give a TraversabilityDistribution of shape {shape}, "
-        f"got {got}. Return a TraversabilityMixture, a QuantileDistribution or a "
-        "custom subclass."
+        "Expected the model to return a TraversabilityDistribution of shape "
+        f"{shape}, got {description}. Return a TraversabilityMixture, a "
+        "QuantileDistribution or a custom subclass."
     )

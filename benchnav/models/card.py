@@ -1,4 +1,4 @@
-"""Card of a checkpoint, README.md, for hubs and people: model, training data, and use."""
+"""README.md of a checkpoint, its card for hubs and readers: model, training data, use."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -23,13 +23,14 @@ def card_of(
     """Return the card of a checkpoint.
 
     Args:
-        name: name of its folder.
-        model: kind of the model.
-        parts: its parts by name, each a `models.checkpoint.Part`; at least one.
+        name: name of the checkpoint's folder.
+        model: name of the model's class, as in `Checkpoint.model`.
+        parts: parts of the model by name, each a `models.checkpoint.Part`; at least one.
         classes: names of the terrain classes.
         code: digest of the code of a custom class; empty for models of this package.
-        conformal_maps: number of maps of the recalibration; 0 without one.
-        pool_temperature: of the average of its members.
+        conformal_maps: number of maps used for conformal recalibration; 0 if the model is
+            not recalibrated.
+        pool_temperature: temperature of the average of an ensemble's members.
 
     Returns:
         Markdown, with the front matter that model hubs read.
@@ -40,12 +41,12 @@ def card_of(
         "tags": ["traversability", "robotics"],
         "datasets": datasets,
     }
-    # An installed class is found by its name.
+    # A registered class is loaded by name; any other needs the path of its file.
     is_custom = code and model not in registry.names("model")
     model_path = f"path/to/file.py:{model}@{name}" if is_custom else name
     custom_note = (
-        f"The class `{model}` is a user's own and not in this folder: name the file "
-        "that holds it. The "
+        f"The class `{model}` is custom code, which is not in this folder: give the "
+        "path of its file. The "
         f"SHA-256 of its code was `{code}`. Loading runs that file.\n\n"
         if is_custom
         else ""
@@ -54,46 +55,46 @@ def card_of(
         f"Terrain classes of the maps: {', '.join(classes)}.\n\n" if classes else ""
     )
     guarantee = (
-        f"It is recalibrated by {conformal_maps} maps (conformal): on a new map of "
-        "the same kind λ of a random cell "
-        "falls below the u-quantile with probability u at most. Nothing is promised "
-        "on other ground.\n\n"
+        f"The model is recalibrated on {conformal_maps} maps (conformal prediction): on "
+        "a new map of the same kind, λ of a random cell is below the predicted "
+        "u-quantile with probability at most u. There is no guarantee for other "
+        "terrain.\n\n"
         if conformal_maps
         else ""
     )
     return (
         f"---\n{yaml.safe_dump(head, sort_keys=False)}---\n\n# {name}\n\n"
-        f"A model of traversability of the kind `{model}`, trained on "
+        f"A traversability model of the class `{model}`, trained on "
         f"{' and '.join(datasets)}. It predicts "
         "the distribution of traversability in every cell of a "
-        f"map.{_members(parts, pool_temperature)} This folder "
-        "holds tensors and settings, and no code.\n\n"
+        f"map.{_ensemble_sentence(parts, pool_temperature)} This folder "
+        "contains tensors and settings, and no code.\n\n"
         f"```sh\nbenchnav-train evaluate {model_path} --data DATASET\n"
         f"benchnav-eval run --model {model_path} --data DATASET\n```\n\n"
         "```python\nfrom benchnav.models import load_model\n\nmodel = "
         f"load_model({model_path!r})\n```\n\n"
         f"{custom_note}{classes}{guarantee}## Parts\n\n{_parts_table(parts)}\n\n## "
         f"Settings\n\n{_settings_table(parts)}\n\n"
-        "Measures are of the validation maps, which early stopping and calibration "
-        "have seen. `config.json` holds the "
-        "digests of data and tensors, and the versions of the packages. No licence is "
-        "given here: add one before you "
-        "share it.\n"
+        "The metrics are those of the validation maps, which early stopping and "
+        "calibration have used. `config.json` contains the "
+        "digests of data and tensors, and the versions of the packages. This card "
+        "contains no licence: add one before you share the checkpoint.\n"
     )
 
 
-def _members(parts: Mapping[str, Any], temperature: float) -> str:
-    """Return a sentence on the number of networks of an ensemble, otherwise nothing."""
-    count = sum(name.partition("-")[2] != "" for name in parts) + 1
-    if count == 1:
+def _ensemble_sentence(parts: Mapping[str, Any], temperature: float) -> str:
+    """Return a sentence on the members of an ensemble; empty for a single network."""
+    n_members = sum(name.partition("-")[2] != "" for name in parts) + 1
+    if n_members == 1:
         return ""
-    widened = (
+    calibrated = (
         ""
         if temperature == 1
-        else f", and widened by the temperature {temperature:.3g}"
+        else f" and calibrated by the temperature {temperature:.3g}"
     )
     return (
-        f" It is an ensemble: what its {count} networks predict is averaged{widened}."
+        f" It is an ensemble: the predictions of its {n_members} networks are "
+        f"averaged{calibrated}."
     )
 
 

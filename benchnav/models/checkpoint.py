@@ -47,7 +47,7 @@ from benchnav.models.parts import GP, member_name, training_command
 FORMAT = "benchnav-checkpoint"
 FORMAT_VERSION = (2, 3)
 OLDEST_VERSION = (2, 0)
-_SEALED = (2, 2)  # from this version on, config.json contains its own digest
+_FIRST_WITH_DIGEST = (2, 2)  # from this version on, config.json contains its own digest
 CONFIG = "config.json"
 GROUND = "ground.json"
 FUSED = "fused"
@@ -71,18 +71,18 @@ class Part:
     """One trained part of a model.
 
     Args:
-        config: settings to rebuild it from, plain data.
+        config: settings from which the part is rebuilt, as plain data.
         tensors: weights and tables by name.
-        seed: root seed of its training.
-        metrics: metrics after training.
+        seed: root seed of the training.
+        metrics: values of metrics after training, by name.
         data_id: name of the training data: a dataset, or a file of slip logs.
         data_digest: content digest of the training data.
         half_precision: whether kernels are stored as float16; they are read as float32.
-        versions: versions of the packages that trained it.
-        trainer: settings of the trainer that affect the result; None for a part without a
-            trainer, or of an earlier version.
-        conformal: whether training left out every second map of `valid` for conformal
-            scores.
+        versions: versions of the packages that trained the part, by name.
+        trainer: settings of the trainer that affect the result; None if the part has no
+            trainer or was saved by an earlier version.
+        conformal: whether every second map of `valid` was reserved for conformal
+            recalibration.
     """
 
     __repr__ = short_repr
@@ -105,15 +105,16 @@ class Checkpoint:
 
     Args:
         class_names: names of the C classes, in the order of their ids.
-        parts: its parts by name; `gp`, `classifier`, `classifier-2`, … of a fused model.
+        parts: trained parts by name; those of a fused model are `gp`, `classifier`,
+            `classifier-2`, ….
         model: registered name of the family that rebuilds the model; for a custom class
             from a file or module, its class name.
         pool_temperature: temperature of the average of several members (see
             `models.nets.calibration`); 1 changes nothing.
         code: digest of the code of a custom class; empty for models of this package.
         conformal: a `models.conformal.ConformalTable` as plain data, which recalibrates
-            the model; empty without one.
-        ground: statistics of the latest training maps; None without training maps.
+            the model; empty if the model is not recalibrated.
+        ground: statistics of the maps of the latest training; None if no maps were used.
     """
 
     __repr__ = short_repr
@@ -130,12 +131,12 @@ class Checkpoint:
         """Return a part.
 
         Raises:
-            CheckpointError: If it has not been trained.
+            CheckpointError: If the part has not been trained.
         """
         if name not in self.parts:
             raise CheckpointError(
                 f"Expected a checkpoint with a part {name!r}, got one with "
-                f"{sorted(self.parts)}. Train it with `benchnav-train "
+                f"the parts {sorted(self.parts)}. Train {name!r} with `benchnav-train "
                 f"{training_command(name)}` into the same folder."
             )
         return self.parts[name]
@@ -143,8 +144,8 @@ class Checkpoint:
     def with_part(self, name: str, part: Part) -> "Checkpoint":
         """Return a copy with one part added or replaced.
 
-        Another member invalidates the pool's temperature; any part invalidates the
-        conformal recalibration.
+        The conformal recalibration is removed. The pool temperature is reset to 1, unless
+        the part is `gp`.
         """
         temperature = self.pool_temperature if name == GP else 1.0
         parts = {**self.parts, name: part}
@@ -152,9 +153,9 @@ class Checkpoint:
 
 
 def digests_of(folder: Path) -> dict[str, str]:
-    """Return the SHA-256 of each file that affects predictions, by name.
+    """Return the SHA-256 of each file that affects predictions, by file name.
 
-    The card and the statistics of the terrain do not affect them.
+    The card and the terrain statistics do not affect predictions.
     """
     suffixes = (".json", ".safetensors")
     paths = (path for path in folder.iterdir() if path.suffix in suffixes)
@@ -164,7 +165,7 @@ def digests_of(folder: Path) -> dict[str, str]:
 
 
 def member_names(checkpoint: Checkpoint, stem: str) -> list[str]:
-    """Return the names of the existing members, or else that of the first."""
+    """Return the names of the members that exist; if none exists, the first's name."""
     names = [member_name(index, stem) for index in range(len(checkpoint.parts))]
     return [name for name in names if name in checkpoint.parts] or [stem]
 
@@ -173,7 +174,7 @@ def as_stored(tensors: Mapping[str, Tensor], half_precision: bool) -> dict[str, 
     """Return tensors as they will be read back: kernels are rounded if stored as float16.
 
     Args:
-        tensors: by name.
+        tensors: tensors of a part by name.
         half_precision: whether kernels are stored as float16.
     """
     return _as_read(_to_store(tensors, half_precision))
@@ -187,43 +188,45 @@ def save_checkpoint(folder: str | Path, checkpoint: Checkpoint) -> None:
         checkpoint: content to write.
 
     Raises:
-        OSError: If it cannot be written.
+        OSError: If the checkpoint cannot be written.
         ConfigError: If the path exists and is not a checkpoint.
-        BenchnavError: If another process is writing it.
+        BenchnavError: If another process is writing the checkpoint.
     """
-    with sole_writer(Path(folder), str(folder)), open_place(folder) as (path, partial):
+    writer = sole_writer(Path(folder), str(folder))
+    with writer, open_for_writing(folder) as (path, partial):
         _write(partial, checkpoint, path.name)
         replace_folder(partial, path, last=CONFIG)
 
 
 @contextmanager
-def open_place(folder: str | Path) -> Iterator[tuple[Path, Path]]:
+def open_for_writing(folder: str | Path) -> Iterator[tuple[Path, Path]]:
     """Provide the resolved path of a checkpoint, and an empty folder to write it to.
 
     Raises:
-        OSError: If it cannot be written.
+        OSError: If the folder cannot be written.
         ConfigError: If the path exists and is not a checkpoint.
     """
     check_output(str(folder))
-    # a/../b is b, whether or not there is an a.
+    # a/../b is b even if a does not exist.
     path = resolve_link(Path(os.path.normpath(folder)))
     restore(path)
-    check_replaceable(path, True, _foreign)
+    check_replaceable(path, True, _why_no_checkpoint)
     with building(path) as partial:
         yield path, partial
 
 
-def _foreign(path: Path) -> str:
-    """Return why a path is not a checkpoint, empty if it is; for `check_replaceable`."""
+def _why_no_checkpoint(path: Path) -> str:
+    """Return why a path is not a checkpoint, for `check_replaceable`; empty if it is one."""
     is_checkpoint = (path / CONFIG).is_file()
-    return "" if is_checkpoint else "is something else than a checkpoint"
+    return "" if is_checkpoint else f"contains no {CONFIG}"
 
 
 def load_checkpoint(folder: str | Path) -> Checkpoint:
     """Read a checkpoint, with tensors on the CPU; float16 tensors become float32.
 
     Raises:
-        CheckpointError: If it is missing, damaged, or of a newer format.
+        CheckpointError: If the checkpoint is missing or damaged, or this version cannot
+            read its format.
     """
     folder = Path(folder)
     config = read_config(folder)
@@ -235,7 +238,7 @@ def load_checkpoint(folder: str | Path) -> Checkpoint:
         names = config["class_names"]
         is_text = all(isinstance(name, str) for name in names)
         if not is_text or len(set(names)) != len(names):
-            raise ValueError("class_names are not names of different classes")
+            raise ValueError("class_names are not different texts")
         temperature = float(config.get("pool_temperature", 1.0))
         if not 0 < temperature < float("inf"):
             raise ValueError(f"pool_temperature is {temperature}")
@@ -249,14 +252,17 @@ def load_checkpoint(folder: str | Path) -> Checkpoint:
             ground=read_ground(folder, config),
         )
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise _damaged(folder / CONFIG, f"{type(error).__name__} {error}") from error
+        raise _damage_error(
+            folder / CONFIG, f"{type(error).__name__} {error}"
+        ) from error
 
 
 def read_config(folder: Path) -> dict[str, Any]:
     """Read the description of a checkpoint, without its tensors.
 
     Raises:
-        CheckpointError: If it is missing, damaged, or of a newer format.
+        CheckpointError: If the checkpoint is missing or damaged, or this version cannot
+            read its format.
     """
     path = folder / CONFIG
     if not path.is_file():
@@ -269,7 +275,7 @@ def read_config(folder: Path) -> dict[str, Any]:
         config = json.loads(text)
         kind = config["format"]
         version = tuple(int(part) for part in config["format_version"].split("."))
-        if kind == FORMAT and _SEALED <= version <= FORMAT_VERSION:
+        if kind == FORMAT and _FIRST_WITH_DIGEST <= version <= FORMAT_VERSION:
             config = unseal(text)
     except (
         OSError,
@@ -279,11 +285,11 @@ def read_config(folder: Path) -> dict[str, Any]:
         AttributeError,
         RecursionError,
     ) as error:
-        raise _damaged(path, f"{type(error).__name__} {error}") from error
+        raise _damage_error(path, f"{type(error).__name__} {error}") from error
     if kind != FORMAT:
         raise CheckpointError(
-            f"Expected format {FORMAT!r} in {path}, got {kind!r}. Name a benchnav "
-            "checkpoint."
+            f"Expected format {FORMAT!r} in {path}, got {kind!r}. Give the folder of a "
+            "BenchNav checkpoint."
         )
     if version > FORMAT_VERSION or version < OLDEST_VERSION:
         remedy = "Train the model again with this version."
@@ -305,8 +311,8 @@ def read_ground(folder: Path, config: Mapping[str, Any]) -> GroundStatistics | N
 
     Args:
         folder: folder of the checkpoint.
-        config: result of `read_config`. In checkpoints of earlier versions it does not
-            name statistics, but they may have been added to the folder later.
+        config: result of `read_config`. In checkpoints of earlier versions it has no
+            digest of the statistics; their file may have been added later.
 
     Raises:
         CheckpointError: If the statistics are missing or damaged.
@@ -318,10 +324,10 @@ def read_ground(folder: Path, config: Mapping[str, Any]) -> GroundStatistics | N
     try:
         content = path.read_bytes()
         if sha256 and hashlib.sha256(content).hexdigest() != sha256:
-            raise _damaged(path, "its SHA-256 is not the one in config.json")
+            raise _damage_error(path, "its SHA-256 is not the one in config.json")
         return GroundStatistics.from_json(content.decode())
     except (OSError, UnicodeDecodeError, ConfigError) as error:
-        raise _damaged(path, str(error)) from error
+        raise _damage_error(path, str(error)) from error
 
 
 def _write(folder: Path, checkpoint: Checkpoint, name: str) -> None:
@@ -385,8 +391,8 @@ def _to_store(tensors: Mapping[str, Tensor], half: bool) -> dict[str, Tensor]:
         for name, value in tensors.items()
     }
     for name, value in stored.items():
-        # Only kernels: running variances and biases are few, and may exceed the range
-        # of float16.
+        # Running variances and biases remain float32: they are few, and may exceed the
+        # range of float16.
         if half and value.is_floating_point() and value.ndim >= 2:
             stored[name] = value.half()
     return stored
@@ -396,10 +402,10 @@ def _read_part(path: Path, data: Mapping[str, str], sha256: str, **entry: Any) -
     try:
         content = path.read_bytes()
         if hashlib.sha256(content).hexdigest() != sha256:
-            raise _damaged(path, "its SHA-256 is not the one in config.json")
+            raise _damage_error(path, "its SHA-256 is not the one in config.json")
         tensors = _as_read(safetensors.torch.load(content))
     except (OSError, safetensors.SafetensorError) as error:
-        raise _damaged(path, str(error)) from error
+        raise _damage_error(path, str(error)) from error
     return Part(
         **entry, tensors=tensors, data_id=data["id"], data_digest=data["digest"]
     )
@@ -412,7 +418,7 @@ def _as_read(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     }
 
 
-def _damaged(path: Path, reason: str) -> CheckpointError:
+def _damage_error(path: Path, reason: str) -> CheckpointError:
     return CheckpointError(
         f"{path} is damaged: {reason}. Copy the whole checkpoint again, or train it "
         "again."

@@ -1,4 +1,4 @@
-"""Locations of checkpoints: by path, by name, or on a hub."""
+"""Search for checkpoints by path, by name, or on a hub."""
 
 import re
 from pathlib import Path
@@ -15,7 +15,8 @@ _ONLY_IN_REPOSITORY = "paper-v1"  # a checkpoint that `setup.py` leaves out of w
 def find_checkpoint(source: str | Path) -> Path:
     """Find the folder of a checkpoint by path, by name, or on a hub.
 
-    Names are those in `checkpoints/` here and of the shipped checkpoints.
+    A name is looked up in `checkpoints/` of the working directory first, then among the
+    shipped checkpoints.
 
     Args:
         source: path, name or `owner/name@revision`; for `path/to/file.py:Name@CHECKPOINT`
@@ -23,9 +24,9 @@ def find_checkpoint(source: str | Path) -> Path:
 
     Raises:
         CheckpointError: If the training of the checkpoint was interrupted.
-        ConfigError: If there is no such folder, nor a model of that name.
+        ConfigError: If no checkpoint matches the source.
     """
-    class_and_checkpoint = split_own(source)
+    class_and_checkpoint = split_class_and_checkpoint(source)
     if class_and_checkpoint:
         source = class_and_checkpoint[1]
     path = Path(source)
@@ -34,16 +35,16 @@ def find_checkpoint(source: str | Path) -> Path:
         if (candidate / CONFIG).is_file():
             return candidate
     if path.is_dir():
-        return path  # the reader reports what is missing
+        return path  # `read_config` reports the missing file
     for candidate in candidates:
         check_finished(candidate)
     if hub.is_address(source):
         return hub.download(str(source), "model", CheckpointError)
     if str(source) == _ONLY_IN_REPOSITORY:
         raise ConfigError(
-            f"Expected the checkpoint {source} in checkpoints/, got none: the wheel "
-            f"leaves it out for its size. Copy the folder checkpoints/{source} of the "
-            "repository there, or name another model, such as stakes-v1."
+            f"Expected the checkpoint {source} in checkpoints/, which the wheel leaves "
+            f"out for its size, got no such folder. Copy checkpoints/{source} from the "
+            "repository to checkpoints/, or use another model, such as stakes-v1."
         )
     names = [folder.name for folder in list_checkpoints()]
     options = sorted({*registry.names("model"), *names})
@@ -61,9 +62,10 @@ def find_checkpoint(source: str | Path) -> Path:
 
 
 def list_checkpoints() -> list[Path]:
-    """Return the folders of the checkpoints in `checkpoints/` here and of those shipped.
+    """Return the folders of local and shipped checkpoints.
 
-    Of several checkpoints with the same name only the first is returned.
+    Local checkpoints are in `checkpoints/` of the working directory. If a local and a
+    shipped checkpoint have the same name, only the local one is returned.
     """
     by_name: dict[str, Path] = {}
     for folder in _checkpoint_folders():
@@ -72,11 +74,11 @@ def list_checkpoints() -> list[Path]:
     return list(by_name.values())
 
 
-def split_own(source: str | Path) -> tuple[str, str] | None:
+def split_class_and_checkpoint(source: str | Path) -> tuple[str, str] | None:
     """Split `path/to/file.py:Name@CHECKPOINT` into class and checkpoint.
 
     Returns:
-        None if the source does not have this form.
+        Class and checkpoint; None if the source does not have this form.
     """
     match = re.fullmatch(r"(.+?:[A-Za-z_][\w.]*)@(.+)", str(source))
     if match is None or (Path(source) / CONFIG).is_file():

@@ -26,7 +26,7 @@ def fit(
     settings: dict[str, Any] | None = None,
     members: int = 1,
 ) -> None:
-    """Train a model of any kind, by name or a custom class, or an ensemble.
+    """Train a model, given by its name or a custom class, or an ensemble of it.
 
     Args:
         options: Training options.
@@ -36,7 +36,7 @@ def fit(
         data: Path or id of a dataset with splits train and valid.
         out: Checkpoint folder. Logs are written to OUT.training.
         settings: Settings of the model, such as --settings.learning_rate 1e-3
-            --settings.inputs [rgb,elevation_m]; for fused those of its stages, such as
+            --settings.inputs [rgb,elevation_m]; for fused, settings of its stages, such as
             --settings.classifier.encoder_depth 3.
         members: Number of networks; their distributions are averaged.
     """
@@ -78,15 +78,15 @@ def train_gp(
     """Train the class-wise Gaussian processes.
 
     Args:
-        data: Path or id of a dataset with splits train and valid; or slip logs, a file
-            .csv, .tsv, one of these with .gz, or .parquet, with the columns class,
-            slope_deg and traversability; and optionally drive, to hold out whole drives.
+        data: Path or id of a dataset with splits train and valid; or a file of slip logs
+            (.csv, .tsv, .csv.gz, .tsv.gz or .parquet) with the columns class, slope_deg
+            and traversability, and optionally drive, to hold out whole drives.
         out: Checkpoint folder; classifiers in it for the same classes are preserved, and
-            slip logs are read with their class table.
+            their class names are used to read slip logs.
         gp: Settings of the GPs.
         seed: Root seed of the selection of held-out rows or drives of slip logs.
         device: Device for training; auto uses CUDA if there is a GPU.
-        overwrite: Replace existing GPs, or a checkpoint of other classes.
+        overwrite: Replace existing GPs, or a checkpoint for other classes.
     """
     from benchnav.models.training.fit import FitOptions
     from benchnav.models.training.gaussian_processes import train_gps

@@ -1,6 +1,4 @@
-"""Settings of models and of their training; fast to import, so that commands start
-quickly.
-"""
+"""Settings of models and their training; this module is fast to import, for commands."""
 
 import math
 from dataclasses import asdict, dataclass, field
@@ -9,10 +7,10 @@ from typing import Any, Literal
 from benchnav.core.command import Device
 from benchnav.core.errors import expect
 
-DEEPEST = 5  # stages of the encoders of segmentation-models-pytorch
+MAX_ENCODER_DEPTH = 5  # number of encoder stages in segmentation-models-pytorch
 
-_MAX_PRIOR = 10  # in units of λ; beyond it the GPs cannot be solved
-_N_SEEDS = 2**63  # valid seeds of PyTorch's generators
+_MAX_PRIOR = 10  # in units of λ; with larger values the GPs cannot be solved
+_N_SEEDS = 2**63  # number of valid seeds of PyTorch's generators
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,8 +18,8 @@ class TrainOptions:
     """Options of the training of networks.
 
     Args:
-        seed: Root seed of weights, order and augmentation; members of an ensemble have
-            SEED, SEED + 1, ….
+        seed: Root seed of weights, map order and augmentation; the members of an ensemble
+            have the seeds SEED, SEED + 1, ….
         device: Device for training and calibration; auto uses CUDA if there is a GPU.
         trainer: Settings of Lightning's trainer, for example --trainer.devices 2
             --trainer.precision 32-true.
@@ -29,13 +27,14 @@ class TrainOptions:
         in_memory: Store all maps in memory instead of reading them on demand.
         half_precision: Store the weights of networks as float16.
         symmetries: Rotate and mirror training maps at random. If not given, all maps except
-            those with a photo, whose light has a fixed direction.
-        crop: Side in cells of the squares to train on, drawn again each epoch; 0 for whole
-            maps.
+            those with a photo, in which light has a fixed direction.
+        crop: Side in cells of the square cut from each training map, at a new random
+            position each epoch; 0 for whole maps.
         resume: Resume an interrupted training from its finished parts and epochs.
-        overwrite: Replace an existing checkpoint in `out`, or these parts of it.
-        conformal: Recalibrate the model on every second map of valid, which early
-            stopping and temperature then leave out. Its lower quantiles then have
+        overwrite: Replace an existing checkpoint in `out`, or those of its parts that are
+            trained again.
+        conformal: Recalibrate the model on every second map of valid; early stopping and
+            temperature then use only the other maps. The lower quantiles then have
             guaranteed coverage on new maps of the same kind.
     """
 
@@ -54,13 +53,13 @@ class TrainOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class Masking:
-    """Masks of training maps, as seen by a robot with a limited sensor range.
+    """Settings of masks of training maps, which imitate a limited sensor range.
 
     A masked map is observed within a radius of a straight path, with noise that grows with
     the distance to the path.
 
     Args:
-        share: fraction of the maps that are masked, also in valid; 0 masks no maps.
+        share: fraction of the maps that are masked, in train and valid; 0 masks no maps.
         radius_m: minimum and maximum radius in metres; the radius of a map is drawn between
             them, uniformly in its logarithm.
         colour_noise: standard deviation of each channel of a colour, 0–255, per metre of
@@ -82,7 +81,7 @@ class Masking:
             self,
             0 < low <= high < math.inf,
             "radius_m",
-            "of two radii > 0, ordered and finite",
+            "as two finite radii > 0, the smaller first",
         )
         for name in ("colour_noise", "elevation_noise"):
             _check(self, 0 <= getattr(self, name) < math.inf, name, "≥ 0 and finite")
@@ -90,25 +89,25 @@ class Masking:
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingConfig:
-    """Settings of any trainable model and its training; custom models add their own.
+    """Settings of any trainable model and its training; custom models may add settings.
 
     Args:
         inputs: layers of the maps that the network receives: rgb, elevation_m, slope_deg,
-            and others that the maps have, such as vegetation_m; and seen, 1 in observed
-            cells and 0 elsewhere.
+            any other layer of the maps, such as vegetation_m, or seen, which is 1 in
+            observed cells and 0 elsewhere.
         jitter: maximum relative change of brightness, contrast and saturation of a training
-            map. At 0, dim light does not occur in training.
+            map, in [0, 1). At 0, dim light does not occur in training.
         symmetries: rotate and mirror training maps at random. Maps with a photo, whose
             light has a fixed direction, are changed only with `--symmetries true`, not with
             `--settings.symmetries true`.
         crop: side in cells of the squares cut from maps; 0 for whole maps.
-        learning_rate: maximum rate of the one-cycle schedule.
-        weight_decay: of AdamW.
-        batch_size: maximum number of maps per batch.
+        learning_rate: maximum learning rate of the one-cycle schedule, in (0, 1).
+        weight_decay: weight decay of AdamW, in [0, 1).
+        batch_size: maximum number of maps per batch, at least 2.
         max_epochs: length of the schedule in epochs.
         patience: number of epochs without a lower validation loss after which training
             stops.
-        masking: masks of the maps; the input seen contains them.
+        masking: settings of the masks of maps, which the input seen contains.
     """
 
     inputs: tuple[str, ...] = ("rgb", "slope_deg")
@@ -138,9 +137,9 @@ class NetworkConfig(TrainingConfig):
     Args:
         architecture: a decoder of segmentation-models-pytorch, for example unet, fpn or
             segformer.
-        encoder: one of its encoders, for example resnet18.
+        encoder: an encoder of segmentation-models-pytorch, for example resnet18.
         pretrained: start from ImageNet weights, which are downloaded, instead of random
-            ones.
+            weights.
     """
 
     architecture: str = "unet"
@@ -157,8 +156,8 @@ class ClassifierConfig(NetworkConfig):
             stages reduce the network and its receptive field.
         decoder_channels: channels of the decoder's stages, from coarse to fine, one per
             encoder stage. If empty, the architecture's defaults.
-        full_resolution: pass the image at full resolution to the last layers too. Without
-            it, class boundaries are predicted from cells twice as large, since encoders
+        full_resolution: pass the image at full resolution to the last layers too. If
+            false, class boundaries are predicted at half the resolution, since encoders
             first halve the image.
         focal: γ of the focal loss (Lin et al., 2017), which weighs a cell by (1 − p)^γ,
             with p the probability of its class; at 0 the loss is a proper score.
@@ -180,16 +179,19 @@ class ClassifierConfig(NetworkConfig):
         """Check the ranges of the settings."""
         super().__post_init__()
         for name in ("focal", "dice"):
-            _check(self, 0 <= getattr(self, name) < math.inf, name, "≥ 0")
+            _check(self, 0 <= getattr(self, name) < math.inf, name, "≥ 0 and finite")
         _check(self, 0 <= self.label_smoothing < 1, "label_smoothing", "in [0, 1)")
         _check(
-            self, 1 <= self.encoder_depth <= DEEPEST, "encoder_depth", f"in 1–{DEEPEST}"
+            self,
+            1 <= self.encoder_depth <= MAX_ENCODER_DEPTH,
+            "encoder_depth",
+            f"in 1–{MAX_ENCODER_DEPTH}",
         )
         _check(
             self,
             min(self.decoder_channels, default=1) >= 1,
             "decoder_channels",
-            "≥ 1 each",
+            "with each value ≥ 1",
         )
 
 
@@ -197,27 +199,27 @@ class ClassifierConfig(NetworkConfig):
 class LatentGPConfig:
     """Settings of the class-wise GPs and their training.
 
-    The prior determines the prediction for a class without data, and for slopes steeper
-    than any observed.
+    The prior determines the prediction for classes without data and for slopes steeper
+    than all observed slopes.
 
     Args:
         likelihood: censored, for observations clipped to [0, 1], or gaussian.
-        second_component: give a class a second mode of λ, independent of slope, if the data
-            show one; only with the censored likelihood.
+        second_component: fit a second mode of λ, independent of slope, to each class whose
+            data have one; only with the censored likelihood.
         inducing_points: number of inducing points, evenly over the slopes of the training
             data.
         epochs: number of equal parts of training, each of which reports progress.
-        epoch_steps: steps per epoch, each over all cells.
+        epoch_steps: number of optimiser steps per epoch, each over all cells.
         prior_level: prior λ on flat terrain.
         prior_fall: prior decrease of λ per degree of slope.
-        prior_fall_std: standard deviation of that decrease.
-        prior_std: initial standard deviation of the function around this line.
-        prior_std_range: range of the standard deviation in training.
-        length_deg: initial length scale of the function in degrees.
-        length_range_deg: range of the length scale in training.
-        noise_std: prior standard deviation of λ around the function.
-        noise_spread: standard deviation of its logarithm.
-        noise_std_range: range of the standard deviation in training.
+        prior_fall_std: prior standard deviation of this decrease.
+        prior_std: initial standard deviation of the GP around the prior line.
+        prior_std_range: minimum and maximum of this standard deviation in training.
+        length_deg: initial length scale of the GP in degrees.
+        length_range_deg: minimum and maximum of the length scale in training, in degrees.
+        noise_std: prior standard deviation of λ around the GP.
+        noise_spread: prior standard deviation of the logarithm of noise_std.
+        noise_std_range: minimum and maximum of noise_std in training.
     """
 
     likelihood: Literal["censored", "gaussian"] = "censored"
@@ -253,18 +255,20 @@ class LatentGPConfig:
         ):
             low, high = getattr(self, limits)
             is_valid = 0 < low < getattr(self, name) < high < math.inf
-            expected = f"between the bounds of `{limits}`, both > 0, {low} and {high}"
+            expected = (
+                f"above {low} and below {high}, the finite bounds > 0 in `{limits}`"
+            )
             _check(self, is_valid, name, expected)
 
 
 @dataclass(frozen=True, kw_only=True)
 class JoinedConfig(NetworkConfig):
-    """Settings of an image network joined by slope per cell, and its training.
+    """Settings of an image network whose last layers receive slope, and its training.
 
     Args:
         encoder_depth: number of encoder stages, each of which halves the image; fewer
             stages reduce the network and its receptive field.
-        hidden: channels of the layers in which slope joins the image features.
+        hidden: number of channels of the layers that join slope and image features.
     """
 
     encoder_depth: int = 5
@@ -275,14 +279,17 @@ class JoinedConfig(NetworkConfig):
         """Check the ranges of the settings."""
         super().__post_init__()
         _check(
-            self, 1 <= self.encoder_depth <= DEEPEST, "encoder_depth", f"in 1–{DEEPEST}"
+            self,
+            1 <= self.encoder_depth <= MAX_ENCODER_DEPTH,
+            "encoder_depth",
+            f"in 1–{MAX_ENCODER_DEPTH}",
         )
         _check_min(self, 1, "hidden")
         _check(
             self,
             any(name != "slope_deg" for name in self.inputs),
             "inputs",
-            "with a layer beside slope_deg",
+            "with a layer other than slope_deg",
         )
 
 
@@ -303,9 +310,7 @@ class MDNConfig(JoinedConfig):
 
 
 def plain_config(config: Any) -> dict[str, Any]:
-    """Return the settings of a network as plain data.
-
-    `masking` is left out if no map is masked.
+    """Return the settings of a network as plain data, without `masking` if unused.
 
     Args:
         config: a `TrainingConfig`.
@@ -317,17 +322,17 @@ def plain_config(config: Any) -> dict[str, Any]:
 
 
 def check_seed(seed: int, count: int = 1) -> None:
-    """Check that generators accept a root seed.
+    """Check that PyTorch's generators accept consecutive seeds.
 
     Args:
-        seed: the first of the seeds.
-        count: number of consecutive seeds.
+        seed: first seed.
+        count: number of seeds.
 
     Raises:
-        ConfigError: If one of them is not in 0–2⁶³ − 1.
+        ConfigError: If a seed is not in 0–2⁶³ − 1.
     """
-    last = _N_SEEDS - count
-    expect(0 <= seed <= last, f"`seed` in 0–{last}, got {seed}.")
+    max_seed = _N_SEEDS - count
+    expect(0 <= seed <= max_seed, f"`seed` in 0–{max_seed}, got {seed}.")
 
 
 def _check(config: object, is_valid: bool, name: str, expected: str) -> None:

@@ -1,25 +1,26 @@
 """Conformal recalibration: lower quantiles with guaranteed coverage on a new map of the
 same kind.
 
-Calibration maps that no part of a model has seen yield scores: the PIT values s = F(λ)
-of their cells, drawn within the jump where λ has an atom. Cells of a map are spatially
-correlated, so maps are the unit: each has the same weight, whatever its number of
-cells, and one additional map counts as if all its scores were 0. With n maps, and
-G_j(t) the fraction of the scores of map j below t,
+The scores are the PIT values s = F(λ) of the cells of calibration maps, which no part of
+the model has seen. If λ has an atom, s is drawn uniformly within the jump of F. Cells of
+a map are spatially correlated, so the statistical unit is the map: each map has the same
+weight, whatever its number of cells, and one additional map counts as if all its scores
+were 0. With n maps, and G_j(t) the fraction of the scores of map j below t,
 
     t(u) = sup {t : (G_1(t) + … + G_n(t) + 1) / (n + 1) ≤ u},    Q_conf(u) = Q(t(u)).
 
-**Guarantee.** Let these maps and a new one be exchangeable, and the model be trained
-without them. Then for a random cell of the new map, at each level u of the table, P(λ <
-Q_conf(u)) ≤ u; between levels, at most the next level. Proof: let t* be the supremum of
-t with (G_1(t) + … + G_{n+1}(t)) / (n + 1) ≤ u, the new map included. G_{n+1} ≤ 1, so
-t(u) ≤ t*. The maps are exchangeable in t*, so P(s < t*) for a cell of the new map is
-the expected mean of G_j(t*) over all maps, which is at most u. And λ < Q(t) means F(λ)
-< t, hence s < t.
+**Guarantee.** Let the calibration maps and a new map be exchangeable, and the model be
+trained without them. Then for a random cell of the new map, P(λ < Q_conf(u)) ≤ u at each
+level u of the table; between two levels, the probability is at most the upper level.
+Proof: let t* be the supremum of t with (G_1(t) + … + G_{n+1}(t)) / (n + 1) ≤ u, where
+map n + 1 is the new map. G_{n+1} ≤ 1, so t(u) ≤ t*. The maps are exchangeable in t*, so
+P(s < t*) for a cell of the new map is the expected mean of G_j(t*) over all n + 1 maps,
+which is at most u. λ < Q(t) implies F(λ) < t, hence s < t.
 
 The guarantee holds on average over new maps and over the choice of calibration maps. It
-is one-sided, applies to quantiles and not to CVaR, and does not apply to other terrain
-such as hg or hs. Its cost is that probability 1 / (n + 1) moves to the lowest λ.
+is one-sided, applies to quantiles and not to CVaR, and does not apply to other terrain,
+such as the scenarios hg and hs. Its cost is that probability 1 / (n + 1) moves to the
+lowest λ.
 Sources: Dunn, Wasserman and Ramdas (2022), "Distribution-free prediction sets for
 two-layer hierarchical models" (pooling CDFs); Lee, Barber and Willett (2023),
 "Distribution-free inference with hierarchical data" (the new group's weight). Letters
@@ -40,16 +41,16 @@ from benchnav.core.quantiles import LEVELS, QuantileDistribution, quantiles_at
 from benchnav.core.terrain import Observation
 from benchnav.models.base import TraversabilityModel
 
-_ROUNDING = 1e-9
+_ROUNDING = 1e-9  # of sums of weights
 
 
 @dataclass(frozen=True, kw_only=True)
 class ConformalTable:
-    """Levels at which a model's own quantiles are guaranteed quantiles.
+    """Table of t(u): the model's quantile at level t(u) is a guaranteed u-quantile.
 
     Args:
         levels: u, ascending from 0 to 1.
-        values: t(u) in [0, 1], not descending.
+        values: t(u) in [0, 1], never descending.
         maps: n, number of maps with scores.
     """
 
@@ -59,10 +60,10 @@ class ConformalTable:
 
     @classmethod
     def read(cls, data: Mapping[str, Any]) -> Self:
-        """Read the result of `plain`.
+        """Read a table from the result of `plain`.
 
         Raises:
-            CheckpointError: If it is not a valid table.
+            CheckpointError: If the data are not a valid table.
         """
         try:
             levels = tuple(map(float, data["levels"]))
@@ -70,18 +71,21 @@ class ConformalTable:
             table = cls(levels=levels, values=values, maps=int(data["maps"]))
         except (KeyError, TypeError, ValueError) as error:
             raise CheckpointError(
-                f"Expected a table of `conformal`, got {type(error).__name__} {error}."
+                "Expected the table `conformal` of the checkpoint to have `levels`, "
+                f"`values` and `maps`, got {type(error).__name__} {error}. Train the "
+                "model again."
             ) from error
         ascends = all(low <= high for low, high in pairwise((0.0, *values, 1.0)))
         if len(levels) != len(values) or not ascends:
             raise CheckpointError(
-                "Expected `conformal` with values in [0, 1] that ascend, one a level, "
-                "got others."
+                "Expected the table `conformal` of the checkpoint to have one value per "
+                "level, in [0, 1] and never descending, got one that does not. Train "
+                "the model again."
             )
         return table
 
     def plain(self) -> dict[str, Any]:
-        """Return plain data."""
+        """Return the table as plain data, for JSON."""
         return asdict(self)
 
 
@@ -99,18 +103,18 @@ def fit_table(
         ConfigError: If no map has a score.
     """
     maps = [map_scores for map_scores in scores if len(map_scores)]
-    expect(len(maps) > 0, "maps with an observed λ to calibrate on, got none.")
+    expect(len(maps) > 0, "calibration maps with observed λ, got 0 such maps.")
     map_weight = 1 / (len(maps) + 1)
     weights = np.concatenate(
         [np.full(len(map_scores), map_weight / len(map_scores)) for map_scores in maps]
     )
     pooled = np.concatenate(maps)
     order = np.argsort(pooled, kind="stable")
-    # Weight of the scores up to each; t may rise to the first whose weight exceeds u.
+    # t(u) is the first score at which the cumulative weight exceeds u.
     cumulative = map_weight + weights[order].cumsum()
     u = np.array(levels)
-    first = np.searchsorted(cumulative, u - _ROUNDING)
-    values = np.append(pooled[order], 1.0)[first]
+    first_index = np.searchsorted(cumulative, u - _ROUNDING)
+    values = np.append(pooled[order], 1.0)[first_index]
     values = np.where(u < map_weight - _ROUNDING, 0.0, values)
     values[u >= 1] = 1.0
     return ConformalTable(levels=levels, values=tuple(values.tolist()), maps=len(maps))
@@ -119,21 +123,21 @@ def fit_table(
 def recalibrated(
     distribution: TraversabilityDistribution, table: ConformalTable
 ) -> QuantileDistribution:
-    """Return the distribution whose quantiles at a table's levels are those at its values.
+    """Return the distribution whose u-quantile is the t(u)-quantile of another.
 
     Args:
-        distribution: of shape [*B, H, W].
-        table: from `fit_table`.
+        distribution: prediction of a model, shape [*B, H, W].
+        table: result of `fit_table`.
     """
     return quantiles_at(distribution, table.values, table.levels)
 
 
 class ConformalModel(TraversabilityModel):
-    """A model with recalibrated distributions and without classes.
+    """A model whose distributions are recalibrated; it predicts no classes.
 
     Args:
         model: any model.
-        table: from `fit_table`, on maps that the model has not seen.
+        table: result of `fit_table` on maps that the model has not seen.
     """
 
     def __init__(self, model: TraversabilityModel, table: ConformalTable) -> None:

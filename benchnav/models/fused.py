@@ -1,5 +1,4 @@
-"""The paper's model: class probabilities of a classifier, fused with class-wise Gaussian
-processes.
+"""The paper's model: class probabilities fused with class-wise Gaussian processes.
 
 Source: paper III-B, equation (1); ensembles: Lakshminarayanan et al. (2017), "Simple
 and scalable predictive uncertainty estimation using deep ensembles". Letters in shapes:
@@ -18,22 +17,24 @@ from benchnav.models.checkpoint import Checkpoint
 from benchnav.models.parts import GP
 from benchnav.models.slope_gp.table import SlopeTable
 
-CHUNK_CELLS = 2**17
+CHUNK_CELLS = 2**17  # number of cells that a classifier receives at a time
 
 
 class FusedModel(ModelFamily):
     """P(λ) = Σ_c P(c)·P_c(λ | ψ), equation (1), with one component per class.
 
     Classes with soft spots have two components. P(c) is the average of the members'
-    probabilities, calibrated as a whole. The paper's `single-class` option is
+    probabilities, calibrated by a temperature. The paper's `single-class` option is
     `TraversabilityMixture.most_likely` of the prediction.
 
     Args:
-        classifiers: the members, each from maps by field to logits [B, C, H, W]. A member
-            with `inputs` receives these layers, any other only colours.
-        table: the GPs over slope.
+        classifiers: the members, each a network from layers by name to logits
+            [B, C, H, W]. A member with an attribute `inputs` receives these layers; any
+            other member receives only `rgb`.
+        table: predictions of the GPs over slope.
         class_names: names of the C classes.
-        pool_temperature: of the averaged probabilities (see `models.nets.calibration`).
+        pool_temperature: temperature of the averaged probabilities (see
+            `models.nets.calibration`).
     """
 
     def __init__(
@@ -43,26 +44,26 @@ class FusedModel(ModelFamily):
         class_names: tuple[str, ...],
         pool_temperature: float = 1.0,
     ) -> None:
-        """Set the classifiers to evaluation."""
+        """Set the classifiers to evaluation mode."""
         self.classifiers = tuple(classifier.eval() for classifier in classifiers)
         self.table = table
         self.class_names = class_names
         self.pool_temperature = pool_temperature
         # Computed here, since the number of components in an exported graph cannot
         # depend on tensors.
-        self.soft_owners: tuple[int, ...] = ()
+        self.soft_class_ids: tuple[int, ...] = ()
         if table.soft:
-            self.soft_owners = tuple(table.soft.weight.nonzero().flatten().tolist())
+            self.soft_class_ids = tuple(table.soft.weight.nonzero().flatten().tolist())
 
     def predict(self, observation: Observation) -> TraversabilityMixture:
         """Predict on the observation's device.
 
         Args:
-            observation: B maps of any size. The classifiers are moved to their device.
+            observation: B maps of any size. The classifiers are moved to its device.
 
         Returns:
-            Mixture with float32 parameters of shape [B, K, H, W]: the C classes in order,
-            followed by the second modes; `group` is the class of each component.
+            Mixture with float32 parameters of shape [B, K, H, W]. Its components are the C
+            classes in order, then the second modes; `group` is the class of each.
         """
         return self.fuse(self.member_probabilities(observation), observation)
 
@@ -81,8 +82,8 @@ class FusedModel(ModelFamily):
         means, stds = self.table.lookup(slope_deg.float())
         group = tuple(range(len(self.class_names)))
         if self.table.soft:
-            owners = list(self.soft_owners)
-            group += self.soft_owners
+            owners = list(self.soft_class_ids)
+            group += self.soft_class_ids
             weight, mean, std = (v.to(weights).view(-1, 1, 1) for v in self.table.soft)
             soft_weights = (weights * weight)[:, owners]
             soft_means = mean.expand_as(weights)[:, owners]
@@ -93,7 +94,7 @@ class FusedModel(ModelFamily):
         return TraversabilityMixture(weights, means, stds, group)
 
     def member_probabilities(self, observation: Observation) -> Tensor:
-        """Return class probabilities of each member, before the pool's temperature.
+        """Return class probabilities of each member, before the pool temperature.
 
         Args:
             observation: B maps of any size.
@@ -102,15 +103,15 @@ class FusedModel(ModelFamily):
             float32, shape [M, B, C, H, W].
         """
         height, width = observation.grid.shape
-        size = max(1, CHUNK_CELLS // (height * width))
+        chunk_size = max(1, CHUNK_CELLS // (height * width))
         members = []
         with torch.inference_mode():
             for member in self.classifiers:
                 layers = layers_of(observation, getattr(member, "inputs", ("rgb",)))
                 member.to(observation.rgb.device)
                 probabilities = []
-                for start in range(0, len(observation.rgb), size):
-                    chunk = slice(start, start + size)
+                for start in range(0, len(observation.rgb), chunk_size):
+                    chunk = slice(start, start + chunk_size)
                     logits = member(
                         {name: layer[chunk] for name, layer in layers.items()}
                     )
@@ -137,11 +138,11 @@ class FusedModel(ModelFamily):
 
 
 def sharpen(probabilities: Tensor, temperature: float) -> Tensor:
-    """Divide the logarithms of class probabilities by a temperature.
+    """Return softmax(log p / T) of class probabilities p, with T the temperature.
 
     Args:
-        probabilities: shape [B, C, H, W].
-        temperature: > 0; below 1 it sharpens, at 1 it changes nothing.
+        probabilities: p, shape [B, C, H, W].
+        temperature: T > 0; below 1 it sharpens, at 1 it changes nothing.
     """
     if temperature == 1:
         return probabilities

@@ -1,4 +1,4 @@
-"""The command `benchnav-train export`: a checkpoint as a file for robots without PyTorch."""
+"""The command `benchnav-train export`: write a model for robots without PyTorch."""
 
 from pathlib import Path
 
@@ -26,16 +26,16 @@ def export(
     from benchnav.models.onnx_graph import export_onnx
     from benchnav.models.predictor import load_model
 
-    expect(onnx.endswith(".onnx"), f"`onnx` as a file FILE.onnx, got {onnx!r}.")
+    expect(onnx.endswith(".onnx"), f"`onnx` to end in .onnx, got {onnx!r}.")
     path = Path(onnx)
     expect(
         overwrite or not path.exists(),
-        f"`onnx` as a new file, got {onnx}, which exists. Pass --overwrite to replace "
-        "it.",
+        f"`onnx` to be a new file, got {onnx}, which exists. Pass --overwrite to "
+        "replace it.",
     )
     graph = export_onnx(load_model(checkpoint), path, checkpoint, level, opset)
     size = decimal(path.stat().st_size)
     print(
-        f"wrote {onnx} ({size}): from {', '.join(graph.layers)} to "
-        f"{', '.join(graph.names)} at level {level:g}"
+        f"wrote {onnx} ({size}): from {', '.join(graph.input_names)} to "
+        f"{', '.join(graph.output_names)} at level {level:g}"
     )

@@ -1,14 +1,15 @@
-"""Mean and CVaR of predicted distributions in operations that ONNX has.
+"""Mean and CVaR of predicted distributions, computed by operators of ONNX.
 
-With F the distribution function of λ, v the VaR, found by 40 bisections of [0, 1], and
-p = 1 − α the tail,
+F is the distribution function of λ, v the VaR, which 40 bisections of [0, 1] find, and
+p = 1 − α the probability of the tail:
 
     E[λ] = 1 − ∫₀¹ F,    CVaR_α = v − 1/p ∫₀^v F   (see `benchnav.core.cvar`).
 
-The integral of a mixture has a closed form, also for averaged members. If a temperature
-T widens a distribution to Φ(Φ⁻¹(F) / T), Gauss-Legendre quadrature is used between
-nodes around each component.
-Letters in shapes: B maps, H×W cells, K components, E nodes.
+The integral of a mixture or of averaged mixtures has a closed form. For a distribution
+that a temperature T widens to Φ(Φ⁻¹(F) / T), it is computed by Gauss-Legendre quadrature
+on intervals around the mean of each component.
+Letters in shapes: B maps, H×W cells, K components, E edges of intervals, *E any leading
+dimensions.
 """
 
 import math
@@ -28,17 +29,18 @@ from benchnav.core.quantiles import QuantileDistribution
 _N_BISECTIONS = 40
 _MIN_STD = 1e-9
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
-_REACHES = (0.35, 1.0, 1.75, 2.5, 3.5, 5.0, 8.0, 14.0)
-_EDGES = (*_REACHES, *(-reach for reach in _REACHES))  # standard deviations
-# Beyond these, Φ is not a normal floating-point number.
+# Edges of intervals, in standard deviations from a component's mean.
+_DISTANCES = (0.35, 1.0, 1.75, 2.5, 3.5, 5.0, 8.0, 14.0)
+_EDGES = (*_DISTANCES, *(-distance for distance in _DISTANCES))
+# Beyond these limits, Φ is too small for a normal floating-point number.
 _MAX_SCORE = 37.0
 _MIN_PROBABILITY = 1e-300
-_HART_END = 7.07106781186547
-_HART_ABOVE = (
+_HART_MAX = 7.07106781186547
+_HART_NUMERATOR = (
     3.52624965998911e-02, 0.700383064443688, 6.37396220353165, 33.912866078383, 112.079291497871, 221.213596169931,
     220.206867912376,
 )  # fmt: skip
-_HART_BELOW = (
+_HART_DENOMINATOR = (
     8.83883476483184e-02, 1.75566716318264, 16.064177579207, 86.7807322029461, 296.564248779674, 637.333633378831,
     793.826512519948, 440.413735824752,
 )  # fmt: skip
@@ -66,9 +68,13 @@ _ACKLAM_D = (
 def parameters_of(
     distribution: TraversabilityDistribution, prefix: str = ""
 ) -> dict[str, Tensor]:
-    """Return the parameters by name.
+    """Return the parameters of a distribution by name.
 
-    Members that do not form one mixture have names such as `member_1_weights`.
+    If several members do not form one mixture, the names are such as `member_1_weights`.
+
+    Args:
+        distribution: prediction of a model, shape [B, H, W].
+        prefix: start of each name.
 
     Raises:
         ConfigError: If distributions of this class cannot be exported.
@@ -89,8 +95,8 @@ def parameters_of(
         return parameters
     raise ConfigError(
         "Expected a model that predicts a TraversabilityMixture or a "
-        "QuantileDistribution to export, got one of "
-        f"{type(distribution).__name__}."
+        "QuantileDistribution, got one that predicts a "
+        f"{type(distribution).__name__}, which cannot be exported."
     )
 
 
@@ -98,7 +104,7 @@ def mean_of(distribution: TraversabilityDistribution) -> Tensor:
     """Return E[λ], shape [B, H, W]."""
     if isinstance(distribution, QuantileDistribution):
         return distribution.mean()
-    ones = torch.ones_like(_first(distribution), dtype=torch.float64)
+    ones = torch.ones_like(_any_parameter(distribution), dtype=torch.float64)
     return (1 - _integral(distribution, ones)).clamp(0, 1)
 
 
@@ -108,7 +114,7 @@ def cvar_of(distribution: TraversabilityDistribution, tail: float) -> Tensor:
         return mean_of(distribution)
     if isinstance(distribution, QuantileDistribution):
         return distribution.cvar(1 - tail)
-    level = torch.full_like(_first(distribution), tail, dtype=torch.float64)
+    level = torch.full_like(_any_parameter(distribution), tail, dtype=torch.float64)
     value = _quantile(distribution, level)
     return (value - _integral(distribution, value) / tail).clamp(min=0).minimum(value)
 
@@ -119,8 +125,8 @@ def _quantile(distribution: TraversabilityDistribution, level: Tensor) -> Tensor
         std = distribution.score_std.double()
         score = distribution.score_mean + std * _normal_score(level)
         return _quantile(distribution.base, _normal_cdf(score))
-    # The graph contains each operation of a bisection 40 times, so everything else is
-    # computed before.
+    # The graph contains each operation of a bisection 40 times, so constants are
+    # computed before the loop.
     if isinstance(distribution, TraversabilityMixture):
         weights, means, stds = _mixture(distribution)
         scale = math.sqrt(0.5) / stds
@@ -144,8 +150,8 @@ def _quantile(distribution: TraversabilityDistribution, level: Tensor) -> Tensor
     return low[:, 0] + 0.5**_N_BISECTIONS
 
 
-def _first(distribution: TraversabilityDistribution) -> Tensor:
-    """Return any parameter layer of the distribution's shape, [B, H, W]."""
+def _any_parameter(distribution: TraversabilityDistribution) -> Tensor:
+    """Return a tensor of the distribution's shape, dtype and device: a parameter."""
     return next(iter(parameters_of(distribution).values()))[:, 0]
 
 
@@ -157,7 +163,10 @@ def _mixture(mixture: TraversabilityMixture) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _tails(distribution: TraversabilityDistribution, value: Tensor) -> Tensor:
-    """Return P(λ ≤ value) and P(λ > value), both precise, shape [2, *E, B, H, W]."""
+    """Return P(λ ≤ value) and P(λ > value), shape [2, *E, B, H, W].
+
+    The second is not computed as 1 minus the first, which would lose digits.
+    """
     if isinstance(distribution, PooledDistribution):
         return _average([_tails(member, value) for member in distribution.members])
     if isinstance(distribution, ConditionedDistribution):
@@ -188,7 +197,7 @@ def _integral(distribution: TraversabilityDistribution, value: Tensor) -> Tensor
     edges = _edges(distribution, value)
     low = edges[:-1]
     width = edges[1:] - edges[:-1]
-    # A graph of a few large operations is faster to write and to run.
+    # All nodes are computed at once, since a graph of few operations is faster.
     nodes = torch.from_numpy(_NODES).view(-1, 1, 1, 1, 1) / 2
     weights = torch.from_numpy(_WEIGHTS).view(-1, 1, 1, 1, 1) / 2
     heights = _tails(distribution, low + (0.5 + nodes) * width)[0]
@@ -196,7 +205,7 @@ def _integral(distribution: TraversabilityDistribution, value: Tensor) -> Tensor
 
 
 def _edges(distribution: TraversabilityDistribution, value: Tensor) -> Tensor:
-    """Return ends of intervals in which F is smooth, shape [E, B, H, W]."""
+    """Return the edges of intervals in which F is smooth, ascending, [E, B, H, W]."""
     parameters = parameters_of(distribution)
     edges = [torch.stack([torch.zeros_like(value), value])]
     steps = torch.tensor(_EDGES, dtype=torch.float64).view(-1, 1, 1, 1, 1)
@@ -223,8 +232,8 @@ def _normal_cdf(z: Tensor) -> Tensor:
     for count in (4, 3, 2, 1):
         fraction = x + count / fraction
     ratio = torch.where(
-        x < _HART_END,
-        _polynomial(x, _HART_ABOVE) / _polynomial(x, _HART_BELOW),
+        x < _HART_MAX,
+        _polynomial(x, _HART_NUMERATOR) / _polynomial(x, _HART_DENOMINATOR),
         1 / fraction / math.sqrt(2 * math.pi),
     )
     lower = ratio * torch.exp(-0.5 * x * x)
@@ -248,7 +257,7 @@ def _normal_score(probability: Tensor) -> Tensor:
 
 
 def _polynomial(x: Tensor, coefficients: Sequence[float]) -> Tensor:
-    """Evaluate a polynomial by Horner's scheme, coefficients from the highest power."""
+    """Evaluate a polynomial by Horner's scheme; the highest power is first."""
     total = torch.full_like(x, coefficients[0])
     for coefficient in coefficients[1:]:
         total = total * x + coefficient

@@ -28,15 +28,17 @@ from benchnav.models.nets.trainable import TrainableModel, in_single_precision
 from benchnav.models.onnx_distributions import cvar_of, mean_of, parameters_of
 
 _TOLERANCE = 1e-5  # relative to the model's own predictions
-_EXAMPLE_SHAPE = (2, 48, 40)  # B, H, W of the maps for tracing and checking a graph
+_EXAMPLE_SHAPE = (2, 48, 40)  # B, H, W of the maps that trace and check a graph
 
 
 class Graph(nn.Module):
     """The exported function: from layers of maps to parameters, mean and CVaR.
 
+    Attributes `input_names` and `output_names` name its inputs and outputs in order.
+
     Args:
         model: model rebuilt from a checkpoint.
-        level: α of the CVaR.
+        level: level α of the CVaR, in [0, 1).
 
     Raises:
         ConfigError: If the model cannot be exported, or the level is outside [0, 1).
@@ -54,25 +56,25 @@ class Graph(nn.Module):
         else:
             raise ConfigError(
                 "Expected a fused model or a benchnav.models.TrainableModel to export, "
-                f"got {type(model).__name__}. Export it by your own code."
+                f"got {type(model).__name__}. Export it with custom code."
             )
         self.networks = nn.ModuleList(members)
         layers: list[str] = []
         for member in members:
             expect(
                 not member.no_graph,
-                f"a model that ONNX can hold to export, got {type(member).__name__}, "
+                f"a model that can be exported to ONNX, got {type(member).__name__}, "
                 f"which {member.no_graph}.",
             )
             layers += member.inputs
         if isinstance(model, FusedModel):
             layers.append("slope_deg")
-        self.layers = tuple(dict.fromkeys(layers))
-        self.names: tuple[str, ...] = ()
+        self.input_names = tuple(dict.fromkeys(layers))
+        self.output_names: tuple[str, ...] = ()
         self.eval().requires_grad_(False).cpu()
 
     def predict(self, maps: dict[str, Tensor]) -> TraversabilityDistribution:
-        """Return the model's own prediction, from layers by name."""
+        """Return the model's prediction from layers by name."""
         if isinstance(self.model, FusedModel):
             members = [member(maps).float().softmax(1) for member in self.networks]
             return self.model.fuse_at(torch.stack(members), maps["slope_deg"])
@@ -90,16 +92,16 @@ class Graph(nn.Module):
         """Predict B maps.
 
         Args:
-            layers: in the order of `self.layers`.
+            layers: layers of the maps, in the order of `input_names`.
 
         Returns:
-            Outputs in the order of `self.names`.
+            Outputs, in the order of `output_names`.
         """
         n_maps = layers[0].shape[0]
         height, width = layers[0].shape[-2:]
-        maps = dict(zip(self.layers, layers, strict=True))
-        # Sizes from padding and cropping are symbolic expressions, which would make each
-        # operation slow to export.
+        maps = dict(zip(self.input_names, layers, strict=True))
+        # Padding and cropping make sizes symbolic expressions, with which each further
+        # operation would be slow to export.
         predicted = map_tensors(
             self.predict(maps),
             lambda values: values.reshape(n_maps, *values.shape[1:-2], height, width),
@@ -107,7 +109,7 @@ class Graph(nn.Module):
         outputs = parameters_of(predicted)
         outputs["mean"] = mean_of(predicted)
         outputs["cvar"] = cvar_of(predicted, self.tail)
-        self.names = tuple(outputs)
+        self.output_names = tuple(outputs)
         return tuple(value.float() for value in outputs.values())
 
 
@@ -124,16 +126,15 @@ def export_onnx(
         model: model rebuilt from a checkpoint.
         path: output file.
         name: name of the model, stored in the file.
-        level: α of the CVaR, in [0, 1).
+        level: level α of the CVaR, in [0, 1).
         opset: version of ONNX's operators.
 
     Returns:
-        The exported graph, with the names of its inputs, `layers`, and outputs,
-        `names`.
+        The exported graph.
 
     Raises:
-        ConfigError: If the model cannot be exported, or the packages of the extra
-            `onnx` are missing.
+        ConfigError: If the model cannot be exported, `opset` is out of range, or the
+            packages of the extra `onnx` are missing.
     """
     try:
         import onnx
@@ -146,7 +147,7 @@ def export_onnx(
     newest = onnx.defs.onnx_opset_version()
     expect(
         18 <= opset <= newest,
-        f"`opset` in 18–{newest}, which torch.onnx writes, got {opset}.",
+        f"`opset` in 18–{newest}, the versions that torch.onnx writes, got {opset}.",
     )
     graph = Graph(model, level)
     layers = _check_graph(graph, model)
@@ -167,13 +168,13 @@ def export_onnx(
                 dynamo=True,
                 opset_version=opset,
                 verbose=False,
-                input_names=list(graph.layers),
-                output_names=list(graph.names),
+                input_names=list(graph.input_names),
+                output_names=list(graph.output_names),
                 dynamic_shapes=(tuple(sizes),),
             )
-    except Exception as error:  # of various types
+    except Exception as error:  # torch.onnx raises errors of many types
         raise out_of_memory_error(error) or ConfigError(
-            "Expected a network that PyTorch writes as ONNX, got "
+            "Expected a network that PyTorch can write as ONNX, got "
             f"{type(model).__name__}: {one_line(error.__cause__ or error)[:300]}"
         ) from error
     assert program is not None
@@ -190,7 +191,10 @@ def export_onnx(
 
 
 def _check_graph(graph: Graph, model: TraversabilityModel) -> list[Tensor]:
-    """Compare a graph with its model on random maps, which are returned by layer.
+    """Compare a graph with its model on random maps.
+
+    Returns:
+        The layers of the random maps, in the order of `graph.input_names`.
 
     Raises:
         ConfigError: If the predictions differ because the model's `predict` does more
@@ -203,7 +207,7 @@ def _check_graph(graph: Graph, model: TraversabilityModel) -> list[Tensor]:
     )
     others = {
         name: 30 * torch.rand(n_maps, height, width, generator=generator)
-        for name in graph.layers
+        for name in graph.input_names
         if name != "rgb"
     }
     flat = torch.zeros(n_maps, height, width)
@@ -216,7 +220,7 @@ def _check_graph(graph: Graph, model: TraversabilityModel) -> list[Tensor]:
         layers=fields,
     )
     maps = {"rgb": rgb, **others}
-    layers = [maps[name] for name in graph.layers]
+    layers = [maps[name] for name in graph.input_names]
     with torch.no_grad():
         mean, cvar = graph(*layers)[-2:]
         predicted = model.predict(observation)
@@ -225,7 +229,7 @@ def _check_graph(graph: Graph, model: TraversabilityModel) -> list[Tensor]:
     error = max(float(mean_error), float(cvar_error))
     expect(
         error < _TOLERANCE,
-        "a model whose `predict` is its network and `to_distribution` alone, got "
-        f"{type(model).__name__}, of which the graph is off by {error:.2g}.",
+        "a model whose `predict` uses only its network and `to_distribution`, got "
+        f"{type(model).__name__}, whose graph has an error of {error:.2g}.",
     )
     return layers

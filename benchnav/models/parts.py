@@ -1,4 +1,4 @@
-"""Names of the parts of a model, and interrupted trainings of parts."""
+"""Names of a model's parts, and a check for interrupted training."""
 
 import os
 from collections.abc import Collection
@@ -12,18 +12,18 @@ GP = "gp"
 
 
 def member_name(index: int, stem: str) -> str:
-    """Return the part of an ensemble's member, counted from 0; the first is the stem."""
+    """Return the part name of a member, counted from 0; that of the first is `stem`."""
     return f"{stem}-{index + 1}" if index else stem
 
 
 def is_member(name: str, stem: str) -> bool:
-    """Return whether a part is a member of the name `stem`."""
+    """Return whether a part name is that of a member with this stem."""
     number = name.removeprefix(f"{stem}-")
     return name == stem or (number != name and number.isdigit())
 
 
 def training_command(part: str) -> str:
-    """Return the command that trains a part."""
+    """Return the subcommand of `benchnav-train` that trains a part."""
     stem = part.partition("-")[0]
     if stem in (CLASSIFIER, GP):
         return stem
@@ -33,7 +33,7 @@ def training_command(part: str) -> str:
 
 
 def training_folder(folder: str | Path) -> Path:
-    """Return the folder for logs and state of a training, next to its checkpoint."""
+    """Return the folder of a training's logs and state, next to its checkpoint."""
     return Path(f"{os.path.normpath(folder)}.training")
 
 
@@ -41,11 +41,11 @@ def check_finished(folder: str | Path, trained: Collection[str] = ()) -> None:
     """Check that the training of a model was not interrupted.
 
     Args:
-        folder: folder of its checkpoint, which need not exist.
+        folder: folder of the model's checkpoint, which need not exist.
         trained: names of the parts in the checkpoint.
 
     Raises:
-        CheckpointError: If the folder of logs has a part that the checkpoint lacks.
+        CheckpointError: If the training folder has a part that the checkpoint lacks.
     """
     logs = training_folder(folder)
     unfinished = sorted(
@@ -57,7 +57,7 @@ def check_finished(folder: str | Path, trained: Collection[str] = ()) -> None:
         command = "all" if GP in trained else training_command(unfinished[0])
         raise CheckpointError(
             f"Expected a trained model in {folder}, got one whose training was "
-            f"interrupted: {logs / unfinished[0]} is not finished. Give its command "
-            f"again with --resume, such as `benchnav-train {command} --data DATA --out "
-            f"{folder} --resume`."
+            f"interrupted: {logs / unfinished[0]} is not finished. Run the training "
+            f"command again with --resume, such as `benchnav-train {command} --data "
+            f"DATA --out {folder} --resume`."
         )

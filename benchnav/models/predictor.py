@@ -1,9 +1,9 @@
 """Loading of models by name or checkpoint, and the privileged models.
 
 Models are parts of the registry (`benchnav.core.registry`, kind `model`). A registered
-object is either called with its options and returns a model, or is a family with
-`from_checkpoint`, for checkpoints that name it. The package's own models are in the
-same registry. Letters in shapes: K components.
+object is either a function or class that returns a model from options, or a family
+whose `from_checkpoint` rebuilds the models of checkpoints that name it. The models of
+this package are registered in the same way. Letters in shapes: K components.
 """
 
 import json
@@ -46,14 +46,14 @@ from benchnav.models.checkpoint import (
 from benchnav.models.checkpoint_folders import (
     find_checkpoint,
     list_checkpoints,
-    split_own,
+    split_class_and_checkpoint,
 )
 from benchnav.models.conformal import ConformalModel, ConformalTable
 from benchnav.models.parts import CLASSIFIER, check_finished
 
 
 class Oracle(PrivilegedModel):
-    """Predicts the true distribution of each cell's own class; only noise remains."""
+    """Predicts the true distribution of each cell's class; only noise is unknown."""
 
     def predict_terrain(self, terrain: Terrain) -> TraversabilityMixture:
         """Return the true distribution of each cell."""
@@ -63,9 +63,9 @@ class Oracle(PrivilegedModel):
 class Ideal(PrivilegedModel):
     """Predicts the best distribution given colours: the mixture over look-alike classes.
 
-    The difference between a model and this one is the model's error; the difference between
-    this one and the oracle cannot be observed in images. Look-alikes have equal weights, so
-    the single-class option selects the first of the class table.
+    A model's difference from Ideal is the model's error. The difference between Ideal and
+    Oracle cannot be observed in images. Look-alike classes have equal weights, so the
+    single-class option selects the first of them in the class table.
     """
 
     def predict_terrain(self, terrain: Terrain) -> TraversabilityMixture:
@@ -76,7 +76,7 @@ class Ideal(PrivilegedModel):
 
 
 class Clairvoyant(PrivilegedModel):
-    """Predicts the realised λ; only planning remains."""
+    """Predicts the realised λ, so that only planning can fail."""
 
     def predict_terrain(self, terrain: Terrain) -> TraversabilityMixture:
         """Return the realised λ of each cell as a point mass, K = 1."""
@@ -88,17 +88,17 @@ class Clairvoyant(PrivilegedModel):
 
 _SOURCE = "_source"  # attribute with the part from which a model was loaded
 Source = str | Path | Mapping[str, Any] | Part
-# `CovarianceModel.nugget` for a trained model; docs/reference/sensing.md has the measurements behind
-# it. Without a nugget, scores of neighbouring cells with prediction errors contradict
-# each other.
+# `CovarianceModel.nugget` for trained models, measured in docs/reference/sensing.md. With
+# a nugget of 0, prediction errors make the scores of neighbouring cells contradict each
+# other.
 MODEL_NUGGET = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
 class ModelPart(Part):
-    """The description of a model: a part of the registry, or a checkpoint.
+    """Description of a model: a part of the registry, or a checkpoint.
 
-    A checkpoint may be combined with the class that rebuilds it.
+    A checkpoint may be given together with the class that rebuilds it.
     """
 
     kind: str = field(default="model", compare=False, repr=False)
@@ -107,35 +107,36 @@ class ModelPart(Part):
     def folder(self) -> Path | None:
         """Folder of the checkpoint; None for a part of the registry.
 
-        Names of the registry take precedence.
+        Registered names take precedence over folders.
         """
         if self.part in registry.names("model"):
             return None
         is_code = ":" in self.part or self.part.endswith(".py")
         is_folder = (Path(self.part) / CONFIG).is_file()
-        if is_code and not is_folder and split_own(self.part) is None:
+        if is_code and not is_folder and split_class_and_checkpoint(self.part) is None:
             return None
         folder = find_checkpoint(self.part)
         expect(
             not self.options,
-            f"no options for the checkpoint {self.part!r}, got {dict(self.options)}.",
+            f"no options for the checkpoint {self.part!r}, got {dict(self.options)}. "
+            "Leave them out.",
         )
         return folder
 
     @property
     def found(self) -> Found:
-        """The class or function that creates the model, or that rebuilds a checkpoint."""
+        """The class or function that creates the model or rebuilds its checkpoint."""
         folder = self.folder
         if folder is None:
             return registry.find("model", self.part)
-        class_and_checkpoint = split_own(self.part)
+        class_and_checkpoint = split_class_and_checkpoint(self.part)
         if class_and_checkpoint:
             return registry.find("model", class_and_checkpoint[0])
         return find_family(read_config(folder)["model"])
 
     @property
     def key(self) -> str:
-        """The description as text, with digests of code and files; see `loaded`."""
+        """The description as JSON, with digests of code and files; key for `loaded`."""
         folder = self.folder
         files = digests_of(folder) if folder else registry.option_files(self)
         content = [self.part, dict(self.options), self.found.digest, files]
@@ -143,7 +144,7 @@ class ModelPart(Part):
 
     @property
     def object(self) -> TraversabilityModel:
-        """The model; the last two are cached while their code and files do not change."""
+        """The model; the two used last are cached until their code or files change."""
         return loaded(self.key)
 
     def create(self, **arguments: Any) -> TraversabilityModel:
@@ -153,7 +154,7 @@ class ModelPart(Part):
 
 @lru_cache(maxsize=2)
 def loaded(key: str) -> TraversabilityModel:
-    """Return the model of a `ModelPart.key`, which is cached."""
+    """Return the model for a `ModelPart.key`; the two used last are cached."""
     part, options, *_ = json.loads(key)
     return load_model(ModelPart(part=part, label="", options=options))
 
@@ -162,7 +163,7 @@ def read_model(source: Source) -> ModelPart:
     """Read the description of a model as users write it; see `load_model`.
 
     Raises:
-        ConfigError: If it is not a text, a path or a mapping with a part.
+        ConfigError: If the description is not a text, a path or a mapping with a part.
     """
     if isinstance(source, ModelPart):
         return source
@@ -174,15 +175,16 @@ def read_model(source: Source) -> ModelPart:
 
 @torch.inference_mode(False)  # so that the caller's mode does not affect the model
 def load_model(source: Source) -> TraversabilityModel:
-    """Load a model by checkpoint or as a part of the registry.
+    """Load a model from a checkpoint or from the registry.
 
-    It predicts on the observation's device.
+    The model predicts on the observation's device.
 
     Args:
-        source: the folder of a checkpoint, by path or by its name in `checkpoints/`
-            here or among those shipped, or `owner/name@revision` of a hub; or a part,
-            such as `oracle`, `package.module:Name` or `path/to/file.py:Name`, with
-            options in a mapping; or a checkpoint with its custom class,
+        source: a checkpoint, given by the path of its folder, by its name in
+            `checkpoints/` of the working directory or among the shipped checkpoints, or
+            as `owner/name@revision` of a hub; or a part of the registry, such as
+            `oracle`, `package.module:Name` or `path/to/file.py:Name`, with options in a
+            mapping; or a checkpoint with its custom class,
             `path/to/file.py:Name@CHECKPOINT`.
 
     Raises:
@@ -195,7 +197,7 @@ def load_model(source: Source) -> TraversabilityModel:
     if folder is not None:
         model = open_checkpoint(_checked_checkpoint(part, folder, family), family)
     elif is_family(family.target):
-        raise no_model(part)
+        raise no_checkpoint_error(part)
     else:
         model = registry.make("model", part)
     # Frozen models reject attributes, and networks would register them.
@@ -203,15 +205,15 @@ def load_model(source: Source) -> TraversabilityModel:
     return model
 
 
-def no_model(part: ModelPart) -> ConfigError:
-    """Return the error for a family of models, with a remedy."""
+def no_checkpoint_error(part: ModelPart) -> ConfigError:
+    """Return the error for a family of models that is given instead of a model."""
     same_name = [path for path in list_checkpoints() if path.name == part.part]
-    remedy = "name or path, a class of your own as FILE.py:Class@CHECKPOINT"
+    remedy = "name or path, or as FILE.py:Class@CHECKPOINT for a custom class"
     if same_name:
         remedy = f"path: {same_name[0]}"
     return ConfigError(
-        f"Expected a model, got {part.part!r}, which is a family of models. Name a "
-        f"checkpoint of it, by its {remedy}."
+        f"Expected a model, got {part.part!r}, which is a family of models. Give a "
+        f"checkpoint of this family by its {remedy}."
     )
 
 
@@ -222,12 +224,11 @@ def describe_model(model: Any) -> Part:
         model: a model, or an argument of `load_model`.
 
     Returns:
-        The part that loads a model with the same weights. A model that was trained in
-        this process, or changed after it was loaded, has a name valid in this process
-        only.
+        The part that loads a model with the same weights. If the model was trained in
+        this process or changed after loading, the part is valid only in this process.
 
     Raises:
-        ConfigError: If it is not a model.
+        ConfigError: If the argument is not a model.
     """
     if isinstance(model, str | Path | Mapping | Part):
         return read_model(model)
@@ -262,26 +263,26 @@ def networks_of(value: Any) -> Iterator[nn.Module]:
 
 
 def _checked_checkpoint(part: ModelPart, folder: Path, family: Found) -> Checkpoint:
-    """Read a checkpoint, and check that it is finished and matches a named class.
+    """Read a checkpoint, and check that it is finished and matches the given class.
 
     Raises:
-        ConfigError: If the named class cannot rebuild checkpoints.
-        CheckpointError: If the checkpoint is unfinished or of another class.
+        ConfigError: If the given class cannot rebuild checkpoints.
+        CheckpointError: If the checkpoint is unfinished or has another class.
     """
-    class_and_checkpoint = split_own(part.part)
+    class_and_checkpoint = split_class_and_checkpoint(part.part)
     if class_and_checkpoint and not is_family(family.target):
         raise ConfigError(
-            f"Expected {class_and_checkpoint[0]} to be a "
-            "benchnav.models.TrainableModel or ModelFamily, whose models checkpoints "
-            "store, got another class or function."
+            f"Expected {class_and_checkpoint[0]} to be a subclass of "
+            "benchnav.models.TrainableModel or ModelFamily, since only these have "
+            "checkpoints, got another class or a function."
         )
     checkpoint = load_checkpoint(folder)
     if class_and_checkpoint:
         if checkpoint.model != family.target.__name__:
             raise CheckpointError(
                 f"Expected a checkpoint of the class {family.target.__name__}, got "
-                f"{folder}, which is one of {checkpoint.model!r}. Name the class that "
-                "it was trained with."
+                f"{folder}, which is of the class {checkpoint.model!r}. Give the class "
+                "with which it was trained."
             )
     elif checkpoint.model == FUSED and CLASSIFIER not in checkpoint.parts:
         check_finished(folder, checkpoint.parts)
@@ -292,7 +293,7 @@ def find_family(name: str) -> Found:
     """Find the family that a checkpoint names.
 
     Only registered names are accepted, never a module or file, so that a checkpoint
-    cannot run code of its choice.
+    cannot run arbitrary code.
 
     Raises:
         CheckpointError: If the name is not registered.
@@ -302,7 +303,7 @@ def find_family(name: str) -> Found:
     if family is None or not is_family(family.target):
         raise CheckpointError(
             f"Expected a checkpoint of a model among {', '.join(options)}, got one of "
-            f"{name!r}. Install the package that registers it, or name the class: "
+            f"{name!r}. Install the package that registers {name!r}, or give its class: "
             f"path/to/file.py:{name}@CHECKPOINT."
         )
     return family
@@ -315,7 +316,8 @@ def open_checkpoint(
 
     Args:
         checkpoint: content of the checkpoint.
-        family: class that rebuilds it; None for the one that the checkpoint names.
+        family: class that rebuilds the model; None for the class that the checkpoint
+            names.
 
     Raises:
         CheckpointError: If the family is not registered, or cannot rebuild the model.
@@ -324,8 +326,8 @@ def open_checkpoint(
     if checkpoint.code and checkpoint.code != family.digest:
         tell(
             f"benchnav: warning: {checkpoint.model} in {family.origin} has changed "
-            f"since it trained the checkpoint (digest {family.digest[:12]}, then "
-            f"{checkpoint.code[:12]}), so that its predictions may differ"
+            f"since it trained the checkpoint (digest {family.digest[:12]} instead of "
+            f"{checkpoint.code[:12]}), so its predictions may differ"
         )
     try:
         model = family.target.from_checkpoint(checkpoint)
@@ -334,10 +336,10 @@ def open_checkpoint(
         return ConformalModel(model, ConformalTable.read(checkpoint.conformal))
     except CheckpointError:
         raise
-    except Exception as error:  # a user's class may raise anything
+    except Exception as error:  # a custom class may raise any error
         raise out_of_memory_error(error) or CheckpointError(
-            "Expected tensors that fit the checkpoint's settings, got: "
-            f"{str(error)[:300]}. Train the model again."
+            f"Expected tensors that fit the settings of the {checkpoint.model} "
+            f"checkpoint, got: {str(error)[:300]}. Train the model again."
         ) from error
 
 
@@ -345,11 +347,11 @@ def trained_on(source: Source) -> dict[str, str]:
     """Return the maps on which a checkpoint was trained.
 
     Args:
-        source: argument of `load_model`, which has loaded it before.
+        source: argument of `load_model`.
 
     Returns:
         Name of split and dataset, such as "train of paper-v1", by digest of the split;
-        empty without a checkpoint.
+        empty if the model has no checkpoint.
     """
     folder = read_model(source).folder
     if not folder:
@@ -363,22 +365,23 @@ def trained_on(source: Source) -> dict[str, str]:
 
 
 def nugget_of(model: TraversabilityModel) -> float:
-    """Return `CovarianceModel.nugget` for a model's predictions; 0 if they are true distributions."""
+    """Return `CovarianceModel.nugget` for a model; 0 if it predicts the truth."""
     return 0.0 if isinstance(model, Oracle | Clairvoyant) else MODEL_NUGGET
 
 
 def find_ground_statistics(source: Source, dataset: TerrainDataset) -> GroundStatistics:
-    """Return the statistics of terrain for the initial belief.
+    """Return the terrain statistics for the initial belief.
 
     Args:
         source: argument of `load_model`. The statistics of a checkpoint are those of
             its training maps.
-        dataset: the maps to drive on, for models without statistics: the statistics
-            next to it, otherwise those of the shipped recipe of its maps.
+        dataset: maps of the evaluation. If the model has no statistics, they are read
+            from the file next to the dataset, or else from the shipped recipe of its
+            maps.
 
     Raises:
         ConfigError: If there are no statistics.
-        CheckpointError: If those of the checkpoint are damaged.
+        CheckpointError: If the statistics of the checkpoint are damaged.
     """
     folder = read_model(source).folder
     statistics = read_ground(folder, read_config(folder)) if folder else None
@@ -398,16 +401,16 @@ def find_ground_statistics(source: Source, dataset: TerrainDataset) -> GroundSta
 def class_mismatch(
     model: TraversabilityModel | Checkpoint, recipe: Recipe, name: str = "the model"
 ) -> str:
-    """Return in one line that a model has another class table than the data.
+    """Return a line that compares a model's classes with the data's if they differ.
 
     Args:
-        model: a model, or a checkpoint, which has a class table even if its model predicts
+        model: a model, or a checkpoint, which has class names even if its model predicts
             no classes.
         recipe: recipe of the data.
         name: name of the model in the line.
 
     Returns:
-        Empty if the tables are equal, or the model has none.
+        The line; empty if the classes are equal or the model has no class names.
     """
     names = tuple(item.name for item in recipe.classes)
     if model.class_names in ((), names):

@@ -1,9 +1,9 @@
 """Tile-by-tile prediction of maps that are too large to be predicted whole.
 
 A tile is predicted with a margin on each side as wide as the model's receptive field;
-the margin is then cut off. The result is the prediction of the whole map within 1e-5. A
-network that pools by 2, 4, …, 32 cells has the same pools if tiles start at multiples
-of 32. The receptive field is measured on the model itself, so it need not be known.
+the margin is then cut off. The result differs from the prediction of the whole map by at
+most 1e-5. A network that pools by 2, 4, …, 32 cells has the same pools if tiles start at
+multiples of 32. The receptive field need not be known: it is measured by predictions.
 Letters in shapes: B maps, H×W cells of a map, h×w cells of a tile.
 """
 
@@ -25,14 +25,13 @@ from benchnav.core.store import replacing
 from benchnav.core.terrain import Observation, take_cells
 from benchnav.models.base import TraversabilityModel, predict_observation
 
-_STRIDE = 32
+_STRIDE = 32  # tiles with their margins start at multiples of this number of cells
 _PROBES = (256, 512, 1024)  # sides of the maps on which a model is probed
 _NEGLIGIBLE = 1e-6  # a tenth of the error bound of tiles
 
 
 class Window(NamedTuple):
-    """A rectangle of cells; `values[..., *window]` are those of an array of shape [*B,
-    H, W].
+    """A rectangle of cells; `values[..., *window]` cuts it out of an array [*B, H, W].
 
     Attributes:
         rows: rows of the map.
@@ -49,13 +48,13 @@ def predict_tiles(
     tile: int = 1024,
     margin: int | None = None,
 ) -> Iterator[tuple[Window, TraversabilityDistribution]]:
-    """Predict a map tile by tile, each tile when it is requested.
+    """Predict maps tile by tile; each tile is predicted when the iterator reaches it.
 
     Args:
         model: any model that is not privileged.
         observation: B maps of any size.
-        tile: maximum side of a tile without its margin in cells, at least 64.
-        margin: width of the margin in cells; None to measure it, see
+        tile: maximum side of a tile without its margin, in cells, at least 64.
+        margin: width of the margin in cells, at least 0; None to measure it with
             `measure_margin`.
 
     Returns:
@@ -68,7 +67,7 @@ def predict_tiles(
     """
     expect(tile >= 2 * _STRIDE, f"`tile` of at least {2 * _STRIDE} cells, got {tile}.")
     expect(
-        margin is None or margin >= 0, f"`margin` of no cells or more, got {margin}."
+        margin is None or margin >= 0, f"`margin` of at least 0 cells, got {margin}."
     )
     height, width = observation.grid.shape
     rows = _cut_side(height, tile)
@@ -91,10 +90,10 @@ def write_risk_maps(
     tile: int = 1024,
     margin: int | None = None,
 ) -> dict[str, Path]:
-    """Write maps of measures of a prediction, tile by tile, for other programs.
+    """Write one map per measure of a prediction, tile by tile, for other programs.
 
-    `numpy.load(path, mmap_mode="r")` reads a part of a map only. Existing files of the
-    same names are replaced when all maps are complete.
+    `numpy.load(path, mmap_mode="r")` opens a map without reading all of it. Existing
+    files of the same names are replaced when all maps are complete.
 
     Args:
         model: any model that is not privileged.
@@ -103,20 +102,22 @@ def write_risk_maps(
             for example `{"cvar:0.9": lambda distribution: distribution.cvar(0.9)}`, or
             a risk measure of `benchnav.planning.risk`.
         folder: output folder, which need not exist.
-        tile: as in `predict_tiles`.
-        margin: as in `predict_tiles`.
+        tile: maximum side of a tile, as in `predict_tiles`.
+        margin: width of the margin, as in `predict_tiles`.
 
     Returns:
-        The file of each measure by name: `NAME.npy` with `-` for `:`, float32, shape
-        [B, H, W].
+        Path of the file of each measure by name: `NAME.npy` with `-` for `:`, float32,
+        shape [B, H, W].
 
     Raises:
-        ConfigError: As in `predict_tiles`, or if a measure returns an invalid value.
+        ConfigError: As in `predict_tiles`, or if a measure returns a tensor of the wrong
+            shape.
     """
     paths = {name: Path(folder) / f"{name.replace(':', '-')}.npy" for name in measures}
     expect(
         len(set(paths.values())) == len(paths),
-        f"names of different files, got {list(measures)}.",
+        f"`measures` with different file names, got {list(measures)}, in which `:` "
+        "becomes `-`. Rename one of them.",
     )
     tiles = predict_tiles(model, observation, tile, margin)
     shape = (len(observation.rgb), *observation.grid.shape)
@@ -131,13 +132,13 @@ def write_risk_maps(
             for name, measure in measures.items():
                 target = maps[name][:, *window]
                 values = measure(distribution)
-                got: Any = type(values).__name__
+                result: Any = type(values).__name__
                 if isinstance(values, Tensor):
-                    got = list(values.shape)
+                    result = list(values.shape)
                 expect(
-                    got == list(target.shape),
-                    f"measure {name!r} to give a tensor of shape "
-                    f"{list(target.shape)}, got {got}.",
+                    result == list(target.shape),
+                    f"measure {name!r} to return a tensor of shape "
+                    f"{list(target.shape)}, got {result}.",
                 )
                 target[...] = values.cpu()
         for risk_map in maps.values():
@@ -146,43 +147,46 @@ def write_risk_maps(
 
 
 def measure_margin(model: TraversabilityModel, observation: Observation) -> int:
-    """Measure the receptive field around a cell, by cropping maps and predicting again.
+    """Measure how far around a cell a model's prediction depends on the map.
 
-    A map is predicted whole, and again without its first and without its last 32 rows
-    and columns. The receptive field is the distance from the edge of the farthest cell
-    whose parameters differ by more than rounding. The maps are the centre of the first
-    map, and cells drawn from all over it. Their side doubles from 256 to 1024 until the
-    farthest cells differ by at most 1e-6 (relatively, for parameters above 1).
+    A probe map is predicted whole, then without its first 32 rows and columns, and then
+    without its last 32. The receptive field is the distance from the cropped edge of the
+    farthest cell whose parameters differ by more than rounding. There are two probe maps:
+    the centre of the first map, and cells drawn at random from the first map. Their side
+    doubles from 256 to 1024 until the cells farthest from the edge differ by at most 1e-6
+    (relatively, for parameters above 1).
 
     Args:
         model: any model that is not privileged.
         observation: maps similar to those to predict.
 
     Returns:
-        Cells, a multiple of 32; 0 for a model that predicts each cell independently.
+        Width in cells, a multiple of 32; 0 for a model that predicts each cell
+        independently.
 
     Raises:
         ConfigError: If the receptive field exceeds 960 cells, or the model pools by
             more than 32.
     """
     for side in _PROBES:
-        reaches = []
+        margins = []
         for probe in _probes(observation, side):
-            reach = _reach(model, probe)
-            if reach is None:
+            distance = _max_changed_distance(model, probe)
+            if distance is None:
                 break
-            reaches.append(-(-reach // _STRIDE) * _STRIDE)
+            margins.append(-(-distance // _STRIDE) * _STRIDE)
         else:
-            return max(reaches)
+            return max(margins)
     raise ConfigError(
-        f"Expected a model that looks at most {_PROBES[-1] - 2 * _STRIDE} cells far "
-        f"and pools by {_STRIDE} at most, got {type(model).__name__}, whose tiles "
-        "differ from the whole map. Predict the map whole, or give `margin`."
+        "Expected a model whose receptive field extends at most "
+        f"{_PROBES[-1] - 2 * _STRIDE} cells around a cell and that pools by at most "
+        f"{_STRIDE}, got {type(model).__name__}, whose predictions of tiles differ from "
+        "that of the whole map. Predict the whole map at once, or give `margin`."
     )
 
 
 def _cut_side(size: int, tile: int) -> list[slice]:
-    """Cut a side of a map into the fewest, nearly equal parts, at multiples of the stride."""
+    """Cut a side of a map at multiples of the stride into as few, equal parts as possible."""
     blocks = -(-size // _STRIDE)
     parts = -(-blocks // (tile // _STRIDE))
     edges = [blocks * part // parts * _STRIDE for part in range(parts)]
@@ -218,13 +222,14 @@ def _probes(observation: Observation, side: int) -> Iterator[Observation]:
     yield take_cells(first_map, random_rows, random_columns)
 
 
-def _reach(model: TraversabilityModel, probe: Observation) -> int | None:
+def _max_changed_distance(model: TraversabilityModel, probe: Observation) -> int | None:
     """Return the distance from an edge up to which cropping changes a prediction.
 
-    Differences in the farthest corner are rounding, which depends on the size of a map.
+    Differences of at most 1e-6 in the farthest cells count as rounding, which depends on
+    the size of a map.
 
     Returns:
-        Cells; None if even the farthest cells change.
+        Distance in cells; None if even the farthest cells change by more than rounding.
     """
     prediction = predict_observation(model, probe)
     side = probe.grid.height
@@ -247,7 +252,7 @@ def _reach(model: TraversabilityModel, probe: Observation) -> int | None:
 
 
 def _difference(a: TraversabilityDistribution, b: TraversabilityDistribution) -> Tensor:
-    """Return the largest difference of the parameters of two distributions per cell.
+    """Return the largest difference between two distributions' parameters in each cell.
 
     Differences are relative for parameters above 1.
 

@@ -298,7 +298,7 @@ def test_tensors_that_do_not_fit_their_settings_are_refused(folder: Path) -> Non
         with pytest.raises(CheckpointError, match="Train the model again"):
             open_checkpoint(there.with_part("classifier", replace(part, config=config)))
     fewer = replace(there, class_names=there.class_names[:3])
-    with pytest.raises(CheckpointError, match="fit the checkpoint"):
+    with pytest.raises(CheckpointError, match="fit the settings of the"):
         open_checkpoint(fewer)
 
 
@@ -331,7 +331,7 @@ def test_a_save_never_replaces_what_is_no_checkpoint(
 ) -> None:
     (tmp_path / "precious").mkdir()
     (tmp_path / "precious" / "notes.txt").write_text("keep")
-    with pytest.raises(ConfigError, match="something else"):
+    with pytest.raises(ConfigError, match=r"contains no config\.json"):
         save_checkpoint(tmp_path / "precious", load_checkpoint(folder))
     assert (tmp_path / "precious" / "notes.txt").read_text() == "keep"
 

@@ -154,7 +154,7 @@ def test_a_model_that_is_right_is_left_nearly_as_it_is() -> None:
 
 
 def test_maps_without_a_score_are_refused() -> None:
-    with pytest.raises(ConfigError, match="got none"):
+    with pytest.raises(ConfigError, match="got 0 such maps"):
         fit_table([np.array([])])
 
 

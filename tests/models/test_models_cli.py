@@ -147,7 +147,7 @@ def test_a_checkpoint_of_other_classes_is_refused_and_both_are_named(
         ),
         (["gp", "--data", "DATA", "--out", "x", "--gp.max_points", "9"], "max_points"),
         (["gp", "--data", "TEST", "--out", "x"], "train and valid"),
-        (["gp", "--data", "DATA", "--out", "."], "something else"),
+        (["gp", "--data", "DATA", "--out", "."], "contains no config.json"),
         *(
             ([kind, "--data", "DATA", "--out", "x/y", *setting], expected)
             for kind in ("all", "mdn", "classifier")
@@ -162,7 +162,7 @@ def test_a_checkpoint_of_other_classes_is_refused_and_both_are_named(
                 ),
                 (
                     ["--trainer.limit_val_batches", "0"],
-                    "`trainer.limit_val_batches` that leaves a batch",
+                    "`trainer.limit_val_batches` to select at least one",
                 ),
                 (
                     ["--trainer.gradient_clip_val", "many"],
@@ -235,8 +235,8 @@ def test_pretrained_weights_that_cannot_be_had_are_told_with_the_flag_before_any
     for encoder in ("resnet18", "tu-resnet18"):
         asked = ("--classifier.pretrained", "--classifier.encoder", encoder)
         message = refuses(capfd, "all", "--data", dataset.path, "--out", "x/y", *asked)
-        assert f"ImageNet weights of {encoder} for `pretrained`" in message
-        assert "leave --classifier.pretrained or --mdn.pretrained out" in message
+        assert f"ImageNet weights of {encoder} to download" in message
+        assert "(--classifier.pretrained or --mdn.pretrained)" in message
     assert not (tmp_path / "x").exists()
 
 
@@ -353,7 +353,7 @@ def test_classes_without_rows_are_told_before_what_was_learned_of_them_is_droppe
         f"fewer than 10 rows of 2 of 10 classes ({names[0]} 0, {names[1]} 0); their GPs"
         in first
     )
-    assert f"the GPs for them in {folder} are dropped" in first
+    assert f"The GPs of these classes in {folder} are replaced" in first
     assert not any("warning" in line for line in rest)
 
     there = load_checkpoint(folder)
@@ -370,15 +370,15 @@ def test_classes_without_rows_are_told_before_what_was_learned_of_them_is_droppe
 @pytest.mark.parametrize(
     ("command", "expected"),
     [
-        (["all", *QUICK_GP], "gp kept; to resume, give the same command with --resume"),
+        (["all", *QUICK_GP], "gp kept; to resume, run the same command with --resume"),
         (
             ["all", "--overwrite", *QUICK_GP],
-            "gp kept; to resume, give the same command with --resume instead of --overwrite",
+            "gp kept; to resume, run the same command with --resume instead of --overwrite",
         ),
-        (["mdn"], "nothing was finished; give the same command again"),
+        (["mdn"], "nothing was finished; run the same command again"),
         (
             ["classifier", "--overwrite"],
-            "nothing was finished; give the same command again",
+            "nothing was finished; run the same command again",
         ),
     ],
 )
@@ -411,7 +411,7 @@ def test_epochs_that_were_finished_are_said_to_be_kept(tmp_path: Path) -> None:
         target, ["gp", "classifier", "classifier-2"], FitOptions(folder=tmp_path)
     )
     assert said == (
-        "gp and the finished epochs of classifier kept; to resume, give the same command with --resume"
+        "gp and the finished epochs of classifier kept; to resume, run the same command with --resume"
     )
 
 

@@ -252,7 +252,8 @@ def test_a_model_whose_training_was_interrupted_is_told_with_the_command_to_go_o
         assert f"`benchnav-train {command}`" in str(caught.value)
     save_checkpoint("checkpoints/mdn", replace(whole, model="mdn"))
     with pytest.raises(
-        ConfigError, match="Name a checkpoint of it, by its path: checkpoints/mdn"
+        ConfigError,
+        match="Give a checkpoint of this family by its path: checkpoints/mdn",
     ):
         load_model("mdn")
     # A finished training has left its logs; a member that joins an ensemble may still

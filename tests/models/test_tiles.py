@@ -321,13 +321,13 @@ def test_risk_maps_are_written_whole_or_not_at_all(tmp_path: Path) -> None:
         "row": lambda mixture: mixture.mean()[..., 0],
     }
     with pytest.raises(
-        ConfigError, match=r"measure 'row' to give a tensor of shape \[1, 64, 32\]"
+        ConfigError, match=r"measure 'row' to return a tensor of shape \[1, 64, 32\]"
     ):
         write_risk_maps(model, observe(128, 70, seed=1), bad, tmp_path, tile=64)
     assert [path.name for path in tmp_path.iterdir()] == ["mean.npy"]
     assert (tmp_path / "mean.npy").read_bytes() == before
     same = {"a:b": TraversabilityMixture.mean, "a-b": TraversabilityMixture.mean}
-    with pytest.raises(ConfigError, match="different files"):
+    with pytest.raises(ConfigError, match="different file names"):
         write_risk_maps(model, observation, same, tmp_path, tile=64)
 
 
@@ -347,7 +347,7 @@ def test_bad_settings_and_answers_are_named() -> None:
     observation = observe(100, 100)
     with pytest.raises(ConfigError, match=r"`tile` of at least 64 cells, got 63"):
         predict_tiles(ColourModel(), observation, 63)
-    with pytest.raises(ConfigError, match=r"`margin` of no cells or more, got -1"):
+    with pytest.raises(ConfigError, match=r"`margin` of at least 0 cells, got -1"):
         predict_tiles(ColourModel(), observation, margin=-1)
     with pytest.raises(ConfigError, match=r"\[1, 64, 64\]"):
         next(predict_tiles(Small(0, 0), observation, 64, 0))

@@ -16,7 +16,7 @@ from benchnav.core.registry import Part
 from benchnav.core.settings import changed, of, read
 from benchnav.eval.experiment.suite import MAX_CONDITIONS
 from benchnav.models.base import is_family
-from benchnav.models.predictor import ModelPart, no_model
+from benchnav.models.predictor import ModelPart, no_checkpoint_error
 
 _Chosen = dict[tuple[str, ...], Any]  # values by their path in a mapping
 
@@ -52,7 +52,7 @@ def read_parts(kind: str, spec: Any) -> list[Part]:
         if model.folder:
             return [_with_folder_label(model, model.folder)]
         if is_family(model.found.target):
-            raise no_model(model)
+            raise no_checkpoint_error(model)
     parts = []
     for variant in each_part(kind, part):
         completed = registry.complete(kind, variant)

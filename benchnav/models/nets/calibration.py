@@ -1,14 +1,14 @@
 """Calibration on the validation maps by one parameter, fitted by maximum likelihood.
 
-For class probabilities it is the temperature by which logits are divided, so that
-confidence matches accuracy; the most likely classes do not change. The average of
-several calibrated classifiers is underconfident, increasingly so the more they differ.
-It therefore has a temperature of its own: pool first, then calibrate.
+For class probabilities, the parameter is the temperature by which logits are divided, so
+that confidence matches accuracy; the most likely classes do not change. The average of
+several calibrated classifiers is underconfident, the more so the more the classifiers
+differ. The average therefore has its own temperature: pool first, then calibrate.
 
-For distributions of λ it is the temperature T by which normal scores are multiplied:
-F⁻¹(Φ(T·Φ⁻¹(u))). If the predictions are correct, the scores z = Φ⁻¹(F(λ)) of the
-observations are standard normal; a density has φ(z / T) / T, an atom Φ(upper / T) −
-Φ(lower / T).
+For distributions of λ, the parameter is the temperature T by which normal scores are
+multiplied: F⁻¹(Φ(T·Φ⁻¹(u))). If the predictions are correct, the scores z = Φ⁻¹(F(λ)) of
+the observations are standard normal. Where F has a density, the likelihood of a score is
+φ(z / T) / T; at an atom it is Φ(upper / T) − Φ(lower / T).
 
 Sources: Guo et al. (2017), "On calibration of modern neural networks"; Rahaman and
 Thiery (2021), "Uncertainty quantification and deep ensembles". Letters in shapes: B
@@ -32,9 +32,9 @@ from benchnav.datagen.schema import UNLABELLED
 
 _MAX_CELLS = 200_000
 _MAX_TEMPERATURE = 20.0
-_MAX_SCORE = 8.0  # a normal distribution has less than 10⁻¹⁵ beyond
+_MAX_SCORE = 8.0  # the normal probability beyond this score is below 10⁻¹⁵
 _MIN_ATOM = 1e-9  # smaller masses are rounding errors of a CDF without an atom
-_MIN_GAIN = 1e-3  # nats per cell; below, a distribution is left unchanged
+_MIN_GAIN = 1e-3  # nats per cell; with a smaller gain, a distribution is left unchanged
 
 
 def fit_temperature(logits: Tensor, class_id: Tensor) -> float:
@@ -58,11 +58,11 @@ def fit_pool_temperature(
     """Return the temperature of the average of classifiers, for `models.fused.sharpen`.
 
     Args:
-        members: classifiers from maps by field to logits [B, C, H, W], each already
-            calibrated.
+        members: calibrated classifiers; each returns logits [B, C, H, W] from the layers
+            of maps by name.
         maps: a `models.training.data.MapDataset` with their inputs and `class_id`.
         seed: root seed for sampling cells.
-        device: where to compute; the classifiers are moved there.
+        device: device of the computation, to which the classifiers are moved.
     """
     average = torch.zeros((), device=device)
     class_id = torch.zeros(0, dtype=torch.int64)
@@ -73,7 +73,7 @@ def fit_pool_temperature(
 
 
 def fit_width(lower: Tensor, upper: Tensor) -> float:
-    """Return the temperature of normal scores, or 1 if it gains under 0.001 nats a cell.
+    """Return the temperature of normal scores; 1 if its gain is below 0.001 nats per cell.
 
     Args:
         lower: normal scores of P(λ < observed), shape [N].
@@ -84,10 +84,10 @@ def fit_width(lower: Tensor, upper: Tensor) -> float:
     high = upper.double().cpu().numpy()
     is_atom = ndtr(high) - ndtr(low) > _MIN_ATOM
     score = high.clip(-_MAX_SCORE, _MAX_SCORE)
-    # Placeholders elsewhere keep the mass well defined.
+    # Cells without an atom get placeholders, so that `mass` is finite in all cells.
     low = np.where(is_atom, low, -1.0)
     high = np.where(is_atom, high, 1.0)
-    # Take the difference in the tail where it loses no digits.
+    # Mirror positive scores to the lower tail, where differences of Φ lose no digits.
     flip = low > 0
     near_tail = np.where(flip, -high, low)
     far_tail = np.where(flip, -low, high)
@@ -116,13 +116,15 @@ def _minimise(loss: Callable[[float], float]) -> float:
 def sample_logits(
     classifier: nn.Module, maps: Any, seed: int = 0, device: torch.device = CPU
 ) -> tuple[Tensor, Tensor]:
-    """Classify maps and return at most 200 000 cells, the same fraction of each map.
+    """Classify maps and return a sample of at most 200 000 cells.
+
+    At most equally many cells are taken from each map.
 
     Args:
-        classifier: from maps by field to logits [B, C, H, W].
+        classifier: returns logits [B, C, H, W] from the layers of maps by name.
         maps: a `models.training.data.MapDataset` with its inputs and `class_id`.
-        seed: root seed of the draw.
-        device: where to compute; the classifier is moved there.
+        seed: root seed for sampling cells.
+        device: device of the computation, to which the classifier is moved.
 
     Returns:
         Logits [N, C] and true classes [N], int64, of labelled cells, on that device.
@@ -146,7 +148,8 @@ def sample_logits(
     class_id = torch.cat(labels_per_map)
     if not len(class_id):
         raise DatasetError(
-            "Expected validation maps with labelled cells, got none. Check `class_id`."
+            "Expected validation maps with labelled cells, got only unlabelled cells. "
+            "Check `class_id`."
         )
     return torch.cat(logits_per_map), class_id
 
@@ -160,14 +163,14 @@ def sample_scores(
 ) -> tuple[Tensor, Tensor]:
     """Predict maps and return the normal scores of at most 200 000 observed cells.
 
-    The fraction of cells is the same for each map.
+    At most equally many cells are taken from each map.
 
     Args:
-        predict: from layers by name to distributions [B, H, W].
+        predict: returns distributions [B, H, W] from the layers of maps by name.
         maps: a `models.training.data.MapDataset` with the inputs and `traversability`.
         inputs: layers that the model receives.
-        seed: root seed of the draw.
-        device: where to compute.
+        seed: root seed for sampling cells.
+        device: device of the computation.
 
     Returns:
         Scores of P(λ < observed) and of P(λ ≤ observed), each of shape [N], on that

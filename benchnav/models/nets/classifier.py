@@ -1,9 +1,8 @@
-"""Terrain classifier: calibrated class probabilities from colour, and optionally other
-layers.
+"""Terrain classifier: calibrated class probabilities from colour and other layers.
 
 It accepts any architecture and encoder of segmentation-models-pytorch. The default is
-the U-Net with a ResNet-18 encoder of paper III-B, joined by the image at full
-resolution. Unlabelled cells enter neither losses nor metrics.
+the U-Net with a ResNet-18 encoder of paper III-B; its last layers also receive features
+of the full-resolution image. Losses and metrics ignore unlabelled cells.
 
 Sources: Ronneberger et al. (2015), "U-Net"; He et al. (2016), "Deep residual learning".
 Letters in shapes: B maps, H×W cells, C classes, N channels of the network's images.
@@ -24,7 +23,7 @@ from benchnav.core.errors import ConfigError, expect, out_of_memory_error, quiet
 from benchnav.core.settings import hint, one_line
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.checkpoint import Checkpoint, member_names
-from benchnav.models.config import DEEPEST, ClassifierConfig
+from benchnav.models.config import MAX_ENCODER_DEPTH, ClassifierConfig
 from benchnav.models.nets.calibration import (
     fit_pool_temperature,
     fit_temperature,
@@ -34,28 +33,28 @@ from benchnav.models.nets.inputs import Maps
 from benchnav.models.nets.trainable import Loss, TrainableNetwork
 from benchnav.models.parts import CLASSIFIER
 
-_DETAIL_CHANNELS = 32
+_DETAIL_CHANNELS = 32  # channels of the features at full resolution
 _CHECK_SIDE = 64  # side, in cells, of the map that tests a network
 _MIN_ERROR_PROBABILITY = 1e-6
 
 
 class MeanIoU(MulticlassJaccardIndex):
-    """Mean intersection over union of the classes that occur in the truth; NaN without any.
+    """Mean intersection over union of the true classes; NaN if no cell is labelled.
 
     The mean of torchmetrics counts a class without cells as 0 as soon as one cell is
     predicted as that class.
     """
 
     def compute(self) -> Tensor:
-        """Return the mean over all cells so far."""
+        """Return the mean over the classes in all cells so far."""
         return super().compute()[self.confmat.sum(1) > 0].mean()
 
 
 class TerrainClassifier(TrainableNetwork):
-    """Terrain class of each cell.
+    """Network that predicts the terrain class of each cell.
 
     Args:
-        config: settings.
+        config: settings of the classifier and its training.
     """
 
     target = "class_id"
@@ -74,11 +73,11 @@ class TerrainClassifier(TrainableNetwork):
         return build_network(self.config, channels, len(self.map_classes))
 
     def configure_losses(self) -> Loss:
-        """Return the loss: cross-entropy, a proper score, plus the terms in the settings.
+        """Return the loss: cross-entropy, a proper score, changed by two settings.
 
-        The optional soft Dice loss weighs rare classes as much as frequent ones. Source:
-        Milletari et al. (2016), "V-Net". The optional focal loss gives well-classified
-        cells less weight.
+        `dice` adds the soft Dice loss, in which rare and frequent classes have the same
+        weight. Source: Milletari et al. (2016), "V-Net". `focal` reduces the weight of
+        well-classified cells.
         """
         smoothing = self.config.label_smoothing
         dice = self.config.dice
@@ -103,12 +102,12 @@ class TerrainClassifier(TrainableNetwork):
 
     def configure_metrics(self) -> dict[str, Metric]:
         """Return accuracy and mean intersection over union of the labelled cells."""
-        count = len(self.map_classes)
+        n_classes = len(self.map_classes)
         return {
             "accuracy": MulticlassAccuracy(
-                count, average="micro", ignore_index=UNLABELLED
+                n_classes, average="micro", ignore_index=UNLABELLED
             ),
-            "miou": MeanIoU(count, average="none", ignore_index=UNLABELLED),
+            "miou": MeanIoU(n_classes, average="none", ignore_index=UNLABELLED),
         }
 
     def update_metrics(self, outputs: Tensor, target: Tensor) -> None:
@@ -120,10 +119,10 @@ class TerrainClassifier(TrainableNetwork):
         """Compute the logits of the classes.
 
         Args:
-            maps: B maps by field, which include `inputs`.
+            maps: layers of B maps by name, including `inputs`.
 
         Returns:
-            Shape [B, C, H, W]; in evaluation divided by the temperature.
+            Logits of shape [B, C, H, W]; in evaluation mode divided by the temperature.
         """
         logits = super().forward(maps)
         return logits if self.training else logits / self.temperature
@@ -158,7 +157,7 @@ class TerrainClassifier(TrainableNetwork):
 
 
 def focal_weights(logits: Tensor, class_id: Tensor, focal: float) -> Tensor:
-    """Return the focal loss's weights (1 − p)^γ, p being the true class's probability.
+    """Return the weights (1 − p)^γ of the focal loss, with p the true class's probability.
 
     Source: Lin et al. (2017), "Focal loss for dense object detection".
 
@@ -168,17 +167,17 @@ def focal_weights(logits: Tensor, class_id: Tensor, focal: float) -> Tensor:
         focal: γ > 0.
 
     Returns:
-        Shape [B, H, W].
+        Weights of shape [B, H, W].
     """
     index = torch.where(class_id == UNLABELLED, 0, class_id).unsqueeze(1)
     log_probability = logits.log_softmax(1).gather(1, index).squeeze(1)
     error_probability = -torch.expm1(log_probability)
-    # At p = 1 a power below 1 would have no gradient.
+    # At p = 1, the gradient of a power below 1 would be infinite.
     return error_probability.clamp(min=_MIN_ERROR_PROBABILITY) ** focal
 
 
 def classifiers_of(checkpoint: Checkpoint) -> list[TerrainClassifier]:
-    """Rebuild the classifiers of a checkpoint, in order.
+    """Rebuild the classifiers of a checkpoint, in the order of their part names.
 
     Raises:
         CheckpointError: If the checkpoint has no classifier.
@@ -195,12 +194,12 @@ def classifiers_of(checkpoint: Checkpoint) -> list[TerrainClassifier]:
 
 
 class WithFullResolution(nn.Module):
-    """A network whose features are joined by those of the full-resolution image.
+    """A network whose last layers also receive features of the full-resolution image.
 
     Args:
-        network: from images [B, N, H, W] to features [B, 32, H, W].
-        channels: N.
-        class_count: C.
+        network: returns features [B, 32, H, W] from images [B, N, H, W].
+        channels: N, number of channels of the images.
+        class_count: C, number of classes.
     """
 
     def __init__(self, network: nn.Module, channels: int, class_count: int) -> None:
@@ -218,7 +217,7 @@ class WithFullResolution(nn.Module):
         return self.head(torch.cat([self.network(image), self.detail(image)], dim=1))
 
 
-# Idle stages are found by gradients, which the caller may have disabled.
+# Unused stages are detected by gradients, which the caller may have disabled.
 @torch.inference_mode(False)
 def build_network(
     config: ClassifierConfig, channels: int, class_count: int
@@ -226,13 +225,13 @@ def build_network(
     """Build the network with new weights, drawn from PyTorch's global generator.
 
     Args:
-        config: settings.
-        channels: N, of the images.
-        class_count: C.
+        config: settings of the classifier.
+        channels: N, number of channels of the images.
+        class_count: C, number of classes.
 
     Returns:
-        A network from images [B, N, H, W], whose sides are multiples of
-        2^encoder_depth, to logits [B, C, H, W].
+        A network that returns logits [B, C, H, W] from images [B, N, H, W], whose sides
+        are multiples of 2^encoder_depth.
 
     Raises:
         ConfigError: If the architecture or encoder does not exist or does not accept
@@ -240,7 +239,7 @@ def build_network(
     """
     _check_names(config)
     sizes = _network_sizes(config)
-    # The hub's messages about failed downloads would bury the error.
+    # The hub's own messages about failed downloads would hide the error.
     with quiet("huggingface_hub"):
         try:
             network = smp.create_model(
@@ -251,23 +250,23 @@ def build_network(
                 classes=_DETAIL_CHANNELS if config.full_resolution else class_count,
                 **sizes,
             )
-            if config.encoder_depth < DEEPEST:
+            if config.encoder_depth < MAX_ENCODER_DEPTH:
                 _drop_unused_stages(network, channels)
         except (OSError, KeyError, RuntimeError) as error:
             if not config.pretrained:
                 raise
             raise out_of_memory_error(error) or ConfigError(
-                f"Expected to download ImageNet weights of {config.encoder} for "
-                f"`pretrained`, got: {one_line(error)} "
-                "Try again with a network connection, or leave "
-                "--classifier.pretrained or --mdn.pretrained out."
+                f"Expected the ImageNet weights of {config.encoder} to download for "
+                f"`pretrained`, got: {one_line(error).rstrip('.')}. Try again with a "
+                "network connection, or leave out `pretrained` "
+                "(--classifier.pretrained or --mdn.pretrained)."
             ) from error
         except (ValueError, TypeError) as error:
             raise ConfigError(
-                f"Expected settings that {config.architecture} of {config.encoder} "
-                f"accepts, got `encoder_depth` {config.encoder_depth} and "
-                f"`decoder_channels` {list(config.decoder_channels)}: {error} "
-                "Change them, or leave them out."
+                f"Expected settings that {config.architecture} with the encoder "
+                f"{config.encoder} accepts, got `encoder_depth` {config.encoder_depth} "
+                f"and `decoder_channels` {list(config.decoder_channels)}: "
+                f"{str(error).rstrip('.')}. Change these settings, or leave them out."
             ) from error
         if config.full_resolution:
             network = WithFullResolution(network, channels, class_count)
@@ -275,7 +274,7 @@ def build_network(
 
 
 def _network_sizes(config: ClassifierConfig) -> dict[str, Any]:
-    """Return `encoder_depth` and `decoder_channels` where they differ from defaults.
+    """Return `encoder_depth` and `decoder_channels` if they differ from the defaults.
 
     Raises:
         ConfigError: If the architecture has no `decoder_channels`.
@@ -288,15 +287,15 @@ def _network_sizes(config: ClassifierConfig) -> dict[str, Any]:
     has_channels = isinstance(default_channels, tuple)
     expect(
         has_channels or not config.decoder_channels,
-        f"no `decoder_channels` for architecture {config.architecture}, which has no "
-        f"such setting, got {list(config.decoder_channels)}. Leave them out.",
+        f"no `decoder_channels` for the architecture {config.architecture}, which has "
+        f"no such setting, got {list(config.decoder_channels)}. Leave it out.",
     )
     sizes: dict[str, Any] = {}
     if config.decoder_channels:
         sizes["decoder_channels"] = config.decoder_channels
-    if config.encoder_depth < DEEPEST:
+    if config.encoder_depth < MAX_ENCODER_DEPTH:
         sizes["encoder_depth"] = config.encoder_depth
-        # The default channels are one per stage, too many at a lower depth.
+        # The default has one number per stage, which is too many at a lower depth.
         if has_channels and not config.decoder_channels:
             sizes["decoder_channels"] = default_channels[-config.encoder_depth :]
     return sizes
@@ -306,7 +305,7 @@ def _check_names(config: ClassifierConfig) -> None:
     """Check that the architecture and the encoder exist.
 
     Raises:
-        ConfigError: If one of them does not.
+        ConfigError: If the architecture or the encoder does not exist.
     """
     architectures = smp.MODEL_ARCHITECTURES_MAPPING
     if config.architecture not in architectures:
@@ -320,21 +319,21 @@ def _check_names(config: ClassifierConfig) -> None:
     if encoder in encoders:
         return
     if encoder.startswith("tu-"):
-        # In tu-resnet18.a1_in1k the suffix after the dot names weights. A colon, for a
-        # hub or a folder, is rejected: opening a checkpoint would request it there.
+        # In tu-resnet18.a1_in1k, the suffix after the dot names weights. Names with a
+        # colon, such as hf-hub:NAME, are rejected: loading a checkpoint would open them.
         model_name = encoder[3:].partition(".")[0]
         if timm.is_model(model_name):
             return
         encoders += [f"tu-{name}" for name in timm.list_models()]
     raise ConfigError(
-        "Expected `encoder` to be one of segmentation-models-pytorch, such as "
+        "Expected `encoder` to be an encoder of segmentation-models-pytorch, such as "
         "resnet18, or of timm, such as tu-resnet18, got "
         f"{encoder!r}.{hint(encoder, encoders)}"
     )
 
 
 def _drop_unused_stages(network: Any, channels: int) -> None:
-    """Replace encoder stages that a lower depth does not use, so they are not stored.
+    """Replace encoder stages that a lower depth does not use; they need not be stored.
 
     A stage is unused if it has weights and none of them receives a gradient.
 
@@ -355,9 +354,9 @@ def _drop_unused_stages(network: Any, channels: int) -> None:
     network.train().zero_grad()
 
 
-def _convolution(channels: int, out: int) -> nn.Module:
+def _convolution(in_channels: int, out_channels: int) -> nn.Module:
     return nn.Sequential(
-        nn.Conv2d(channels, out, 3, padding=1, bias=False),
-        nn.BatchNorm2d(out),
+        nn.Conv2d(in_channels, out_channels, 3, padding=1, bias=False),
+        nn.BatchNorm2d(out_channels),
         nn.ReLU(),
     )

@@ -1,5 +1,4 @@
-"""Ensembles of models, and the temperature of distributions on the scale of normal
-scores.
+"""Ensembles of models, and the temperature by which normal scores are multiplied.
 
 Letters in shapes: B maps, H×W cells.
 """
@@ -23,7 +22,7 @@ class Ensemble(TraversabilityModel):
 
     Args:
         members: the models.
-        temperature: of the average; see `TrainableModel`.
+        temperature: temperature of the average; see `TrainableModel`.
     """
 
     def __init__(
@@ -45,7 +44,7 @@ def widened(
     """Multiply the normal scores of distributions by a temperature.
 
     Args:
-        distribution: of shape [B, H, W].
+        distribution: any distribution, shape [B, H, W].
         temperature: > 0; above 1 it widens, at 1 it changes nothing.
     """
     if temperature == 1:

@@ -1,5 +1,4 @@
-"""Inputs of networks: layers of the maps as channels of one image, scaled by statistics
-of the training maps.
+"""Inputs of networks: layers of the maps as the channels of one scaled image.
 
 Letters in shapes: B maps, H×W cells, C channels of a layer, N channels of all inputs.
 """
@@ -14,7 +13,7 @@ from benchnav.core.errors import ConfigError, expect
 from benchnav.core.grid import is_azimuth
 from benchnav.core.settings import hint
 
-# By field: `rgb` of shape [B, 3, H, W], all others [B, H, W].
+# Layers of B maps by name: `rgb` of shape [B, 3, H, W], any other of shape [B, H, W].
 Maps = Mapping[str, Tensor]
 
 
@@ -22,9 +21,9 @@ class LayerScale(NamedTuple):
     """Scale of a layer: statistics of the training maps, float32.
 
     Args:
-        mean: per channel, shape [C]; colours are in 0–255.
-        std: per channel, shape [C].
-        rms: root mean square, at least 1, shape [].
+        mean: mean of each channel, shape [C]; colours are in 0–255.
+        std: standard deviation of each channel, shape [C].
+        rms: root mean square of the layer, at least 1, shape [].
     """
 
     mean: Tensor
@@ -40,7 +39,7 @@ class InputStack(nn.Module):
 
     Args:
         names: names of the layers.
-        scale: by layer; None if the state dict contains it.
+        scale: scale of each layer by name; None if a state dict will be loaded.
     """
 
     mean: Tensor
@@ -78,7 +77,7 @@ def _n_channels(name: str) -> int:
 
 
 def channels_of(name: str, layer: Tensor) -> Tensor:
-    """Return the channels of a layer, [B, C, H, W], from a field of the maps."""
+    """Return the channels of a layer of B maps, shape [B, C, H, W]."""
     if name == "rgb":
         return layer
     if is_azimuth(name):
@@ -102,7 +101,7 @@ def check_inputs(inputs: Sequence[str], fields: Iterable[str]) -> None:
     is_unique = len(set(inputs)) == len(inputs)
     expect(
         inputs and is_unique,
-        f"`inputs` as layers, each once, got {list(inputs)}.",
+        f"`inputs` of at least one layer, each named once, got {list(inputs)}.",
     )
     for name in inputs:
         if name not in options:

@@ -1,5 +1,4 @@
-"""From layers of maps to N numbers per cell: an image network, joined by the slope per
-cell.
+"""Base of models that predict N numbers per cell, from an image network and slope.
 
 The image passes through a convolutional network, because a cell's surroundings show its
 terrain. Slope joins after that network, because traversability depends on the slope of
@@ -21,15 +20,15 @@ from benchnav.models.nets.trainable import TrainableModel
 
 SLOPE = "slope_deg"
 
-_FIRST_SPREAD = 0.1
-_FEATURES = 32
+_FIRST_WEIGHT_SCALE = 0.1  # factor on the random weights of the last layer
+_N_FEATURES = 32
 
 
 class JoinedModel(TrainableModel):
-    """Model with N numbers per cell, from the image and from slope if it is an input.
+    """Model that predicts N numbers per cell from the image, and from slope if an input.
 
     Args:
-        config: settings.
+        config: settings of the model and its training.
     """
 
     slope_scale_deg: Tensor
@@ -38,7 +37,7 @@ class JoinedModel(TrainableModel):
         """Derive the settings of the image network."""
         super().__init__(config)
         # The classifier's network, with features instead of classes as outputs.
-        self.image = ClassifierConfig(
+        self.image_config = ClassifierConfig(
             architecture=config.architecture,
             encoder=config.encoder,
             pretrained=config.pretrained,
@@ -48,11 +47,11 @@ class JoinedModel(TrainableModel):
     @property
     def stride(self) -> int:
         """Downsampling factor of the encoder."""
-        return 2**self.image.encoder_depth
+        return 2**self.image_config.encoder_depth
 
     @abstractmethod
     def first_numbers(self) -> Tensor:
-        """Return the numbers of a cell, up to small random terms, before training; shape [N]."""
+        """Return the N numbers of each cell before training, up to small random terms."""
 
     @abstractmethod
     def to_outputs(self, numbers: Tensor) -> Any:
@@ -75,19 +74,19 @@ class JoinedModel(TrainableModel):
         # Seed again, so that these weights do not depend on the encoder.
         torch.default_generator.manual_seed(self.seed)
         self.joint = nn.Sequential(
-            nn.Conv2d(_FEATURES + self.has_slope, hidden, 1),
+            nn.Conv2d(_N_FEATURES + self.has_slope, hidden, 1),
             nn.SiLU(),
             nn.Conv2d(hidden, hidden, 1),
             nn.SiLU(),
         )
         self.head = nn.Conv2d(hidden, len(bias), 1)
         self.joint.to(memory_format=torch.channels_last)
-        weight = _FIRST_SPREAD * self.head.weight
+        weight = _FIRST_WEIGHT_SCALE * self.head.weight
         self.head.load_state_dict({"weight": weight, "bias": bias})
 
     def configure_network(self, channels: int) -> nn.Module:
         """Return the network from images to features, [B, F, H, W]."""
-        return build_network(self.image, channels, _FEATURES)
+        return build_network(self.image_config, channels, _N_FEATURES)
 
     def features(self, maps: Maps) -> Tensor:
         """Return the image features of each cell, and its slope, shape [B, F + 1, H, W]."""
@@ -102,7 +101,7 @@ class JoinedModel(TrainableModel):
         """Return the numbers of each cell, float32 even under autocast.
 
         Args:
-            hidden: output of the last hidden layer.
+            hidden: output of the last hidden layer, [B, hidden channels, H, W].
         """
         with torch.autocast(hidden.device.type, enabled=False):
             return self.head(hidden.to(self.head.weight.dtype))
@@ -111,6 +110,6 @@ class JoinedModel(TrainableModel):
         """Compute the outputs for maps of any size.
 
         Args:
-            maps: B maps by field, which include `inputs`.
+            maps: layers of B maps by name, including `inputs`.
         """
         return self.to_outputs(self.numbers(self.joint(self.features(maps))))

@@ -1,5 +1,4 @@
-"""Mixture density network: predicts the distribution of traversability directly from
-colour and slope.
+"""Mixture density network: a Gaussian mixture of λ per cell from colour and slope.
 
 It does not use terrain classes: it learns only from observed λ, by the likelihood of a
 Gaussian mixture clipped to [0, 1].
@@ -48,26 +47,26 @@ def censored_nll(
 
     Args:
         log_weights: logarithms of weights that sum to 1 over K, shape [B, K, H, W].
-        means: before clipping, shape [B, K, H, W].
-        stds: before clipping, > 0, shape [B, K, H, W].
+        means: means before clipping, shape [B, K, H, W].
+        stds: standard deviations before clipping, > 0, shape [B, K, H, W].
         observed: λ in [0, 1], NaN if not observed, shape [B, H, W].
 
     Returns:
-        Mean over the observed cells, a scalar; 0 without observed cells.
+        Mean over the observed cells, a scalar; 0 if no cell is observed.
     """
-    seen = observed.isfinite()
+    has_value = observed.isfinite()
     # Unobserved cells need a finite value: NaN times 0 would enter the gradients.
-    finite = torch.where(seen, observed, 0.5).unsqueeze(1)
+    finite = torch.where(has_value, observed, 0.5).unsqueeze(1)
     component = component_log_prob(means, stds, finite)
     log_prob = torch.logsumexp(component + log_weights, dim=1)
-    return -torch.where(seen, log_prob, 0.0).sum() / seen.sum().clamp(min=1)
+    return -torch.where(has_value, log_prob, 0.0).sum() / has_value.sum().clamp(min=1)
 
 
 class MixtureDensityModel(JoinedModel):
-    """Gaussian mixture of each cell, predicted from colour and slope.
+    """Model that predicts a Gaussian mixture per cell from colour and slope.
 
     Args:
-        config: settings.
+        config: settings of the model and its training.
     """
 
     def __init__(self, config: MDNConfig) -> None:
@@ -75,7 +74,7 @@ class MixtureDensityModel(JoinedModel):
         super().__init__(config)
 
     def first_numbers(self) -> Tensor:
-        """Return means spread over [0, 1], equal weights and equal widths."""
+        """Return numbers for means spread over [0, 1], equal weights and equal widths."""
         count = self.config.components
         logits = torch.zeros(count)
         means = (torch.arange(count) + 0.5) / count

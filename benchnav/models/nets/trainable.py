@@ -1,7 +1,7 @@
-"""Base classes of trainable models: named hooks that a subclass implements.
+"""Base classes of trainable models, with hooks that a subclass implements.
 
-`benchnav-train fit` trains any `TrainableModel`, custom ones included. A model learns
-one field of the maps, observed λ, from layers of the same maps. A subclass states the
+`benchnav-train fit` trains any `TrainableModel`, including custom ones. A model learns
+one field of the maps, observed λ, from layers of the same maps. A subclass names the
 layers (`inputs` among its settings), creates its network, loss and distribution, and
 inherits everything else:
 
@@ -44,26 +44,25 @@ from benchnav.models.nets.calibration import fit_width, sample_scores
 from benchnav.models.nets.ensemble import Ensemble, widened
 from benchnav.models.nets.inputs import InputStack, LayerScale, Maps
 
-CHUNK_CELLS = 2**17
-WARM_UP_FRACTION = 0.15
+CHUNK_CELLS = 2**17  # number of cells that a network receives at a time
+WARM_UP_FRACTION = 0.15  # fraction of the steps in which the learning rate increases
 
 Loss = Callable[[Any, Tensor], Tensor]
 
 
 class TrainableNetwork(lightning.LightningModule):
-    """Network that learns one field of the maps: base of trainable models and classifier.
+    """Network that learns one field of the maps; base of models and of the classifier.
 
     Args:
         config: settings of the network and its training.
     """
 
     target: ClassVar[str] = "traversability"
-    """Field of the maps to learn."""
+    """Name of the field of the maps that the network learns."""
 
     stops_early: ClassVar[bool] = True
-    """Whether training stops after `patience` epochs without a gain and keeps the best
-    epoch; otherwise it keeps the last.
-    """
+    """Whether training stops after `patience` epochs without a lower validation loss and
+    keeps the best epoch; if false, it keeps the last epoch."""
 
     no_graph: ClassVar[str] = ""
     """Reason why the model cannot be exported to ONNX; empty if it can."""
@@ -78,14 +77,12 @@ class TrainableNetwork(lightning.LightningModule):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Layers that the network receives: `rgb`, `elevation_m`, `slope_deg`, or others of the
-        maps.
-        """
+        """Names of the layers that the network receives, such as `rgb` and `slope_deg`."""
         return tuple(self.config.inputs)
 
     @property
     def stride(self) -> int:
-        """Number of cells to whose multiples maps are padded; outputs are cropped."""
+        """Number of cells: maps are padded to multiples of it, and outputs are cropped."""
         return 1
 
     @abstractmethod
@@ -95,27 +92,27 @@ class TrainableNetwork(lightning.LightningModule):
         The generator has been seeded.
 
         Args:
-            channels: N, of the images that the network receives, [B, N, H, W].
+            channels: N, number of channels of the images [B, N, H, W].
         """
 
     @abstractmethod
     def configure_losses(self) -> Loss:
-        """Return the loss: from outputs of `forward` and the target, [B, H, W], to a scalar.
+        """Return the loss, a function of `forward`'s outputs and the target [B, H, W].
 
-        The target is NaN in cells without a value, or 255 in unlabelled cells; the loss must
-        ignore these cells.
+        It returns a scalar. The target is NaN in cells without a value, or 255 in unlabelled
+        cells; the loss must ignore these cells.
         """
 
     def configure_metrics(self) -> dict[str, Metric]:
-        """Return further metrics of the validation maps, by name; see `update_metrics`."""
+        """Return additional metrics of the validation maps by name; see `update_metrics`."""
         return {}
 
     def update_metrics(self, outputs: Any, target: Tensor) -> None:
         """Update `self.metrics` with a batch of validation maps.
 
         Args:
-            outputs: of `forward`.
-            target: field to learn, shape [B, H, W].
+            outputs: outputs of `forward`.
+            target: values of the field to learn, shape [B, H, W].
         """
 
     def build(
@@ -127,7 +124,7 @@ class TrainableNetwork(lightning.LightningModule):
         """Create the network with new weights; restore PyTorch's global generator.
 
         Args:
-            scale: of the training maps, by layer of `inputs`.
+            scale: statistics of the training maps by layer; None to load a state dict.
             map_classes: names of the terrain classes of the maps.
             seed: root seed of the weights and of all draws in training.
         """
@@ -136,7 +133,7 @@ class TrainableNetwork(lightning.LightningModule):
         with torch.random.fork_rng(devices=[]):
             torch.default_generator.manual_seed(seed)
             self.make_modules(scale)
-        # A NaN loss must show, not be ignored.
+        # A NaN loss must make the mean NaN.
         loss = MeanMetric(nan_strategy=math.nan)
         metrics: dict[str, Any] = {"loss": loss, **self.configure_metrics()}
         self.metrics = MetricCollection(metrics, prefix="valid_", compute_groups=False)
@@ -144,7 +141,7 @@ class TrainableNetwork(lightning.LightningModule):
         return self
 
     def make_modules(self, scale: Mapping[str, LayerScale] | None) -> None:
-        """Create the modules with weights: `stack`, from layers to one image, and `network`."""
+        """Create the modules: `stack`, which makes layers one image, and `network`."""
         self.stack = InputStack(self.inputs, scale)
         self.network = self.configure_network(self.stack.channels)
 
@@ -171,7 +168,7 @@ class TrainableNetwork(lightning.LightningModule):
         """Rebuild a trained network without any download.
 
         Args:
-            config: fields of its settings, and optionally `temperature`.
+            config: settings of the network, and optionally `temperature`.
             map_classes: names of the terrain classes of the training maps.
             tensors: a state dict.
 
@@ -184,7 +181,7 @@ class TrainableNetwork(lightning.LightningModule):
         is_number = isinstance(temperature, int | float)
         expect(
             is_number and 0 < temperature < math.inf,
-            f"a `temperature` > 0, got {temperature!r}.",
+            f"a finite `temperature` > 0, got {temperature!r}.",
         )
         kind = config_class(cls)
         if "pretrained" in settings:
@@ -196,14 +193,14 @@ class TrainableNetwork(lightning.LightningModule):
         return network.eval()
 
     def settings(self) -> dict[str, Any]:
-        """Return plain data to rebuild the network: configuration and temperature."""
+        """Return the settings and the temperature as plain data, for `from_tensors`."""
         return {**plain_config(self.config), "temperature": self.temperature}
 
     def forward(self, maps: Maps) -> Any:
         """Compute the outputs for maps of any size, by padding and cropping.
 
         Args:
-            maps: B maps by field, which include `inputs`.
+            maps: layers of B maps by name, including `inputs`.
 
         Returns:
             The cropped output, shape [B, *, H, W]; the network's output must be one
@@ -218,10 +215,10 @@ class TrainableNetwork(lightning.LightningModule):
         return self.network(image)[..., :height, :width]
 
     def assess(self, maps: Maps) -> tuple[Tensor, int]:
-        """Compute a batch's loss and its number of cells; in evaluation update `metrics`.
+        """Compute the loss of a batch; in evaluation mode also update the metrics.
 
         Returns:
-            The loss, and the number of cells of which it is the mean.
+            The loss, and the number of cells over which it is averaged.
         """
         outputs = self(maps)
         target = maps[self.target]
@@ -239,11 +236,11 @@ class TrainableNetwork(lightning.LightningModule):
         return loss, int(has_value.sum())
 
     def calibrate(self, maps: Any, device: torch.device) -> None:
-        """Calibrate on the validation maps; called after training, in evaluation.
+        """Calibrate on the validation maps after training, in evaluation mode.
 
         Args:
             maps: a `models.training.data.MapDataset` with `inputs` and the field to learn.
-            device: where to compute.
+            device: device of the computation.
         """
 
     @classmethod
@@ -256,7 +253,7 @@ class TrainableNetwork(lightning.LightningModule):
             members: trained and calibrated networks.
             maps: a `models.training.data.MapDataset` with their inputs and the field to learn.
             seed: root seed for sampling cells.
-            device: where to compute.
+            device: device of the computation.
         """
         raise NotImplementedError
 
@@ -311,16 +308,16 @@ class TrainableNetwork(lightning.LightningModule):
         return loss
 
     def validation_step(self, batch: Maps, batch_index: int) -> None:
-        """Measure a batch."""
+        """Measure a batch of validation maps."""
         self.tally(batch)
-        # Tables start with the loss.
+        # The loss comes first, so that tables start with it.
         metrics = {"valid_loss": self.metrics["loss"], **dict(self.metrics.items())}
         self.log_dict(metrics, on_epoch=True, batch_size=len(batch[self.target]))
 
     def measure(self, maps: Any) -> dict[str, float]:
         """Return metrics of maps by name, such as `valid_loss`, as in training.
 
-        The network must be in evaluation.
+        The network must be in evaluation mode.
 
         Args:
             maps: a `models.training.data.MapDataset` with `inputs` and the field to learn.
@@ -332,7 +329,7 @@ class TrainableNetwork(lightning.LightningModule):
         return {name: float(value) for name, value in self.metrics.compute().items()}
 
     def tally(self, batch: Maps) -> None:
-        """Update `metrics` with a batch; the network must be in evaluation."""
+        """Update the metrics with a batch; the network must be in evaluation mode."""
         loss, cells = self.assess(batch)
         self.metrics["loss"].update(loss, cells)
 
@@ -350,7 +347,7 @@ class TrainableModel(TrainableNetwork, ModelFamily):
         """Return the distribution of λ in each cell, [B, H, W].
 
         Args:
-            outputs: of `forward`, float32.
+            outputs: outputs of `forward`, float32.
         """
 
     def predict(self, observation: Observation) -> TraversabilityDistribution:
@@ -358,7 +355,7 @@ class TrainableModel(TrainableNetwork, ModelFamily):
 
         Args:
             observation: B maps of any size, with the layers of `inputs`. The network is moved
-                to their device.
+                to its device.
 
         Returns:
             Distributions of shape [B, H, W].
@@ -374,11 +371,11 @@ class TrainableModel(TrainableNetwork, ModelFamily):
         first = next(iter(maps.values()))
         self.eval().to(first.device)
         cells_per_map = first.shape[-2] * first.shape[-1]
-        size = max(1, CHUNK_CELLS // cells_per_map)
+        chunk_size = max(1, CHUNK_CELLS // cells_per_map)
         distributions = []
         with torch.inference_mode():
-            for start in range(0, len(first), size):
-                chunk = slice(start, start + size)
+            for start in range(0, len(first), chunk_size):
+                chunk = slice(start, start + chunk_size)
                 outputs = self({name: layer[chunk] for name, layer in maps.items()})
                 distributions.append(self.to_distribution(in_single_precision(outputs)))
         return map_tensors(
@@ -388,7 +385,7 @@ class TrainableModel(TrainableNetwork, ModelFamily):
     def sharpen(
         self, distribution: TraversabilityDistribution
     ) -> TraversabilityDistribution:
-        """Apply the temperature."""
+        """Return a distribution whose normal scores are multiplied by the temperature."""
         return widened(distribution, self.temperature)
 
     def configure_metrics(self) -> dict[str, Metric]:
@@ -396,7 +393,7 @@ class TrainableModel(TrainableNetwork, ModelFamily):
         return {"rmse": MeanSquaredError(squared=False)}
 
     def update_metrics(self, outputs: Any, target: Tensor) -> None:
-        """Update every metric with E[λ] and observed λ, each of shape [N]."""
+        """Update every metric with E[λ] and observed λ of the observed cells."""
         seen = target.isfinite()
         mean = self.to_distribution(outputs).mean()[seen]
         for name, metric in self.metrics.items(keep_base=True):
@@ -428,7 +425,7 @@ class TrainableModel(TrainableNetwork, ModelFamily):
         """Rebuild the model, or the ensemble.
 
         Raises:
-            CheckpointError: If the checkpoint has no part of it.
+            CheckpointError: If the checkpoint has no part of this model.
         """
         name = checkpoint.model
         members = [
@@ -441,7 +438,7 @@ class TrainableModel(TrainableNetwork, ModelFamily):
 
     @classmethod
     def from_part(cls, part: Part, checkpoint: Checkpoint) -> Self:
-        """Rebuild one member."""
+        """Rebuild one member from its part."""
         return cls.from_tensors(part.config, checkpoint.class_names, part.tensors)
 
 

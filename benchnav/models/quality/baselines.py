@@ -1,7 +1,6 @@
 """Baselines without a model: nearest colour, and one distribution of λ for all cells.
 
-A model that scores worse than these is of no use. Letters in shapes: B maps, H×W cells,
-C classes.
+A useful model scores better than both. Letters in shapes: B maps, H×W cells, C classes.
 """
 
 import numpy as np
@@ -18,11 +17,11 @@ def nearest_colour(rgb: Tensor, colours: Tensor) -> Tensor:
     """Return the class with the nearest fully lit colour (Euclidean) for each cell.
 
     Args:
-        rgb: 0–255, shape [B, 3, H, W].
+        rgb: colours of the cells, 0–255, shape [B, 3, H, W].
         colours: colours of the classes, 0–255, shape [C, 3].
 
     Returns:
-        Class indices, int64, shape [B, H, W]; the first among equally near classes.
+        Class ids, int64, shape [B, H, W]; of equally near classes, the first.
     """
     pixels = rgb.movedim(1, -1).float().flatten(1, 2)
     palette = colours.float().expand(len(rgb), -1, -1)
@@ -31,7 +30,7 @@ def nearest_colour(rgb: Tensor, colours: Tensor) -> Tensor:
 
 
 def nearest_colour_accuracy(dataset: TerrainDataset, split: str) -> float:
-    """Return the fraction of a split's labelled cells that `nearest_colour` classifies."""
+    """Return the accuracy of `nearest_colour` in the labelled cells of a split."""
     colours = torch.tensor([item.colour for item in dataset.recipe.classes])
     n_correct = 0
     n_labelled = 0
@@ -46,12 +45,11 @@ def nearest_colour_accuracy(dataset: TerrainDataset, split: str) -> float:
 
 
 def climatology_crps(dataset: TerrainDataset, split: str) -> float:
-    """Return the CRPS of the split's own distribution of observed λ for all cells.
+    """Return the CRPS of one prediction for all cells: the distribution of observed λ.
 
-    It is ∫ F·(1 − F), with F the fraction of cells up to a value, computed from a
-    histogram with an error below 1e-4. It is NaN if λ was not observed. Source:
-    Gneiting and Raftery (2007), "Strictly proper scoring rules, prediction, and
-    estimation", 4.2.
+    The CRPS is ∫ F·(1 − F), where F(x) is the fraction of cells with λ ≤ x, computed from
+    a histogram with an error below 1e-4; NaN if λ was not observed. Source: Gneiting and
+    Raftery (2007), "Strictly proper scoring rules, prediction, and estimation", 4.2.
     """
     counts = np.zeros(_BINS)
     for _, maps in dataset.chunks(split, ("traversability",)):

@@ -1,11 +1,11 @@
-"""Columns of the tables of models: headings and meanings."""
+"""Headings and meanings of the columns in tables of models."""
 
-# For each number of ClassQuality and TraversabilityQuality: the heading in two lines,
-# and its meaning for a new reader.
+# Heading, in two lines, and meaning of each number of ClassQuality and
+# TraversabilityQuality.
 COLUMNS = {
     "accuracy": (
         "accuracy\n",
-        "fraction of cells whose most likely class is the true one; 1 is perfect.",
+        "fraction of cells whose most likely class is the true class; 1 is perfect.",
     ),
     "miou": (
         "mIoU\n",
@@ -14,8 +14,8 @@ COLUMNS = {
     ),
     "miou_predicted": (
         "mIoU\n∪ pred.",
-        "mIoU averaged over all classes that are true or predicted somewhere; a class "
-        "that is predicted but never occurs counts as 0.",
+        "mIoU averaged over all classes that are true or predicted in any cell; a class "
+        "that is predicted but never true counts as 0.",
     ),
     "look_alike_accuracy": (
         "accuracy\nlook-alikes=1",
@@ -52,8 +52,8 @@ COLUMNS = {
     ),
     "mutual_information": (
         "mutual\ninf.",
-        "the part of the entropy due to disagreement of an ensemble's members, in "
-        "nats.",
+        "part of the entropy that is due to disagreement between an ensemble's members, "
+        "in nats.",
     ),
     "entropy_auroc": (
         "AUROC\nentropy",
@@ -62,7 +62,7 @@ COLUMNS = {
     ),
     "mutual_information_auroc": (
         "AUROC\nm. inf.",
-        "AUROC of mutual information, as for entropy.",
+        "as AUROC entropy, with mutual information instead of entropy.",
     ),
     "rmse_observed": (
         "RMSE\nλ",
@@ -95,14 +95,14 @@ COLUMNS = {
         "means that low λ is more frequent than predicted.",
     ),
 }
-# Only for class tables with look-alike classes.
+# Columns that are shown only if there are look-alike classes.
 LOOK_ALIKES = (
     "look_alike_accuracy",
     "look_alike_miou",
     "look_alike_share_error",
     "look_alike_share_ece",
 )
-# Not shown in terminals, which are too narrow.
+# Columns that are not shown in terminals, which are too narrow.
 FILES_ONLY = (
     "miou_predicted",
     "entropy",

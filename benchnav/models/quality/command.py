@@ -33,16 +33,15 @@ def evaluate_command(
         out: Folder for quality.json, quality.csv, quality.md and figures. If empty,
             nothing is written.
         json: File for the content of quality.json only.
-        maps: Number of maps of each split in the map sheets among the figures; all maps
-            are measured.
-        seed: Root seed of the draws that place clipped values within their atoms.
+        maps: Number of maps of each split that the map sheets show; all maps are measured.
+        seed: Root seed of the PIT values, which are random where λ is clipped to 0 or 1.
         overwrite: Replace an existing evaluation in `out`.
         device: Device for the measurement; auto uses CUDA if there is a GPU. Figures are
             drawn on the CPU.
     """
     from benchnav.core.errors import expect
 
-    expect(maps >= 0, f"`maps` ≥ 0, got {maps}. 0 leaves the map sheets out.")
+    expect(maps >= 0, f"`maps` ≥ 0, got {maps}. Pass 0 to draw no map sheets.")
     if json:
         target = Path(json)
         is_file_path = target.parent.is_dir() and not target.is_dir()
@@ -80,8 +79,8 @@ def compare(
         splits: Names of splits, for example [test/std,valid]. If empty, all test splits.
         out: Folder for compare.json, compare.csv, differences.csv, compare.md and
             figures. If empty, nothing is written.
-        seed: Root seed of the draws that place clipped values within their atoms, the
-            same for all models.
+        seed: Root seed of the PIT values, which are random where λ is clipped to 0 or 1;
+            the random numbers are the same for all models.
         overwrite: Replace an existing comparison in `out`.
         device: Device for measuring and timing; auto uses CUDA if there is a GPU.
     """

@@ -23,10 +23,10 @@ class QualityData:
 
     Args:
         title: names of model and dataset, for the map sheets.
-        model: the measured model.
-        dataset: the maps.
-        qualities: quality of the model, by split.
-        maps: number of maps of each split in the map sheets.
+        model: measured model.
+        dataset: dataset of the measured maps.
+        qualities: quality of the model by split.
+        maps: number of maps of each split that the map sheets show.
     """
 
     title: str
@@ -46,7 +46,7 @@ class QualityData:
 
     @property
     def table(self) -> SlopeTable | None:
-        """The model's Gaussian processes over slope; None if it has none."""
+        """Table of the model's Gaussian processes over slope; None if it has no table."""
         table = getattr(self.model, "table", None)
         return table if isinstance(table, SlopeTable) else None
 
@@ -83,7 +83,7 @@ class QualityData:
 
 
 def series_table(splits: Iterable[str]) -> pd.DataFrame:
-    """Return the series of shifts, a row per `split` with `scenario` and `severity`."""
+    """Return the series of shifts: one row per `split`, with `scenario` and `severity`."""
     rows = []
     for scenario, pairs in find_series(splits).items():
         for severity, split in pairs:

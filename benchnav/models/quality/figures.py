@@ -1,8 +1,8 @@
 """Figures of a model's quality: errors, and calibration of probabilities.
 
-Their width is that of two columns of a page, or less if there are few panels. Lines
-differ in marker or dash as well as in colour. A figure has a panel per split, in the
-given order.
+A figure is as wide as two columns of a page, or less if it has few panels. Lines differ
+in marker or dash as well as in colour. A figure has a panel per split, in the order of
+the evaluation.
 """
 
 from collections.abc import Sequence
@@ -25,9 +25,11 @@ from benchnav.viz.figure import Figure, applicable
 from benchnav.viz.panels import Curves, Looks, draw_baseline, line_looks, ticks_of
 from benchnav.viz.style import legend_outside, page_width
 
-_MARGIN = 0.01  # of an axis around the ideal, so that small differences look small
+# Minimum range of an axis on each side of the ideal value, so that small differences
+# look small.
+_MARGIN = 0.01
 
-# Title and field of ClassQuality or TraversabilityQuality.
+# Title and field of each measure of ClassQuality or TraversabilityQuality.
 _SEVERITY: tuple[tuple[str, str], ...] = (
     ("Accuracy", "accuracy"),
     ("Calibration error (ECE)", "ece"),
@@ -38,8 +40,8 @@ _SEVERITY: tuple[tuple[str, str], ...] = (
     ("In the 90 % interval", "coverage"),
     ("Under VaR at 0.9", "tail_rate"),
 )
-_IDEALS = {"coverage": 0.9, "tail_rate": 0.1}  # not at an end of the range
-_N_OF_CLASSES = 4  # the first measures
+_IDEALS = {"coverage": 0.9, "tail_rate": 0.1}  # ideal values inside the range
+_N_CLASS_MEASURES = 4  # number of measures of ClassQuality, which come first
 
 
 class Severity(Figure):
@@ -66,7 +68,7 @@ class Severity(Figure):
         measured = table.dropna(axis=1)
         quantities = _SEVERITY
         if "accuracy" not in measured:
-            quantities = _SEVERITY[_N_OF_CLASSES:]
+            quantities = _SEVERITY[_N_CLASS_MEASURES:]
         table = table.assign(panel="")
         table = table.rename(columns={"severity": "x", "scenario": "line"})
         looks = line_looks(table["line"].tolist())
@@ -95,7 +97,7 @@ class Severity(Figure):
 
     def _draw_information(self, panel: Axes, table: pd.DataFrame, looks: Looks) -> None:
         """Add the AUROC of mutual information as dotted lines."""
-        label = "of mutual information; solid: of entropy"
+        label = "dotted: mutual information; solid: entropy"
         for scenario, rows in table.groupby("line", sort=False):
             look = {**looks[str(scenario)], "ls": ":", "mfc": "white"}
             auroc = rows["mutual_information_auroc"]
@@ -136,6 +138,6 @@ class MapSheets(Figure):
 
 
 def quality_figures(data: QualityData) -> list[Figure]:
-    """Return the figures of a model's quality that apply."""
+    """Return the figures that apply to the quality of a model."""
     figures = (Confusion(), Reliability(), PIT(), Severity(), Latent(), MapSheets())
     return applicable(figures, data)

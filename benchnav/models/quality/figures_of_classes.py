@@ -16,9 +16,9 @@ from benchnav.viz.maps import frame_map
 from benchnav.viz.panels import panel_grid
 from benchnav.viz.style import BLUE, ORANGE, SKY, legend_outside, page_width
 
-_SMALL = 5.5
-_MAX_NUMBERED = 16  # classes; numbers do not fit the cells of larger matrices
-_MIN_FRACTION = 1e-3  # of the cells; rarer bins have no mark
+_NUMBER_SIZE = 5.5  # font size in points
+_MAX_NUMBERED = 16  # maximum number of classes for which numbers fit the matrix
+_MIN_FRACTION = 1e-3  # minimum fraction of the cells for which a bin has a marker
 
 
 class Confusion(Figure):
@@ -27,9 +27,10 @@ class Confusion(Figure):
     name = "confusion"
     title = "Confusion of classes"
     text = (
-        "Rows are true classes, columns the most likely ones, numbers percentages of "
-        "the row. A perfect model has 100 along the diagonal; no model can distinguish "
-        "look-alike classes. Grey rows are classes that do not occur in the split."
+        "Rows are true classes, columns are most likely classes, numbers are percentages "
+        "of the row. A perfect model has 100 along the diagonal; no model can "
+        "distinguish look-alike classes. Grey rows are classes that do not occur in the "
+        "split."
     )
 
     def needs(self, data: QualityData) -> bool:
@@ -41,7 +42,7 @@ class Confusion(Figure):
         n_panels = len(data.by_class)
         n_columns = 3 if n_panels > 2 else 2
         height = 2.2 if n_columns == 3 else 3.1
-        # Panels without a panel below need room for the column labels.
+        # Panels that have no panel below need space for their column labels.
         is_ragged = n_panels > n_columns and n_panels % n_columns
         margin = 1.25 if is_ragged else 0.7
         titles = [
@@ -62,8 +63,8 @@ class Confusion(Figure):
             frame_map(panel)
         figure.supxlabel("most likely class")
         figure.supylabel("true class")
-        # The bar is next to the upper right panel and as high as the panel's square,
-        # which is smaller than the space of the panel.
+        # The colour bar is as high as the square of the upper right panel, which does not
+        # fill the panel.
         right_panel = panels[min(n_panels, n_columns) - 1]
         colour_bar = right_panel.inset_axes((1.04, 0, 0.05, 1))
         figure.colorbar(image, cax=colour_bar, label="fraction of the true class [%]")
@@ -86,7 +87,7 @@ class Confusion(Figure):
                 column,
                 row,
                 f"{value:.0f}",
-                size=_SMALL,
+                size=_NUMBER_SIZE,
                 color="white" if is_dark else "black",
                 ha="center",
                 va="center",
@@ -100,9 +101,9 @@ class Reliability(Figure):
     name = "reliability"
     title = "Calibration of the class probabilities"
     text = (
-        "Above: accuracy of the most likely class over its probability. A calibrated "
-        "model is on the dashed line; below it the model is overconfident. ECE is the "
-        "mean gap. Below: fraction of cells with that probability."
+        "Upper panel: accuracy of the most likely class over its probability. A "
+        "calibrated model is on the dashed line, an overconfident model below it. ECE is "
+        "the mean gap. Lower panel: fraction of cells with that probability."
     )
     needs = Confusion.needs
 

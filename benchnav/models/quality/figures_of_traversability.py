@@ -22,12 +22,17 @@ from benchnav.viz.figure import Figure
 from benchnav.viz.panels import panel_grid, ticks_of
 from benchnav.viz.style import BLUE, ORANGE, SKY, TEXT, legend_outside, page_width
 
-_BAND = "0.82"
-_RARE = 1e-3
+_BAND_COLOUR = "0.82"
+_RARE_FRACTION = 1e-3  # of the cells of a class
 
 
 def _slope_quantile(cells: Sequence[int], fraction: float) -> float:
-    """Return the whole degree of slope exceeded by at most a fraction of the cells."""
+    """Return the least whole degree of slope that at most a fraction of cells exceeds.
+
+    Args:
+        cells: number of cells in each whole degree of slope.
+        fraction: fraction of the cells, in [0, 1).
+    """
     n_steeper = np.cumsum(cells[::-1])[::-1]
     threshold = fraction * n_steeper[0]
     return float(np.sum(n_steeper > threshold))
@@ -40,10 +45,10 @@ class PIT(Figure):
     title = "Calibration of the predicted distribution of λ"
     text = (
         "The probability integral transform (PIT) is the predicted CDF at observed λ, "
-        "from 0 (lower end) to 1 (upper end). A calibrated model is flat at 1. High at "
-        "both ends is overconfident, high in the middle underconfident. High at the "
-        "left (orange): low λ is more frequent than predicted. Panels have scales of "
-        "their own."
+        "from 0 (lower end) to 1 (upper end). The histogram of a calibrated model is "
+        "flat at 1. If it is high at both ends, the model is overconfident; if high in "
+        "the middle, underconfident. If it is high at the left (orange), low λ is more "
+        "frequent than predicted. Each panel has its own scale."
     )
 
     def draw(self, data: QualityData) -> Drawing:
@@ -73,7 +78,7 @@ class PIT(Figure):
         low, high = interval / mean_count
         label = "90 % of a calibrated model's bins"
         panel.fill_between(
-            [0, 1], low, high, color=_BAND, lw=0, zorder=0.5, label=label
+            [0, 1], low, high, color=_BAND_COLOUR, lw=0, zorder=0.5, label=label
         )
         for bound in (0.05, 0.95):
             panel.axvline(bound, color="black", lw=0.7, ls=":", label="central 90 %")
@@ -113,7 +118,8 @@ class Latent(Figure):
     title = "Latent functions of the Gaussian processes"
     text = (
         "Predicted traversability over slope for each class, with the truth in black "
-        "if it is available. Few or no measured cells are as steep as the grey part."
+        "if it is available. Few measured cells are as steep as the light grey part, "
+        "and no cell is as steep as the dark grey part."
     )
 
     def needs(self, data: QualityData) -> bool:
@@ -171,7 +177,7 @@ class Latent(Figure):
             self._shade_steep(panel, cells[index])
             panel.text(0.05, 0.05, note, size=TEXT, transform=panel.transAxes)
             panel.set(xlim=(0, x[-1]), ylim=(-0.45, 1.45), yticks=[0, 0.5, 1])
-        true_noise = ", in brackets the true one" if has_truth else ""
+        true_noise = ", in brackets the true noise" if has_truth else ""
         figure.supxlabel(f"slope [°]  (σ: noise{true_noise})")
         figure.supylabel("traversability")
         legend_outside(figure, side="upper center")
@@ -204,9 +210,9 @@ class Latent(Figure):
         panel.plot(x, expected, "k:", lw=1, label="true E[λ]")
 
     def _shade_steep(self, panel: Axes, cells: Sequence[int]) -> None:
-        """Shade the slopes of few cells, and more darkly those of no cell."""
+        """Shade slopes that few cells exceed, and more darkly slopes that none exceeds."""
         shades = (
-            (_RARE, 0.12, "steeper: 1 cell in 1000"),
+            (_RARE_FRACTION, 0.12, "steeper: 1 cell in 1000"),
             (0.0, 0.25, "steeper: no cell of the class"),
         )
         for fraction, alpha, label in shades:

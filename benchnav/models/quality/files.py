@@ -1,4 +1,4 @@
-"""Files of an evaluation and of a comparison, and checks before any measurement."""
+"""Files of evaluations and comparisons, and checks before measurement."""
 
 import tempfile
 from collections.abc import Collection
@@ -28,7 +28,7 @@ def open_maps(
     Args:
         data: path or id of the dataset.
         splits: names of splits; None for all test splits.
-        seed: root seed.
+        seed: root seed of the measurement.
         out: output folder; if empty, nothing is written.
         overwrite: whether an existing measurement may be replaced.
         files: names of the files in an output folder, in addition to `FIGURES`.
@@ -46,7 +46,7 @@ def open_maps(
     check_seed(seed)
     if out:
         names = {*files, FIGURES}
-        reason = partial(_foreign, files=names, content=content)
+        reason = partial(_why_not_replaceable, files=names, content=content)
         check_replaceable(Path(out), overwrite, reason)
         check_writable(Path(out, next(iter(files))))
     dataset = TerrainDataset(find_dataset(data))
@@ -54,13 +54,13 @@ def open_maps(
     return dataset
 
 
-def _foreign(folder: Path, files: set[str], content: str) -> str:
-    """Return the reason for which a path may not be replaced; empty if it may."""
+def _why_not_replaceable(folder: Path, files: set[str], content: str) -> str:
+    """Return why a path may not be replaced, for `check_replaceable`; empty if it may."""
     if folder.is_dir():
         names = {item.name for item in folder.iterdir()}
         if names <= files:
             return ""
-    return f"is something else than {content}"
+    return f"is not {content}"
 
 
 def check_writable(path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Measurement of models on splits of a dataset: one model, or several to compare."""
+"""The commands `evaluate` and `compare`: measure one model, or compare several."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -50,7 +50,7 @@ def evaluate(
     json: str = "",
     maps: int = 3,
 ) -> None:
-    """Measure a model, print and write its quality; see `command.evaluate_command`."""
+    """Measure a model, and print and write its quality; see `command.evaluate_command`."""
     candidate = load_candidate(source, source)
     chosen = choose_splits(candidate.model, dataset, splits)
     measurement = Measurement(
@@ -75,7 +75,7 @@ def evaluate(
         print(f"wrote {json}")
     report_file, csv_file, page_file = EVALUATION
     if not out:
-        print(f"columns: --out FOLDER writes {page_file}, which explains them")
+        print(f"to explain the columns, --out FOLDER writes {page_file}")
         return
     name = Path(source).name if Path(source).is_dir() else source
     data = QualityData(
@@ -101,7 +101,7 @@ def compare(
     device: str,
     out: str = "",
 ) -> None:
-    """Compare models, print and write scores and differences; see `command.compare`."""
+    """Compare models, and print and write scores and differences; see `command.compare`."""
     candidates = find_candidates(sources)
     chosen = known_splits(dataset, splits)
     measurement = Measurement(
@@ -126,8 +126,8 @@ def compare(
     report_file, csv_file, differences_file, page_file = COMPARISON
     if not out:
         print(
-            f"columns: --out FOLDER writes {page_file}, which explains them and lists "
-            "all differences"
+            f"to explain the columns and list all differences, --out FOLDER writes "
+            f"{page_file}"
         )
         return
     header = {**measurement.header(notes), "threads": torch.get_num_threads()}
@@ -179,7 +179,7 @@ def _groups(dataset: TerrainDataset, split: str) -> np.ndarray:
 
 
 def _cost(candidate: Candidate, terrain: Terrain) -> dict[str, Any]:
-    """Return source and cost of a model; privileged models have no cost."""
+    """Return source and costs of a model; the costs of privileged models are None."""
     parameters = None
     milliseconds = None
     if not candidate.privileged:
@@ -209,7 +209,7 @@ def _notes(
     lines = [f"statistical units: {', '.join(counts)}", *measurement.notes_of_data]
     n_competing = sum(not candidate.privileged for candidate in candidates)
     n_tests = n_competing * (n_competing - 1) // 2
-    # Of n units, the smallest p-value of a sign-flip permutation test is 2^(1 − n).
+    # With n units, the minimum p-value of a sign-flip permutation test is 2^(1 − n).
     too_few = []
     for split, n in n_units.items():
         min_p = 2.0 ** (1 - n)
@@ -217,18 +217,20 @@ def _notes(
             too_few.append(split)
     if too_few:
         lines.append(
-            f"no difference can be significant with so few maps: {', '.join(too_few)}"
+            f"too few maps for any difference to be significant: {', '.join(too_few)}"
         )
     left_out = [candidate.label for candidate in candidates if candidate.needs_truth]
     if left_out and measurement.unknown:
         models = " and ".join(left_out)
         splits = ", ".join(measurement.unknown)
-        lines.append(f"{models} are left out on {splits}: the truth is unknown there")
+        lines.append(
+            f"{models} are left out on {splits}, where the true distribution is unknown"
+        )
     for candidate in candidates:
         if class_mismatch(candidate.model, dataset.recipe):
             lines.append(
-                f"{candidate.label} is compared by λ only: its classes are not those of "
-                "these maps"
+                f"{candidate.label} is compared only by λ, since its classes differ from "
+                "those of the maps"
             )
         if not candidate.privileged:
             notes = measurement.notes_of(candidate)

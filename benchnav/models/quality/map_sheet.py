@@ -1,4 +1,4 @@
-"""Map sheets: truth, prediction, error and uncertainty of several maps, a row per map.
+"""Map sheets: truth, prediction, error and uncertainty of maps, one row per map.
 
 A quantity has the same scale in all sheets of an evaluation, so that splits can be
 compared. Letters in shapes: B maps, H×W cells.
@@ -36,8 +36,8 @@ _LAYERS: dict[str, tuple[str, str, str]] = {
     "entropy": ("Entropy", "nats", "magma"),
     "information": ("Mutual information", "nats", "magma"),
 }
-_SCALE_LEVEL = 0.995
-_STEPS = np.array([1, 1.5, 2, 3, 4, 5, 6, 8, 10])
+_SCALE_LEVEL = 0.995  # fraction of the cells that a scale covers
+_ROUND_NUMBERS = np.array([1, 1.5, 2, 3, 4, 5, 6, 8, 10])
 
 
 class MapSheet(NamedTuple):
@@ -47,8 +47,8 @@ class MapSheet(NamedTuple):
         split: split of the maps.
         indices: indices of the maps.
         extent_m: size of a map along x and y in metres.
-        layers: layers that the model has, by the keys of `_LAYERS`, each of shape [B, H,
-            W]; `rgb` is of shape [B, H, W, 3].
+        layers: available layers, by keys of `_LAYERS`, each of shape [B, H, W]; `rgb` has
+            the shape [B, H, W, 3].
     """
 
     split: str
@@ -63,7 +63,7 @@ def read_sheet(
     split: str,
     indices: Sequence[int],
 ) -> MapSheet:
-    """Predict several maps of a split.
+    """Predict maps of a split, and return the layers of their map sheet.
 
     Args:
         model: any model.
@@ -104,9 +104,9 @@ def read_sheet(
 def shared_scales(
     sheets: Sequence[MapSheet], classes: Sequence[TerrainClass]
 ) -> dict[str, dict[str, Any]]:
-    """Return keywords of `imshow` for each layer, the same in all sheets.
+    """Return keywords of `imshow` for each layer, which all sheets share.
 
-    Scales without a fixed range cover 99.5 % of the cells.
+    If the range of a scale is not fixed, it covers 99.5 % of the cells.
 
     Args:
         sheets: all sheets of an evaluation, at least one.
@@ -143,13 +143,13 @@ def map_sheet_figure(
     classes: Sequence[TerrainClass],
     title: str,
 ) -> Figure:
-    """Draw a sheet, a row per map and a column per layer.
+    """Draw a sheet with a row per map and a column per layer.
 
-    The panel of a layer has the label `LAYER ROW`.
+    Each panel has the label `LAYER ROW`.
 
     Args:
-        sheet: the maps.
-        scales: keywords of `imshow` by layer, from `shared_scales`.
+        sheet: layers of the maps.
+        scales: keywords of `imshow` by layer, the result of `shared_scales`.
         classes: classes of the dataset.
         title: names of model and dataset, followed by the split.
     """
@@ -194,6 +194,6 @@ def _round_up(value: float) -> float:
     if value <= 0:
         return 1.0
     power = 10.0 ** np.floor(np.log10(value))
-    candidates = power * _STEPS
+    candidates = power * _ROUND_NUMBERS
     is_enough = candidates >= 0.999 * value
     return float(candidates[is_enough][0])

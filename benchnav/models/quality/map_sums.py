@@ -1,4 +1,4 @@
-"""Quality by map: sums over maps, from which `scores_of_maps` computes all scores.
+"""Sums of a model's scores in each map, from which `scores_of_maps` computes scores.
 
 Letters in shapes: B maps of a chunk, M maps of a split, C classes, N cells.
 """
@@ -22,7 +22,7 @@ from benchnav.models.quality.scores import (
 )
 from benchnav.stats.scores import Sums
 
-STEPS = 50  # of a sparsification curve, beginning with all cells
+STEPS = 50  # number of points of a sparsification curve; the first has all cells
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,14 +31,15 @@ class CellScores:
 
     Args:
         predicted: predicted distributions, of shape [1, N].
-        observed: λ, shape [1, N].
+        observed: observed λ, shape [1, N].
         expected: predicted E[λ], shape [1, N].
-        transformed: PIT of λ, shape [1, N].
+        transformed: PIT of observed λ, shape [1, N].
         maps: index of each cell's map, int64, shape [N].
-        scores: `squares` of E[λ] − λ, `nll`, and `crps`, float64, each of shape [1, N].
+        scores: scores by name: `squares` of E[λ] − λ, `nll` and `crps`, float64, each of
+            shape [1, N].
         labelled: mask of cells with a class, bool, shape [N].
-        expected_squares: squared errors of E[λ] relative to the true E[λ], in the
-            labelled cells only, float64.
+        expected_squares: squared differences of E[λ] and the true E[λ], only in the
+            labelled cells, float64.
     """
 
     predicted: TraversabilityDistribution
@@ -52,17 +53,17 @@ class CellScores:
 
 
 class MapTally:
-    """Sums over maps, added in chunks.
+    """Sums of scores in each map; maps are added in chunks.
 
     Args:
         classes: number of classes C; 0 for a model without classes.
         truth: whether the true distribution of λ is available.
-        quantiles: whether to add sums that need quantiles of all cells, which take most of
-            the time.
+        quantiles: whether to compute sums that need quantiles of all cells, which take most
+            of the time.
     """
 
     def __init__(self, classes: int, truth: bool, quantiles: bool = True) -> None:
-        """Start without maps."""
+        """Create the tally without maps."""
         self.classes = classes
         self.truth = truth
         self.quantiles = quantiles
@@ -72,7 +73,7 @@ class MapTally:
         self.ranked = np.zeros((2, STEPS))
 
     def add(self, cells: CellScores | None, count: int) -> None:
-        """Add `count` maps by their observed cells; None if there are no such cells."""
+        """Add `count` maps, given their observed cells; None if no cell is observed."""
         sums = {name: torch.zeros(count, dtype=torch.float64) for name in self.names}
         if cells is not None:
             sums |= self._sums_of(cells, count)
@@ -81,7 +82,7 @@ class MapTally:
             self._append(name, values)
 
     def _sums_of(self, cells: CellScores, count: int) -> dict[str, Tensor]:
-        """Return sums of scores by map, each of shape [count]; also update the curves."""
+        """Return the sums of scores by map, each of shape [count]; update the curves."""
         scores = dict(cells.scores)
         scores["cells"] = torch.ones_like(cells.observed)
         scores["inside"] = (cells.transformed - 0.5).abs() <= LEVEL / 2
@@ -118,14 +119,14 @@ class MapTally:
             self._append(name, counts.view(n_maps, self.classes))
 
     def sums(self) -> dict[str, np.ndarray]:
-        """Return the sums by name, of shape [M]; sums by class have shape [M, C]."""
+        """Return the sums by name, each of shape [M]; sums by class have shape [M, C]."""
         return {name: np.concatenate(parts) for name, parts in self.parts.items()}
 
     def curves(self) -> np.ndarray:
         """Return the sparsification curves, shape [3, STEPS].
 
-        The rows are the fraction of removed cells, and the mean error of the remaining
-        cells, ranked by width and by error.
+        The rows are the fraction of removed cells, the mean error of the remaining cells
+        if cells are removed by width, and the mean error if they are removed by error.
         """
         n_cells = sum(float(counts.sum()) for counts in self.parts["cells"])
         removed = np.arange(STEPS) / STEPS
@@ -136,7 +137,7 @@ class MapTally:
         self.parts.setdefault(name, []).append(array)
 
     def _rank(self, cells: CellScores, width: Tensor, count: int) -> Tensor:
-        """Return the AUSE of each cell's map, [N]; also add to the curves of all maps."""
+        """Return the AUSE of each cell's map, [N]; add the maps to the mean curves."""
         areas = torch.zeros_like(width)
         error = (cells.expected - cells.observed)[0].abs()
         steps = torch.arange(STEPS, device=width.device)
@@ -167,16 +168,16 @@ _OF_QUANTILES = ("pinball", "width", "areas")
 
 
 def by_group(sums: Sums, groups: np.ndarray) -> dict[str, np.ndarray]:
-    """Add the maps of each group, such as overlapping maps, into one statistical unit.
+    """Sum the maps of each group, such as overlapping maps, as one statistical unit.
 
-    Units without cells are left out.
+    Units without observed cells are left out.
 
     Args:
-        sums: sums by name, of shape [M]; sums by class have shape [M, C].
+        sums: sums by name, each of shape [M]; sums by class have shape [M, C].
         groups: group id of each map, shape [M].
 
     Returns:
-        Sums of the units, in the order of their ids.
+        Sums of the units by name, in the order of the group ids.
     """
     group_ids, index = np.unique(groups, return_inverse=True)
     totals = {}

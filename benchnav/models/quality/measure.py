@@ -1,8 +1,8 @@
 """Quality of a model's class probabilities and predicted λ, per split.
 
-One pass over the maps updates sums and counts only, so memory does not grow with the
-maps. The scores themselves are in `scores`. Letters in shapes: M members, B maps, H×W
-cells, C classes, N cells of all maps.
+Only sums and counts are stored, in one pass over the maps, so memory does not grow with
+the number of maps. The scores are defined in `scores`. Letters in shapes: M members, B
+maps, H×W cells, C classes, N cells of all maps.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -38,8 +38,8 @@ from benchnav.models.quality.scores import (
 )
 from benchnav.models.quality.scores_of_maps import SCORES
 
-# Fields of `TraversabilityQuality` with the same names in `SCORES`.
-_OF_CELLS = ("rmse_observed", "rmse_expected", "nll", "crps", "coverage")
+# Fields of `TraversabilityQuality` that have the same names in `SCORES`.
+_SHARED_SCORES = ("rmse_observed", "rmse_expected", "nll", "crps", "coverage")
 _MAX_SLOPE_DEG = 90
 
 
@@ -49,23 +49,24 @@ class ClassQuality:
 
     Args:
         accuracy: fraction of cells whose most likely class is correct.
-        miou: intersection over union, averaged over the classes that occur in the truth.
+        miou: intersection over union, averaged over the classes that are true in any cell.
         miou_predicted: intersection over union, averaged over the classes that are true or
-            predicted somewhere; a class that does not occur counts as 0.
-        ece: expected calibration error of the most likely class, 15 bins.
+            predicted in any cell; a class that is predicted but never true counts as 0.
+        ece: expected calibration error of the most likely class, from 15 bins.
         brier: Brier score, squared distance of the probabilities from the true class, 0–2.
         entropy: mean predictive entropy, in nats.
         mutual_information: mean mutual information of class and member, in nats; NaN for a
-            model without several members.
+            model with fewer than two members.
         entropy_auroc: probability that a misclassified cell has a higher entropy than a
             correct one; NaN if all cells or no cells are misclassified.
         mutual_information_auroc: the same probability for mutual information.
-        confusion: cells by true class (row) and most likely class (column), [C][C].
+        confusion: number of cells by true class (row) and most likely class (column),
+            [C][C].
         reliability: the curve that the ECE summarises: number of `cells`, mean
             `confidence` and `accuracy` in 15 equal bins of the probability of the most
-            likely class; both are 0 in an empty bin.
-        slope_cells: cells by true class and whole degree of slope, [C][90].
-        look_alikes: quality with look-alike classes merged; None without look-alikes.
+            likely class; all three are 0 in an empty bin.
+        slope_cells: number of cells by true class and whole degree of slope, [C][90].
+        look_alikes: quality with look-alike classes merged; None if no classes look alike.
     """
 
     accuracy: float
@@ -87,18 +88,18 @@ class ClassQuality:
 class TraversabilityQuality:
     """Quality of predicted distributions of traversability.
 
-    Lower is better except for the last three.
+    Of the first four, lower is better.
 
     Args:
         rmse_observed: root mean square of E[λ] − observed λ.
         rmse_expected: root mean square of E[λ] − true E[λ] over labelled cells; NaN
-            without such cells or if the truth is not available.
+            if there are no such cells or the truth is not available.
         nll: negative log-likelihood of observed λ, from the density in (0, 1) and the mass
             at 0 and 1; NaN for distributions without a density.
         crps: continuous ranked probability score of observed λ.
-        coverage: fraction of λ in the central 90 % of its prediction; ideally 0.9.
+        coverage: fraction of λ in the central 90 % interval of its prediction; ideally 0.9.
         tail_rate: fraction of λ below the VaR at level 0.9; ideally 0.1.
-        pit: cells in 20 equal bins of the randomised PIT; ideally equal.
+        pit: number of cells in 20 equal bins of the randomised PIT; ideally all equal.
     """
 
     rmse_observed: float
@@ -115,11 +116,11 @@ class Quality:
     """Quality of a model on one split.
 
     Args:
-        maps: number of maps predicted.
-        traversability: quality of the distributions.
-        classes: quality of the class probabilities; empty for a model without classes, and
-            on maps without labels.
-        by_map: sums for a comparison, if requested.
+        maps: number of predicted maps.
+        traversability: quality of the predicted distributions of λ.
+        classes: quality of the class probabilities; empty if the model predicts no classes
+            or the maps have no labels.
+        by_map: sums by map for a comparison; None if they are not requested.
     """
 
     maps: int
@@ -131,28 +132,28 @@ class Quality:
 def choose_splits(
     model: TraversabilityModel, dataset: TerrainDataset, splits: Iterable[str] = ()
 ) -> list[str]:
-    """Return the splits to measure, after a check that the model can be measured.
+    """Return the splits to measure, and check that the model's classes are those of the maps.
 
     Args:
         model: any model.
-        dataset: the maps.
+        dataset: dataset of the maps.
         splits: names of splits; if empty, all test splits.
 
     Raises:
         DatasetError: If a split does not exist or there is no test split.
-        CheckpointError: If the model was trained on another class table.
+        CheckpointError: If the model was trained on other classes.
     """
     chosen = known_splits(dataset, splits)
     mismatch = class_mismatch(model, dataset.recipe)
     if mismatch:
         raise CheckpointError(
-            f"{mismatch}. Train it on a dataset with this class table."
+            f"{mismatch}. Train the model on a dataset with the classes of the maps."
         )
     return chosen
 
 
 def known_splits(dataset: TerrainDataset, splits: Iterable[str] = ()) -> list[str]:
-    """Return the splits to measure: the named ones, or by default all test splits.
+    """Return the splits to measure: the given splits, or by default all test splits.
 
     Raises:
         DatasetError: If a split does not exist or there is no test split.
@@ -163,7 +164,7 @@ def known_splits(dataset: TerrainDataset, splits: Iterable[str] = ()) -> list[st
     if not chosen:
         raise DatasetError(
             f"Expected a test split in {dataset.path}, got {sorted(dataset.splits)}. "
-            "Name one in `splits`."
+            "Choose other splits with `splits`."
         )
     for split in chosen:
         dataset.map_count(split)  # raises an error if there is no such split
@@ -181,17 +182,17 @@ def evaluate(
 
     Args:
         model: any model.
-        dataset: the maps.
+        dataset: dataset of the maps.
         splits: names of splits; if empty, all test splits.
-        seed: root seed of the draws within atoms.
+        seed: root seed of the random PIT values within atoms.
         device: device of the computation.
 
     Yields:
-        Name of a split and the quality on it.
+        Name of a split and quality of the model on the split.
 
     Raises:
         DatasetError: If a split does not exist or there is no test split.
-        CheckpointError: If the model was trained on another class table.
+        CheckpointError: If the model was trained on other classes.
     """
     for split in choose_splits(model, dataset, splits):
         yield split, measure_split(model, dataset, split, seed, device)
@@ -207,16 +208,17 @@ def measure_split(
 ) -> Quality:
     """Measure a model on one split.
 
-    Only λ is measured if the model's class table differs from that of the maps.
+    Only λ is measured if the model's classes differ from those of the maps.
 
     Args:
         model: any model.
-        dataset: the maps.
+        dataset: dataset of the maps.
         split: name of the split.
-        seed: root seed of the draws within atoms, the same for all models.
+        seed: root seed of the random PIT values within atoms; all models of a comparison
+            have the same seed.
         device: device of the computation.
-        by_map: whether to return sums for a comparison, which need quantiles of all
-            cells.
+        by_map: whether to return sums by map for a comparison, which need quantiles of
+            all cells.
     """
     alike = look_alike_classes(dataset.recipe.classes)
     truth = dataset.truth_of(split) == "generated"
@@ -240,13 +242,13 @@ def measure(
     Args:
         model: any model.
         chunks: chunks of maps; at least one map.
-        generator: generator of the draws within atoms, on the CPU.
-        alike: for each class, itself and its look-alikes; empty if there are no
-            look-alikes.
+        generator: generator of the random PIT values within atoms, on the CPU.
+        alike: ids of each class and its look-alikes, by class; empty if no classes look
+            alike.
         truth: whether the true distribution of λ is available.
-        by_map: whether to return sums for a comparison, which need quantiles of all
-            cells.
-        classes: whether to measure the model's classes, if it predicts any.
+        by_map: whether to return sums by map for a comparison, which need quantiles of
+            all cells.
+        classes: whether to measure class probabilities, if the model predicts classes.
     """
     n_maps = 0
     n_classes = len(model.class_names) if classes else 0
@@ -266,10 +268,10 @@ def measure(
     sums = map_tally.sums() if n_maps else {}
     if not n_maps or not sums["cells"].any():
         raise DatasetError(
-            "Expected maps with observed λ to measure on, got none. Record λ in some "
-            "cells."
+            "Expected maps with observed λ to measure on, got no such cell. Record λ in "
+            "some cells."
         )
-    values = {name: SCORES[name].value(sums) for name in _OF_CELLS}
+    values = {name: SCORES[name].value(sums) for name in _SHARED_SCORES}
     traversability = TraversabilityQuality(
         **values,
         tail_rate=SCORES["tail_rate_90"].value(sums),
@@ -307,9 +309,9 @@ class _ClassTally:
     """Sums of a model's class probabilities over the labelled cells of maps.
 
     Args:
-        count: number of classes C, 0 for a model without classes.
-        alike: for each class, itself and its look-alikes; empty if there are no
-            look-alikes.
+        count: number of classes C; 0 for a model without classes.
+        alike: ids of each class and its look-alikes, by class; empty if no classes look
+            alike.
     """
 
     def __init__(self, count: int, alike: Sequence[tuple[int, ...]]) -> None:
@@ -329,7 +331,7 @@ class _ClassTally:
         class_id: Tensor,
         slope_deg: Tensor,
     ) -> None:
-        """Add maps.
+        """Add B maps.
 
         Args:
             probabilities: class probabilities of the model, shape [B, C, H, W].
@@ -396,7 +398,7 @@ class _ClassTally:
 
 
 def _in_a_row(layers: Tensor, mask: Tensor) -> Tensor:
-    """Select N cells of maps, from [M, B, C, H, W] to [M, 1, C, 1, N]."""
+    """Return N selected cells of layers [M, B, C, H, W], shape [M, 1, C, 1, N]."""
     selected = layers.movedim(2, -1)[:, mask]
     return selected.movedim(-1, 1)[:, None, :, None]
 
@@ -407,9 +409,9 @@ def _score_cells(
     generator: torch.Generator,
     is_privileged: bool,
 ) -> CellScores | None:
-    """Score each cell with observed λ; return None if there are no such cells.
+    """Score each cell with observed λ; return None if no cell is observed.
 
-    A privileged model predicts labelled cells only, so unlabelled cells are left out.
+    For a privileged model, which predicts only labelled cells, other cells are left out.
     """
     labelled = terrain.class_id != UNLABELLED
     mask = ~terrain.traversability.isnan()

@@ -1,4 +1,4 @@
-"""Measurements of models on splits of a dataset, with notes for their readers."""
+"""Measurements of models on splits of a dataset, with notes on how to read them."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -21,9 +21,9 @@ class Measurement:
     """Measurements of several models.
 
     Args:
-        dataset: the maps.
-        splits: names of the dataset's splits to measure.
-        seed: root seed of the draws within atoms, the same for all models.
+        dataset: dataset of the maps.
+        splits: names of the splits to measure.
+        seed: root seed of the random PIT values within atoms, the same for all models.
         device: device on which models are measured.
         qualities: quality by split and label of the model.
     """
@@ -42,7 +42,7 @@ class Measurement:
         Args:
             pairs: pairs of a split and a model.
             unit: name of the pairs in the progress line.
-            by_map: whether to store sums for a comparison.
+            by_map: whether to store sums by map for a comparison.
         """
 
         def steps() -> Iterator[tuple[int, int]]:
@@ -87,7 +87,7 @@ class Measurement:
 
     @cached_property
     def climatology_crps(self) -> dict[str, float]:
-        """CRPS of one distribution of λ for all cells, by split."""
+        """CRPS of the split's distribution of λ as prediction for all cells, by split."""
         return {
             split: baselines.climatology_crps(self.dataset, split)
             for split in self.splits
@@ -95,7 +95,7 @@ class Measurement:
 
     @property
     def unknown(self) -> list[str]:
-        """Splits without the true distribution of λ."""
+        """Names of the splits whose true distribution of λ is unknown."""
         return [
             split for split in self.splits if self.dataset.truth_of(split) == "unknown"
         ]
@@ -119,18 +119,20 @@ class Measurement:
             for split in self.unknown:
                 parts += self.dataset.splits[split]["parts"]
             sources = [part.get("source", {}) for part in parts]
-            observed = "λ drawn at least in part from the class table, not measured λ"
+            observed = (
+                "λ that is at least partly drawn from the class table, not measured"
+            )
             if all(source.get("traversability") for source in sources):
                 observed = "measured λ"
             lines.append(
                 f"the true distribution of λ is unknown on {', '.join(self.unknown)}: "
                 "RMSE E[λ] is a dash, and RMSE λ, NLL, CRPS, “in 90 %” and “< VaR” are "
-                f"against {observed}"
+                f"computed against {observed}"
             )
         return lines
 
     def notes_of(self, candidate: Candidate) -> list[str]:
-        """Return warnings if a model's numbers are poor or not meaningful."""
+        """Return warnings about poor or misleading numbers of a model."""
         qualities = self.of(candidate)
         warnings = []
         less_accurate = []
@@ -156,21 +158,21 @@ class Measurement:
         if seen:
             warnings.append(
                 "the model was trained, or selected and calibrated, on the maps of "
-                f"{', '.join(seen)}: these numbers do not hold for unseen maps"
+                f"{', '.join(seen)}: these numbers are not valid for new maps"
             )
         unknown = [split for split in self.unknown if split in qualities]
         if unknown and candidate.needs_truth:
             warnings.append(
-                f"on {', '.join(unknown)} this model predicts by the class table of the "
-                "recipe, not by the ground truth"
+                f"on {', '.join(unknown)} this model predicts from the class table of the "
+                "recipe, not from the ground truth"
             )
         return [f"warning: {line}" for line in warnings]
 
     def _seen_splits(self, candidate: Candidate, splits: Iterable[str]) -> list[str]:
-        """Return splits on which a model was trained, with their names in training."""
+        """Return the splits on which a model was trained, with their names in training."""
         seen = []
         for split in splits:
-            # Checkpoints of earlier versions contain the digest of the arrays only.
+            # Checkpoints of earlier versions contain only the digest of the arrays.
             array_digest = self.dataset.splits[split]["digest"]
             for digest in (self.dataset.split_digest(split), array_digest):
                 name = candidate.trained_on.get(digest)
@@ -179,7 +181,7 @@ class Measurement:
         return seen
 
     def header(self, notes: Sequence[str]) -> dict[str, Any]:
-        """Return the information on maps and machine for JSON files."""
+        """Return information on maps, machine and notes, for JSON files."""
         return {
             "dataset": {"id": self.dataset.id, "digest": self.dataset.digest},
             "seed": self.seed,

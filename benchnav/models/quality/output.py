@@ -23,8 +23,8 @@ class Page:
 
     Args:
         title: title of the page.
-        tables: tables of the page; the first follows the title, before the notes, and
-            the others have headings.
+        tables: tables of the page. The first follows the title; the others have headings
+            and follow the notes.
         notes: notes, one line each.
     """
 
@@ -59,16 +59,16 @@ def write_folder(
 
     Args:
         folder: output folder.
-        texts: contents by file name.
+        texts: contents of files by file name.
         name: file name of the page.
-        page: the page.
-        figures: figures with distinct names.
-        data: argument of the figures.
+        page: page to write.
+        figures: figures to draw, with distinct names.
+        data: argument with which each figure is called.
     """
     for file, text in texts.items():
         write_text(folder / file, text)
-    for old in (folder / FIGURES).glob("*.p[nd][gf]"):
-        old.unlink()
+    for old_figure in (folder / FIGURES).glob("*.p[nd][gf]"):
+        old_figure.unlink()
 
     def save() -> Iterator[tuple[int, int]]:
         for count, figure in enumerate(figures, 1):

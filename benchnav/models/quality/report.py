@@ -29,7 +29,7 @@ def quality_table(
     rows = [numbers(quality) for quality in qualities.values()]
     table = pd.DataFrame(rows, index=list(qualities))
     has_values = np.isfinite(table).any()
-    # These two may be missing in every split, and are shown nevertheless.
+    # Both columns are shown even if all their numbers are missing.
     is_optional = table.columns.isin(["rmse_expected", "nll"])
     available = set(table.columns[has_values | is_optional])
     if not all_columns:
@@ -39,7 +39,7 @@ def quality_table(
     for split, row in table[names].to_dict("index").items():
         n_maps = qualities[split].maps
         cells.append({"split": split, "maps": n_maps, **row})
-    split_meaning = "split of the dataset; maps: the number of its maps."
+    split_meaning = "split of the dataset; maps: number of maps in the split."
     columns = [
         Column("split\n", cell_of("split"), split_meaning),
         Column("maps\n", cell_of("maps")),
@@ -63,16 +63,17 @@ def quality_json(header: Mapping[str, Any], qualities: Mapping[str, Quality]) ->
         qualities: quality of the model, by split.
     """
     splits = {
-        split: {"maps": quality.maps, **_everything(quality)}
+        split: {"maps": quality.maps, **_all_results(quality)}
         for split, quality in qualities.items()
     }
     return json_text(header, splits)
 
 
 def quality_csv(qualities: Mapping[str, Quality]) -> str:
-    """Return the numbers as CSV, a row per split, with scenario and severity in series.
+    """Return the numbers as CSV, one row per split.
 
-    `std` has severity 0 and no scenario, because every series starts with it.
+    Splits of a series have a scenario and a severity. `std`, with which every series
+    starts, has severity 0 and no scenario.
     """
     rows: dict[str, dict[str, Any]] = {}
     for split, quality in qualities.items():
@@ -92,12 +93,12 @@ def quality_csv(qualities: Mapping[str, Quality]) -> str:
 
 def numbers(quality: Quality) -> dict[str, float]:
     """Return the scalar results of a split by name, in the order of `COLUMNS`."""
-    values = _everything(quality)
+    values = _all_results(quality)
     return {name: float(values[name]) for name in COLUMNS if name in values}
 
 
-def _everything(quality: Quality) -> dict[str, Any]:
-    """Return all results of a split by name; look-alikes are optional."""
+def _all_results(quality: Quality) -> dict[str, Any]:
+    """Return all results of a split by name, including those of look-alikes if any."""
     values: dict[str, Any] = {}
     for item in quality.classes:
         values |= asdict(item)

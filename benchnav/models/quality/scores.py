@@ -1,9 +1,9 @@
 """Scores of predictions: distributions of λ, class probabilities, and uncertainty.
 
 Calibration of λ is measured by the probability integral transform (PIT) of the
-observations, which is uniform if the predicted distributions are correct. At an atom of
-the distribution, such as where λ was clipped, the PIT is drawn uniformly within the
-atom, so it is uniform there too. Sources: Gneiting and Raftery (2007), "Strictly proper
+observations, which is uniform if the predicted distributions are correct. If λ has an
+atom, such as at 0 or 1 due to clipping, the PIT is drawn uniformly within the jump of the
+CDF, so that it remains uniform. Sources: Gneiting and Raftery (2007), "Strictly proper
 scoring rules, prediction, and estimation" (Brier score); Czado et al. (2009),
 "Predictive model assessment for count data" (randomised PIT); Guo et al. (2017), "On
 calibration of modern neural networks" (reliability, ECE).
@@ -15,9 +15,9 @@ for classification and preference learning"; Lakshminarayanan et al. (2017), "Si
 scalable predictive uncertainty estimation using deep ensembles". Sparsification: Ilg et
 al. (2018), "Uncertainty estimates and multi-hypotheses networks for optical flow".
 
-For two look-alike classes a perfect classifier predicts 1/2 each. Accuracy is therefore
-also computed with look-alikes merged into one class, and the probabilities within the
-merged class are scored separately.
+A perfect classifier predicts 1/2 for each of two look-alike classes. Accuracy is
+therefore also computed with look-alikes merged into one class, and the probabilities
+within the merged class are scored separately.
 
 Letters in shapes: M members, B maps, C classes, G look-alikes, H×W cells, N cells, *B
 any leading dimensions.
@@ -39,7 +39,7 @@ PIT_BINS = 20
 LOWER_FIFTH = tuple(percent / 100 for percent in range(1, 21))
 TAIL_LEVELS = (0.8, 0.9, 0.95)
 
-# Of a float32's 23 fraction bits: scores that differ by over 0.1 % stay distinct.
+# Of the 23 fraction bits of a float32; scores that differ by over 0.1 % remain distinct.
 _DROPPED_BITS = 13
 _N_STEPS = 2 ** (31 - _DROPPED_BITS)
 
@@ -54,10 +54,10 @@ def pit(
     Args:
         distribution: predictions, of shape [*B, H, W].
         observed: λ in [0, 1], shape [*B, H, W].
-        generator: generator of the draws within atoms, on the CPU.
+        generator: generator of the random PIT values within atoms, on the CPU.
 
     Returns:
-        Shape [*B, H, W]; uniform on [0, 1] if the predictions are correct.
+        PIT values of shape [*B, H, W], uniform on [0, 1] if the predictions are correct.
     """
     lower, upper = distribution.cdf_limits(observed)
     uniform = torch.rand(observed.shape, generator=generator).to(observed.device)
@@ -77,11 +77,11 @@ def coverage(transformed: Tensor) -> float:
 def tail_rate(transformed: Tensor, level: float = LEVEL) -> float:
     """Return the fraction of observations below the VaR at level α; ideally 1 − α.
 
-    If the VaR lies on an atom at 0 or 1, the draw within the atom decides.
+    If the VaR is at an atom, observations at the atom count by their random PIT values.
 
     Args:
         transformed: PIT of the observations from `pit`, any shape.
-        level: α.
+        level: level α of the VaR, in (0, 1).
     """
     is_below = transformed < 1 - level
     return float(is_below.double().mean())
@@ -90,18 +90,19 @@ def tail_rate(transformed: Tensor, level: float = LEVEL) -> float:
 def lower_fifth_and_width(
     distribution: TraversabilityDistribution, observed: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return the pinball loss of the lower fifth and the width of the central 90 %.
+    """Return the pinball loss of the lower fifth and the width of the central interval.
 
     The loss is the mean over the levels u = 0.01, 0.02, …, 0.20 of max(u·(λ − Q(u)), (u
-    − 1)·(λ − Q(u))), a proper score of these quantiles only. Sources: Koenker and
-    Bassett (1978), "Regression quantiles"; Gneiting and Raftery (2007), 6.1.
+    − 1)·(λ − Q(u))), a proper score of these quantiles. The interval contains 90 % of the
+    probability. Sources: Koenker and Bassett (1978), "Regression quantiles"; Gneiting and
+    Raftery (2007), 6.1.
 
     Args:
         distribution: predictions, of shape [*B, H, W].
         observed: λ in [0, 1], shape [*B, H, W].
 
     Returns:
-        Loss, and Q(0.95) − Q(0.05), each float64, of shape [*B, H, W].
+        Loss and width Q(0.95) − Q(0.05), each float64, of shape [*B, H, W].
     """
     loss = torch.zeros_like(observed, dtype=torch.float64)
     lower = loss
@@ -119,18 +120,17 @@ def lower_fifth_and_width(
 def sparsification(error: Tensor, uncertainty: Tensor) -> Tensor:
     """Return the mean error of the remaining cells as uncertain cells are removed.
 
-    Cells whose uncertainties differ by less than 0.1 % are tied: each counts with their
-    mean error. The mean of the first row minus the second is the area under the
-    sparsification error curve (AUSE). It is 0 if the uncertainty ranks cells as their
-    errors do.
+    Cells whose uncertainties differ by less than 0.1 % are tied: each has the mean error of
+    the tied cells. The mean of the first row minus that of the second is the area under the
+    sparsification error curve (AUSE). It is 0 if uncertainties rank cells as errors do.
 
     Args:
         error: error of each cell, ≥ 0, shape [N].
         uncertainty: uncertainty of each cell, ≥ 0, shape [N].
 
     Returns:
-        Mean errors of the 1, 2, …, N least uncertain cells, and of those with the
-        smallest errors, float64, shape [2, N].
+        Mean errors of the 1, 2, …, N least uncertain cells, and of the 1, 2, …, N cells
+        with the smallest errors, float64, shape [2, N].
     """
     error = error.double()
     _, group = torch.unique(_score_step(uncertainty), return_inverse=True)
@@ -150,7 +150,7 @@ def pit_counts(transformed: Tensor) -> Tensor:
         transformed: PIT of the observations from `pit`, any shape.
 
     Returns:
-        int64 on the CPU, shape [20].
+        Counts, int64 on the CPU, shape [20].
     """
     bins = _bin(transformed.double(), PIT_BINS)
     return torch.bincount(bins, minlength=PIT_BINS).cpu()
@@ -162,7 +162,7 @@ def brier_score(probabilities: Tensor, class_id: Tensor) -> Tensor:
     Source: Brier (1950), "Verification of forecasts expressed in terms of probability".
 
     Args:
-        probabilities: shape [B, C, H, W].
+        probabilities: class probabilities, shape [B, C, H, W].
         class_id: true classes, int64, shape [B, H, W].
 
     Returns:
@@ -176,12 +176,12 @@ def class_scores(confusion: Tensor) -> tuple[float, float, float]:
     """Return accuracy and mean intersection over union of the most likely classes.
 
     Args:
-        confusion: cells by true class (row) and most likely class (column), int64,
-            shape [C, C].
+        confusion: number of cells by true class (row) and most likely class (column),
+            int64, shape [C, C].
 
     Returns:
-        Accuracy; intersection over union averaged over the classes that occur in the
-        truth; and averaged over the classes that are true or predicted somewhere.
+        Accuracy; intersection over union averaged over the classes that are true in any
+        cell; and averaged over the classes that are true or predicted in any cell.
     """
     hits = confusion.diagonal().float()
     true = confusion.float().sum(1)
@@ -198,11 +198,11 @@ def class_scores(confusion: Tensor) -> tuple[float, float, float]:
 class ReliabilityCurve:
     """Accuracy of the most likely class by its probability, in 15 equal bins.
 
-    Unlike torchmetrics' calibration error it stores sums per bin, not all cells.
+    It stores sums per bin; torchmetrics' calibration error would store all cells.
     """
 
     def __init__(self) -> None:
-        """Start without cells."""
+        """Create the curve without cells."""
         self.sums = torch.zeros(3, CONFIDENCE_BINS, dtype=torch.float64)
 
     def update(self, probabilities: Tensor, class_id: Tensor) -> None:
@@ -214,9 +214,10 @@ class ReliabilityCurve:
         self.sums.index_add_(1, bins, terms.double().flatten(1).cpu())
 
     def compute(self) -> Tensor:
-        """Return cells, mean confidence and accuracy per bin, float64, shape [3, 15].
+        """Return number of cells, mean confidence and accuracy per bin.
 
-        Confidence and accuracy are 0 in empty bins.
+        Returns:
+            float64, shape [3, 15]; confidence and accuracy are 0 in empty bins.
         """
         cells, confidence, correct = self.sums
         divisor = cells.clamp(min=1)
@@ -224,7 +225,7 @@ class ReliabilityCurve:
 
 
 def calibration_error(curve: Tensor) -> float:
-    """Return the expected calibration error: |accuracy − confidence| over cells.
+    """Return the expected calibration error, the mean |accuracy − confidence| over cells.
 
     Args:
         curve: result of `ReliabilityCurve.compute`, shape [3, 15].
@@ -241,7 +242,7 @@ def _bin(values: Tensor, count: int) -> Tensor:
 
 
 def _score_step(score: Tensor) -> Tensor:
-    """Return scores ≥ 0 in steps of 0.1 %, int64, of the same shape."""
+    """Return the index of each score ≥ 0 on a scale in steps of 0.1 %, int64."""
     # The bits of floats ≥ 0, read as integers, are in the order of the floats.
     bits = score.float().clamp(min=0).abs().view(torch.int32)
     return bits.long() >> _DROPPED_BITS
@@ -251,10 +252,10 @@ def predictive_entropy(probabilities: Tensor) -> Tensor:
     """Return the entropy −Σ_c p_c ln p_c of the class in each cell.
 
     Args:
-        probabilities: class probabilities, summing to 1 over C, shape [*B, C, H, W].
+        probabilities: class probabilities, which sum to 1 over C, shape [*B, C, H, W].
 
     Returns:
-        Nats in [0, ln C], shape [*B, H, W].
+        Entropy in nats, in [0, ln C], shape [*B, H, W].
     """
     return torch.special.entr(probabilities).sum(-3)
 
@@ -262,14 +263,15 @@ def predictive_entropy(probabilities: Tensor) -> Tensor:
 def mutual_information(member_probabilities: Tensor) -> Tensor:
     """Return the mutual information of class and member of an ensemble.
 
-    It is the entropy of the mean minus the mean of the entropies.
+    This is the entropy of the mean prediction minus the mean entropy of the members.
 
     Args:
         member_probabilities: class probabilities of M members with equal weights, shape
             [M, B, C, H, W].
 
     Returns:
-        Nats in [0, ln min(M, C)], 0 if all members agree, shape [B, H, W].
+        Mutual information in nats, in [0, ln min(M, C)], 0 if all members agree; shape
+        [B, H, W].
     """
     members = member_probabilities.double()
     mean_entropy = predictive_entropy(members).mean(0)
@@ -279,29 +281,28 @@ def mutual_information(member_probabilities: Tensor) -> Tensor:
 
 
 class ErrorRanking:
-    """Measure of uncertainty over cells: its mean, and its AUROC in ranking errors.
+    """Mean of an uncertainty score over cells, and its AUROC for misclassified cells.
 
-    The AUROC is the probability that a misclassified cell has a higher value than a
-    correct one; a tie counts half. Values are counted in relative steps of 0.1 %, so
-    memory does not grow with the number of cells. torchmetrics' AUROC would need
-    262 144 thresholds for this resolution, and would loop over all of them for each
-    batch.
+    The AUROC is the probability that a misclassified cell has a higher score than a
+    correctly classified cell; a tie counts half. Scores are counted in relative steps of
+    0.1 %, so memory does not grow with the number of cells. torchmetrics' AUROC would
+    need 262 144 thresholds for this resolution, in a loop for each batch.
     """
 
     def __init__(self) -> None:
-        """Start without cells."""
+        """Create the ranking without cells."""
         self.counts = torch.zeros(2, _N_STEPS, dtype=torch.int64)
         self.total = 0.0
 
     def update(self, score: Tensor, wrong: Tensor) -> None:
-        """Add cells: scores ≥ 0, and a mask of misclassified cells, of one shape."""
+        """Add cells: scores ≥ 0, and a mask of misclassified cells of the same shape."""
         index = (_score_step(score) + wrong * _N_STEPS).flatten()
         counts = torch.bincount(index, minlength=2 * _N_STEPS)
         self.counts += counts.view(2, _N_STEPS).cpu()
         self.total += float(score.double().sum())
 
     def compute(self) -> tuple[float, float]:
-        """Return the mean and the AUROC; both are NaN without cells.
+        """Return the mean score and the AUROC; both are NaN if no cells were added.
 
         The AUROC is in [0, 1], and 0.5 for a score without information. It is NaN if all
         cells or no cells are misclassified.
@@ -324,12 +325,12 @@ class LookAlikeQuality:
         look_alike_accuracy: fraction of cells whose most likely class is correct, with
             look-alikes merged into one class.
         look_alike_miou: intersection over union with look-alikes merged, averaged over
-            the classes that occur in the truth.
-        look_alike_share_error: error of the true class's fraction of the probability of
-            its group of look-alikes: the mean distance from the fraction that a perfect
+            the classes that are true in any cell.
+        look_alike_share_error: mean distance of the true class's fraction of the
+            probability of its group of look-alikes from the fraction that a perfect
             classifier predicts, 1/2 in a group of two.
-        look_alike_share_ece: expected calibration error of the largest fraction within
-            a group, 15 bins.
+        look_alike_share_ece: expected calibration error of the largest such fraction in a
+            group, from 15 bins.
     """
 
     look_alike_accuracy: float
@@ -342,12 +343,12 @@ class LookAlikeTally:
     """Sums over maps for the quality of look-alike classes.
 
     Args:
-        alike: for each class, itself and its look-alikes; empty if there are no
-            look-alikes.
+        alike: ids of each class and its look-alikes, by class; empty if no classes look
+            alike.
     """
 
     def __init__(self, alike: Sequence[tuple[int, ...]]) -> None:
-        """Start without cells."""
+        """Create the tally without cells."""
         self.groups = sorted({group for group in alike if len(group) > 1})
         first_classes = sorted({min(group) for group in alike})
         merged = [first_classes.index(min(group)) for group in alike]
@@ -384,7 +385,7 @@ class LookAlikeTally:
             self.curve.update(fractions.T[None, :, None], true_index[None, None])
 
     def quality(self) -> LookAlikeQuality:
-        """Return the quality; fractions are NaN if no look-alike occurred."""
+        """Return the quality; errors of fractions are NaN if no look-alike class occurs."""
         accuracy, miou, _ = class_scores(self.confusion)
         error = self.distance / self.cells if self.cells else math.nan
         return LookAlikeQuality(

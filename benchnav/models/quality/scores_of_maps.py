@@ -1,6 +1,7 @@
 """Scores of models as functions of sums over maps (`map_sums`), with their direction.
 
-Headings and meanings are those of `columns`, shared with the tables of a single model.
+Scores that tables of a single model also show have the headings and meanings of
+`columns`.
 """
 
 from typing import Any
@@ -31,10 +32,10 @@ _COMPARED = {
     ),
     "ause": (
         "AUSE\n",
-        "area under the sparsification error curve: cells are removed by uncertainty, "
-        "and by error; the area between the two curves of the mean error |λ − E[λ]| "
-        "of the remaining cells is averaged over maps. 0 is perfect; noise of λ keeps "
-        "any model above it.",
+        "area under the sparsification error curve: area between the curves of the mean "
+        "error |λ − E[λ]| of the remaining cells if cells are removed by uncertainty "
+        "and by error, averaged over maps. 0 is perfect; noise of λ keeps it above 0 "
+        "for any model.",
     ),
 }
 _UNDER = {level: f"under_{round(100 * level)}" for level in TAIL_LEVELS}
@@ -50,7 +51,7 @@ def _root(squares: np.ndarray, cells: np.ndarray) -> np.ndarray:
 
 
 def _miou(hits: np.ndarray, true: np.ndarray, predicted: np.ndarray) -> np.ndarray:
-    """Return the intersection over union, averaged over classes that occur in truth."""
+    """Return the intersection over union, averaged over the classes that are true."""
     union = true + predicted - hits
     divisor = np.where(union > 0, union, 1)
     overlap: np.ndarray = np.where(true > 0, hits / divisor, 0.0)

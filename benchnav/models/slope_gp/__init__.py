@@ -1,3 +1,1 @@
-"""Traversability as a function of slope per class: Gaussian processes, soft spots and
-their training cells.
-"""
+"""Traversability as a function of slope per class: Gaussian processes and soft spots."""

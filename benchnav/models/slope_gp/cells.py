@@ -1,14 +1,13 @@
-"""Cells driven over by a robot, from maps or slip logs (`slip_logs`): training data of
-the class-wise GPs.
+"""Training cells of the class-wise GPs, from maps or from slip logs (`slip_logs`).
 
 Cells whose slope or traversability is missing (NaN), and unlabelled cells, are left
-out. Five sums per slope bin summarise the cells for the likelihood of the GPs. A bin of
-width w adds noise of root mean square |f'|·w/√12. At 0.25° and a slope of 5 % per
-degree that is 0.004; compared with noise of at least 0.1 it adds under 0.1 %. Sums of
-parts of the data are added, so memory does not grow with the data. The sums do not show
-a second mode of λ, so the cells are also counted by bins of λ. Letters in shapes: N
-cells, C classes, B bins of slope, V = 258 bins of λ: the atom at 0, 256 in (0, 1), the
-atom at 1.
+out. Five sums per slope bin summarise the cells for the likelihood of the GPs. If f is
+the GP's function, a bin of width w adds noise of root mean square |f'|·w/√12. For w =
+0.25° and |f'| = 0.05 per degree this is 0.004, which increases noise of at least 0.1 by
+less than 0.1 %. The sums of parts of the data are added, so memory does not grow with
+the data. The sums do not show a second mode of λ, so the cells are also counted by bins
+of λ. Letters in shapes: N cells, C classes, B bins of slope, V = 258 bins of λ: the atom
+at 0, 256 bins in (0, 1), the atom at 1.
 """
 
 from collections.abc import Iterable, Iterator
@@ -30,8 +29,8 @@ from benchnav.models.slope_gp.table import SlopeTable
 CHUNK_CELLS = 2**18
 BIN_DEG = 0.25
 INSIDE_BINS = 256
-_BINS = round(90 / BIN_DEG) + 1
-_VALUES = INSIDE_BINS + 2
+_N_SLOPE_BINS = round(90 / BIN_DEG) + 1
+_N_LEVEL_BINS = INSIDE_BINS + 2
 _LAYERS = ("class_id", "slope_deg", "traversability")
 
 
@@ -54,7 +53,7 @@ class Cells:
         return len(self.class_id)
 
     def select(self, selection: Tensor) -> "Cells":
-        """Return some cells, chosen by indices or a mask, shape [M]."""
+        """Return the cells that indices or a mask select."""
         return map_tensors(self, lambda values: values[selection])
 
 
@@ -86,7 +85,7 @@ def read_cells(
     """Read the observed cells of a split in chunks of maps.
 
     Args:
-        dataset: data set to read from.
+        dataset: dataset to read from.
         split: name of a split.
         chunk_cells: maximum number of cells in memory; a chunk has at least one map.
 
@@ -99,16 +98,16 @@ def read_cells(
 
 
 def hold_out(cells: Cells, fraction: float, seed: int = 0) -> tuple[Cells, Cells]:
-    """Split cells per class; the held-out cells are consecutive from a random start.
+    """Hold out consecutive cells of each class, from a random start.
 
-    Consecutive rows of a log are correlated. Single rows drawn at random would measure
-    interpolation between neighbours instead of generalisation to another drive.
+    Consecutive rows of a log are correlated. Rows held out one by one at random would
+    measure interpolation between neighbours instead of generalisation to another drive.
 
     Args:
-        cells: of any classes, in the order in which they were driven over.
-        fraction: fraction of each class's cells to hold out, in (0, 1). The count is
-            rounded down, so that at least one cell remains.
-        seed: root seed of the draw.
+        cells: cells of any classes, in driving order.
+        fraction: fraction of each class's cells to hold out, in (0, 1). The number of
+            cells is rounded down, so that at least one cell remains.
+        seed: root seed of the random starts.
 
     Returns:
         The training cells and the held-out cells.
@@ -127,15 +126,15 @@ def hold_out(cells: Cells, fraction: float, seed: int = 0) -> tuple[Cells, Cells
 
 
 def hold_out_drives(drive: Tensor, fraction: float, seed: int = 0) -> Tensor:
-    """Choose whole drives at random whose rows come close to a fraction of all rows.
+    """Hold out random whole drives, with a number of rows close to a fraction of all rows.
 
     Args:
         drive: index of each row's drive, int64, shape [N]; at least two drives.
         fraction: fraction of the rows to hold out, in (0, 1).
-        seed: root seed of the draw.
+        seed: root seed of the random choice.
 
     Returns:
-        Mask of the held-out rows: at least one drive and never all, bool, shape [N].
+        Mask of the held-out rows, bool, shape [N]: at least one drive, but not all.
     """
     n_rows = drive.bincount().tolist()
     key = rng.stream_key(seed, "models", "held-out drives")
@@ -148,7 +147,7 @@ def hold_out_drives(drive: Tensor, fraction: float, seed: int = 0) -> Tensor:
         if abs(n_held_out + n_rows[index] - target_rows) < error:
             chosen.append(index)
     chosen = chosen[: len(n_rows) - 1]
-    if not chosen:  # every drive exceeds twice the fraction: take the shortest
+    if not chosen:  # every drive has more than twice the rows wanted: use the shortest
         chosen = [min(order, key=n_rows.__getitem__)]
     return torch.isin(drive, torch.tensor(chosen))
 
@@ -158,12 +157,12 @@ class SlopeSums:
     """Counts and sums that summarise observed cells.
 
     Args:
-        cells: counts by class, bin of slope and bin of λ, int64, shape [C, B, V].
-        slope: sum of the slopes, float64, shape [C, B].
-        total: sum of λ over the cells in (0, 1), float64, shape [C, B].
-        squares: sum of λ² over those cells, float64, shape [C, B].
-        steepest_deg: steepest slope per class, 0 for a class without cells, float32,
-            shape [C].
+        cells: number of cells by class, bin of slope and bin of λ, int64, [C, B, V].
+        slope: sum of the slopes in degrees, float64, shape [C, B].
+        total: sum of λ over the cells with λ in (0, 1), float64, shape [C, B].
+        squares: sum of λ² over the cells with λ in (0, 1), float64, shape [C, B].
+        steepest_deg: steepest slope of each class in degrees, 0 for a class without
+            cells, float32, shape [C].
     """
 
     cells: Tensor
@@ -178,26 +177,28 @@ class SlopeSums:
 
         Args:
             cells: cells with class ids below C.
-            class_count: C.
+            class_count: C, number of classes.
         """
         slope = cells.slope_deg.double()
         value = cells.traversability.double()
-        index = cells.class_id * _BINS + (slope / BIN_DEG).long()
+        index = cells.class_id * _N_SLOPE_BINS + (slope / BIN_DEG).long()
         inside = (value > 0) & (value < 1)
         inside_level = (value * INSIDE_BINS).long() + 1
-        level = torch.where(inside, inside_level, (value > 0) * (_VALUES - 1))
+        level = torch.where(inside, inside_level, (value > 0) * (_N_LEVEL_BINS - 1))
         steepest = torch.zeros(class_count).scatter_reduce(
             0, cells.class_id, cells.slope_deg.float(), "amax"
         )
-        n_bins = class_count * _BINS
+        n_bins = class_count * _N_SLOPE_BINS
 
         def add(weights: Tensor) -> Tensor:
             sums = torch.bincount(index, weights, n_bins)
-            return sums.view(class_count, _BINS)
+            return sums.view(class_count, _N_SLOPE_BINS)
 
-        counts = torch.bincount(index * _VALUES + level, minlength=n_bins * _VALUES)
+        counts = torch.bincount(
+            index * _N_LEVEL_BINS + level, minlength=n_bins * _N_LEVEL_BINS
+        )
         return cls(
-            cells=counts.view(class_count, _BINS, _VALUES),
+            cells=counts.view(class_count, _N_SLOPE_BINS, _N_LEVEL_BINS),
             slope=add(slope),
             total=add(inside * value),
             squares=add(inside * value**2),
@@ -205,7 +206,7 @@ class SlopeSums:
         )
 
     def __add__(self, addend: "SlopeSums") -> "SlopeSums":
-        """Return the sums over both parts of the data."""
+        """Return the sums over the cells of two parts of the data."""
         return SlopeSums(
             cells=self.cells + addend.cells,
             slope=self.slope + addend.slope,
@@ -227,10 +228,10 @@ class SlopeSums:
                 values.
 
         Returns:
-            `slope_deg` (mean slope of a bin), `zeros` and `ones` (cells clipped to 0 and
-            1), `inside` (all other cells), `total` and `squares` (sums of λ and λ² over
-            those), float64, each of shape [C, B]; and `count`, the number of cells per
-            class, shape [C].
+            `slope_deg` (mean slope of a bin), `zeros` and `ones` (numbers of cells clipped
+            to 0 and to 1), `inside` (number of all other cells), `total` and `squares`
+            (sums of λ and λ² over these other cells), float64, each of shape [C, B]; and
+            `count`, the number of cells per class, shape [C].
         """
         cells = self.cells.sum(2).double()
         occupied = cells.sum(0).nonzero().flatten().tolist()
@@ -240,7 +241,7 @@ class SlopeSums:
         zeros = at_0 * censored
         ones = at_1 * censored
         uncensored_ones = at_1 - ones
-        centres = (torch.arange(_BINS, dtype=torch.float64) + 0.5) * BIN_DEG
+        centres = (torch.arange(_N_SLOPE_BINS, dtype=torch.float64) + 0.5) * BIN_DEG
         mean_slope = self.slope / cells.clamp(min=1)
         sums = {
             "slope_deg": torch.where(cells > 0, mean_slope, centres),
@@ -255,7 +256,7 @@ class SlopeSums:
 
 
 def levels() -> Tensor:
-    """Return λ of the bins: 0, the centres of the inner bins, 1; float64, shape [V]."""
+    """Return λ of each bin: 0, the centres of the inner bins, 1; float64, shape [V]."""
     inside = (torch.arange(INSIDE_BINS, dtype=torch.float64) + 0.5) / INSIDE_BINS
     return torch.cat([torch.zeros(1), inside, torch.ones(1)])
 
@@ -264,8 +265,8 @@ def sum_cells(parts: Iterable[Cells], class_count: int) -> SlopeSums:
     """Sum the cells of all parts of the data, one part at a time.
 
     Args:
-        parts: at least one.
-        class_count: C.
+        parts: cells of each part of the data; at least one part.
+        class_count: C, number of classes.
     """
     sums = (SlopeSums.of(cells, class_count) for cells in parts)
     return reduce(SlopeSums.__add__, sums)
@@ -295,7 +296,7 @@ def cell_nll(cells: Cells, table: SlopeTable) -> float:
         table: tabulated GPs.
 
     Returns:
-        The mean over all cells: log density in (0, 1), log mass at 0 and 1.
+        Mean over all cells, with the log density in (0, 1) and the log mass at 0 and 1.
     """
     class_id = cells.class_id.view(1, 1, -1)
     mixture = table.own(class_id, cells.slope_deg.view(1, 1, -1))
@@ -314,9 +315,10 @@ def measure_latent(
         truth: whether the maps contain the true distribution of λ.
 
     Returns:
-        `nll` of realised λ. If the truth is available, also `latent_rmse` relative to
-        f_c(ψ) and `noise_error`, the maximum relative error of σ_c over the classes
-        that occur.
+        `nll`, the mean negative log-likelihood of realised λ. If the truth is available,
+        also `latent_rmse`, the root mean square error of the latent mean, and
+        `noise_error`, the maximum relative error of the noise's standard deviation over
+        the classes that occur.
     """
     nll_sum = 0.0
     n_observed = 0

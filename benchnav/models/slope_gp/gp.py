@@ -1,20 +1,19 @@
-"""Class-wise Gaussian processes: each class's latent traversability as a function of
-slope.
+"""Class-wise Gaussian processes: latent traversability of a class as a function of slope.
 
 The prior of each class's function is a line over slope plus a Matérn 5/2 process. By
 default (`LatentGPConfig`) the line is 0.5 on flat terrain and falls by 0.03 ± 0.015 per
 degree. This states only that traversability hardly rises with slope and that a robot is
 likely to be immobilised beyond about 30°. Where a class has no data, because it never
-occurs or the slope is steeper than any observed, the GP falls back to this trend, with
+occurs or the slope is steeper than all observed slopes, the GP follows this trend, with
 a spread that grows with slope. The Matérn process has a standard deviation of at least
 0.3 and a length scale of at most 10°. The data therefore do not determine the function
-at slopes more than ten degrees beyond them.
+at slopes more than ten degrees beyond the data.
 
 A batch of C independent sparse variational GPs is fitted to all cells at once, in bins
-of slope. The posterior of the inducing values takes natural gradient steps; with a
-Gaussian likelihood one step suffices. The inducing values are not whitened: the data
-then fix the function while the kernel changes, and a few steps of Rprop fit kernel and
-noise.
+of slope. The posterior of the inducing values is fitted by natural gradient steps; with a
+Gaussian likelihood one step suffices. Kernel and noise are fitted by a few steps of
+Rprop. The inducing values are not whitened, so that the function remains close to the
+data while the kernel changes.
 
 The likelihood is that of the censored Gaussian: observed traversability is the latent
 plus Gaussian noise, clipped to [0, 1]. In (0, 1) an observation has the Gaussian
@@ -44,11 +43,11 @@ from benchnav.models.config import LatentGPConfig
 from benchnav.models.slope_gp.table import SlopeTable, SoftModes, table_slopes
 
 _SLOPE_UNIT_DEG = 10.0
-_MIN_SPAN_DEG = 5.0
+_MIN_SPAN_DEG = 5.0  # minimum range of the inducing points
 _QUADRATURE_NODES = 12
-_NATURAL_RATE = 0.9
-_RPROP_STEP = 0.1
-_RPROP_RANGE = (1e-6, 0.5)
+_NATURAL_RATE = 0.9  # step size of the natural gradient
+_RPROP_STEP = 0.1  # initial step size
+_RPROP_RANGE = (1e-6, 0.5)  # minimum and maximum step size
 _QUADRATURE = np.polynomial.hermite_e.hermegauss(_QUADRATURE_NODES)
 _NODES = torch.from_numpy(_QUADRATURE[0])
 _WEIGHTS = torch.from_numpy(_QUADRATURE[1])
@@ -58,8 +57,8 @@ class SlopeGP(gpytorch.models.ApproximateGP):
     """C independent sparse GPs over slope in units of 10°.
 
     Args:
-        inducing: slopes of the inducing points, shape [C, M].
-        config: settings of the prior.
+        inducing: slopes of the inducing points, in units of 10°, shape [C, M].
+        config: settings of the GPs.
     """
 
     def __init__(self, inducing: Tensor, config: LatentGPConfig) -> None:
@@ -117,10 +116,10 @@ class SlopeGP(gpytorch.models.ApproximateGP):
 
 
 class LatentGPs(lightning.LightningModule):
-    """Latent traversability functions of all classes, learned together.
+    """Latent traversability functions of all classes, trained together.
 
     Args:
-        config: settings.
+        config: settings of the GPs.
         steepest_deg: steepest slope of each class's training data, shape [C]; the
             inducing points cover [0, `steepest_deg`].
         soft: second modes of the classes; None if no class has one.
@@ -154,7 +153,7 @@ class LatentGPs(lightning.LightningModule):
     def configure_optimizers(
         self,
     ) -> tuple[torch.optim.Optimizer, torch.optim.Optimizer]:
-        """Return NGD for the inducing values and Rprop for kernel and noise."""
+        """Return natural gradient descent for inducing values, Rprop for kernel and noise."""
         natural = gpytorch.optim.NGD(
             self.gp.variational_parameters(), num_data=1, lr=_NATURAL_RATE
         )
@@ -169,12 +168,12 @@ class LatentGPs(lightning.LightningModule):
         return self.gp((slope_deg.double() / _SLOPE_UNIT_DEG).unsqueeze(-1))
 
     def training_step(self, batch: dict[str, Tensor], batch_index: int) -> None:
-        """Take one step up the evidence lower bound of each class, over all its cells.
+        """Take one step that increases the evidence lower bound of each class.
 
-        A class without cells stays at its prior.
+        A class without cells remains at its prior.
 
         Args:
-            batch: from `SlopeSums.bins`.
+            batch: result of `SlopeSums.bins` for all cells.
             batch_index: not used.
         """
         bound = self.bound(batch)
@@ -184,17 +183,17 @@ class LatentGPs(lightning.LightningModule):
         self.zero_grad()
         self.manual_backward(-bound.sum())
         natural.step()
-        rprop.optimizer.step()  # past Lightning, which would count a second step
+        rprop.optimizer.step()  # not through Lightning, which would count a second step
         loss = -bound.detach().sum() / batch["count"].sum().clamp(min=1)
         self.log("loss", loss, on_step=False, on_epoch=True, batch_size=1)
 
     def bound(self, bins: dict[str, Tensor]) -> Tensor:
         """Return the evidence lower bound with the prior of the noise, shape [C].
 
-        It is 0 for a class without cells.
+        The bound is 0 for a class without cells.
 
         Args:
-            bins: from `SlopeSums.bins`.
+            bins: result of `SlopeSums.bins`.
         """
         latent = self(bins["slope_deg"])
         noise = self.likelihood.noise
@@ -236,13 +235,13 @@ def expected_log_prob(
     is smooth, it is computed by Gauss-Hermite quadrature.
 
     Args:
-        bins: from `SlopeSums.bins`.
+        bins: result of `SlopeSums.bins`.
         mean: mean of the latent function at the bins, shape [C, B].
         variance: variance of the latent function at the bins, shape [C, B].
         noise: variance of the noise, shape [C, 1].
 
     Returns:
-        Shape [C, B].
+        Expected log-likelihoods, shape [C, B].
     """
     n_inside = bins["inside"]
     square = (

@@ -1,10 +1,10 @@
-"""Slip logs of a robot: training data of the class-wise GPs besides maps.
+"""Slip logs of a robot, from which class-wise GPs can be trained instead of from maps.
 
 A log is a table (CSV, TSV or Parquet) with one row per location driven over. Columns:
 `class` (name or integer id), `slope_deg` (0–90), `traversability` (λ, 0–1; 1 minus the
-slip ratio if the robot maintains its commanded speed), and optionally `drive` (its
-name). Other columns are ignored, and so are rows whose slope or traversability is
-missing.
+slip ratio if the robot maintains its commanded speed), and optionally `drive` (name of
+the drive). Other columns are ignored. Rows without slope or traversability are ignored
+too.
 """
 
 import hashlib
@@ -29,7 +29,7 @@ from benchnav.models.slope_gp.cells import Cells
 
 _LIMITS = {"slope_deg": (0, 90), "traversability": (0, 1)}
 COLUMNS = ("class", *_LIMITS)
-# From this many rows on, some slope in degrees would exceed 1.6°.
+# A log in degrees with at least this many rows has a slope above 1.6°, unlike radians.
 _MIN_ROWS_TO_CHECK_UNIT = 20
 _MAX_CLASSES = 256  # class ids are stored in a byte
 
@@ -38,12 +38,11 @@ class SlipLogs(NamedTuple):
     """Training data of a slip log.
 
     Args:
-        class_names: the class table.
-        cells: rows with a slope and a traversability, in order; `class_id` indexes the
-            class table.
+        class_names: names of the classes, in the order of their ids.
+        cells: rows with a slope and a traversability, in the order of the log.
         digest: SHA-256 of the file.
-        drive: index of the drive of each of these rows, int64, shape [N]; None if the
-            log has no drives.
+        drive: index of the drive of each row in `cells`, int64, shape [N]; None if the
+            log has no column `drive`.
     """
 
     class_names: tuple[str, ...]
@@ -56,15 +55,15 @@ def read_slip_logs(path: str | Path, class_names: tuple[str, ...] = ()) -> SlipL
     """Read a slip log.
 
     Args:
-        path: a file that ends in one of `ENDINGS`.
-        class_names: the class table, which integer ids of the log index. If empty, it
-            is derived from the log: its class names in alphabetical order, or "0",
-            "1", … up to the largest integer id.
+        path: path of the log, which ends in one of `ENDINGS`.
+        class_names: names of the classes, in the order of their ids. If empty, they are
+            derived from the log: its class names in alphabetical order, or "0", "1", …
+            up to the largest integer id.
 
     Raises:
-        DatasetError: If the file does not exist, cannot be read, or has no usable
-            rows; if a column is missing; if a class is not in the table; or if a
-            value is not numeric or out of range.
+        DatasetError: If the file does not exist, cannot be read, or has no row with
+            slope and traversability; if a column is missing; if a class is not in
+            `class_names`; or if a value is not numeric or out of range.
     """
     path = Path(path)
     rows = read_log(path)
@@ -101,7 +100,7 @@ def read_slip_logs(path: str | Path, class_names: tuple[str, ...] = ()) -> SlipL
 def _read_classes(
     rows: pd.DataFrame, path: Path, names: tuple[str, ...]
 ) -> tuple[tuple[str, ...], Tensor]:
-    """Return the class table (of the log if `names` is empty) and the id of each row."""
+    """Return the class names (those of the log if `names` is empty) and each row's id."""
     labels = read_names(rows, "class", path)
     log_classes: Any
     # pandas writes an integer id as 0.0 in a column with missing values.

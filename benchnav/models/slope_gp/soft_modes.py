@@ -1,16 +1,15 @@
-"""Detection of soft spots: a second mode of a class's traversability independent of
-slope.
+"""Detection of soft spots: a second mode of a class's λ that is independent of slope.
 
-With probability 1 − p, λ of a cell follows a normal distribution around the class's
-function of slope f(ψ) with standard deviation σ; otherwise it follows N(m, s²), for any
-slope. Observations are clipped to [0, 1]. Expectation maximisation over counts of cells
-by slope and by λ fits the parameters; the unknowns are the responsibilities of the
-modes and the values beyond the clip. Here f is any function of small second
-differences; the GP is fitted afterwards to the cells of the main mode.
+With probability 1 − p, λ of a cell has the distribution N(f(ψ), σ²), where f is the
+class's function of slope ψ; otherwise it has the distribution N(m, s²), at any slope.
+Observations are clipped to [0, 1]. Expectation maximisation fits the parameters to counts
+of cells by slope and by λ; the hidden variables are each cell's mode and its value before
+clipping. Here f is any function with small second differences; the GP is fitted
+afterwards to the cells of the main mode.
 
 A second mode is accepted if there are at least 100 cells, its weight exceeds 1 %, BIC
-very strongly prefers it, and the mean log-likelihood rises by 0.002 nats per cell. The
-last condition rejects modes that only correct the shape of the main mode, which BIC
+very strongly prefers it, and the mean log-likelihood increases by 0.002 nats per cell.
+The last condition rejects modes that only correct the shape of the main mode, which BIC
 would accept for large numbers of cells. Sources: Dempster, Laird and Rubin (1977),
 "Maximum likelihood from incomplete data via the EM algorithm"; Tobin (1958),
 "Estimation of relationships for limited dependent variables"; Schwarz (1978),
@@ -32,26 +31,27 @@ MIN_WEIGHT = 0.01
 MIN_GAIN = 2e-3  # nats per cell
 
 _INSIDE = levels()[1:-1]  # λ of the bins inside (0, 1)
-_FREE_PARAMETERS = 3  # added by a second mode
-_STRONG = 10.0  # difference of BIC from which evidence is called very strong
-_INITIAL_MEANS = (0.05, 0.35, 0.65, 0.95)  # of the second mode, one per start
+_FREE_PARAMETERS = 3  # number of parameters of a second mode
+_STRONG = 10.0  # difference of BIC above which evidence is called very strong
+_INITIAL_MEANS = (0.05, 0.35, 0.65, 0.95)  # means of the second mode, one per start
 _INITIAL_WEIGHT = 0.1
 _INITIAL_STD = 0.1
 _MAX_WEIGHT = 0.5
 _MIN_STD = 0.01
-_BEND_STD = 0.005  # of the second differences of f between bins
-_TRIAL_STEPS = 40  # from each start
-_MAX_STEPS = 300
-_MAX_LOG_ODDS = 200.0  # beyond, subnormal responsibilities would be slow
-_TOLERANCE = 1e-8  # nats per cell and step
-_LEVEL_PRECISION = 1e-3  # of a weak prior on f
+_BEND_STD = 0.005  # prior standard deviation of the second differences of f
+_TRIAL_STEPS = 40  # steps of EM from each start
+_MAX_STEPS = 300  # steps of EM from the best start
+_MAX_LOG_ODDS = 200.0  # larger values make responsibilities subnormal, which is slow
+_TOLERANCE = 1e-8  # minimum gain of a step in nats per cell
+_LEVEL_PRECISION = 1e-3  # precision of a weak prior on f
 _TWO_PI_ROOT = math.sqrt(2 * math.pi)
 
 
 class _Modes(NamedTuple):
-    """Parameters of S fits: f of shape [S, B], all others of shape [S, 1].
+    """Parameters of S fits.
 
-    The weight is 0 for a single mode.
+    `main` is f, shape [S, B]. `main_std` is σ, `weight` is p, `mean` is m and `std` is s,
+    each of shape [S, 1]. If there is only one mode, the weight is 0.
     """
 
     main: Tensor
@@ -68,9 +68,9 @@ def find_soft_modes(sums: SlopeSums) -> tuple[SoftModes | None, dict[str, Tensor
         sums: sums over the observed cells of C classes.
 
     Returns:
-        The second modes, None if no class has one; and the sums for the censored
-        likelihood over the cells of the main modes, with the keys of
-        `SlopeSums.bins`. The sums of a class without a second mode are unchanged.
+        The second modes, None if no class has one; and the sums over the cells of the
+        main modes for the censored likelihood, with the keys of `SlopeSums.bins`. If a
+        class has no second mode, its sums are those of all cells.
     """
     n_classes = len(sums.cells)
     bins = sums.bins(censored=True)
@@ -102,20 +102,20 @@ def find_soft_modes(sums: SlopeSums) -> tuple[SoftModes | None, dict[str, Tensor
 
 
 def _find_in_class(counts: Tensor) -> _Modes | None:
-    """Return the two modes of a class, up to its steepest non-empty bin.
+    """Return the two modes of a class; None if it has one mode.
 
     Returns:
-        None if the class has one mode.
+        Parameters of one fit, with bins up to the steepest non-empty bin.
     """
     n_cells = int(counts.sum())
     if n_cells < MIN_CELLS:
         return None
     n_bins = int(counts.sum(1).nonzero().max()) + 1
     cells = counts[:n_bins].double()
-    single, single_fit = _maximise(cells, _flat_mode(cells), _MAX_STEPS)
+    one_mode, fit_of_one = _maximise(cells, _flat_mode(cells), _MAX_STEPS)
     # Add a small second mode, with several initial means.
     initial_means = torch.tensor(_INITIAL_MEANS, dtype=torch.float64).unsqueeze(1)
-    with_second = single._replace(
+    with_second = one_mode._replace(
         weight=torch.full_like(initial_means, _INITIAL_WEIGHT),
         mean=initial_means,
         std=torch.full_like(initial_means, _INITIAL_STD),
@@ -123,15 +123,15 @@ def _find_in_class(counts: Tensor) -> _Modes | None:
     starts, fits = _maximise(cells, with_second, _TRIAL_STEPS)
     best_index = fits.argmax()
     best = _Modes(*(values[best_index].unsqueeze(0) for values in starts))
-    double, double_fit = _maximise(cells, best, _MAX_STEPS)
+    two_modes, fit_of_two = _maximise(cells, best, _MAX_STEPS)
     bic_gain = (_FREE_PARAMETERS * math.log(n_cells) + _STRONG) / 2
     min_gain = max(MIN_GAIN * n_cells, bic_gain)
-    is_accepted = double.weight > MIN_WEIGHT and double_fit - single_fit > min_gain
-    return double if is_accepted else None
+    is_accepted = two_modes.weight > MIN_WEIGHT and fit_of_two - fit_of_one > min_gain
+    return two_modes if is_accepted else None
 
 
 def _flat_mode(cells: Tensor) -> _Modes:
-    """Return a single mode at the mean of all cells, for any slope."""
+    """Return one mode, whose f is the mean λ of all cells at every slope."""
     level = levels()
     counts = cells.sum(0)
     mean = (counts * level).sum() / counts.sum()
@@ -148,7 +148,7 @@ def _flat_mode(cells: Tensor) -> _Modes:
 
 
 def _maximise(cells: Tensor, modes: _Modes, max_steps: int) -> tuple[_Modes, Tensor]:
-    """Run EM from S starts at once; return parameters and log-likelihoods [S]."""
+    """Run EM from S starts at once, and return the parameters and log-likelihoods [S]."""
     previous_fit = torch.tensor(-math.inf, dtype=torch.float64)
     tolerance = _TOLERANCE * cells.sum()
     for _ in range(max_steps):
@@ -180,11 +180,11 @@ def _log_prob(mean: Tensor, std: Tensor) -> Tensor:
     """Return log probabilities of the λ bins under clipped normal distributions.
 
     Args:
-        mean: before clipping, shape [S, B].
-        std: before clipping, shape [S, 1].
+        mean: mean before clipping, shape [S, B].
+        std: standard deviation before clipping, shape [S, 1].
 
     Returns:
-        Shape [S, B, V].
+        Log probabilities, shape [S, B, V].
     """
     z = (_INSIDE - mean.unsqueeze(-1)) / std.unsqueeze(-1)
     log_scale = (std * _TWO_PI_ROOT * INSIDE_BINS).log().unsqueeze(-1)
@@ -200,7 +200,7 @@ def _improve(cells: Tensor, modes: _Modes, responsibility: Tensor) -> _Modes:
     Args:
         cells: counts by bins of slope and of λ, shape [B, V].
         modes: parameters of the E step.
-        responsibility: of the second mode, shape [S, B, V].
+        responsibility: responsibility of the second mode, shape [S, B, V].
     """
     soft = cells * responsibility
     count, total, squares = _moments(cells - soft, modes.main, modes.main_std)
@@ -227,9 +227,9 @@ def _moments(cells: Tensor, mean: Tensor, std: Tensor) -> tuple[Tensor, Tensor, 
     """Return counts and the expected sums of λ and λ² before clipping.
 
     Args:
-        cells: counts by bins, shape [S, B, V].
+        cells: counts by bins of slope and of λ, shape [S, B, V].
         mean: mean of the normal distribution, shape [S, B].
-        std: its standard deviation, shape [S, 1].
+        std: standard deviation of the normal distribution, shape [S, 1].
 
     Returns:
         Three tensors of shape [S, B].
@@ -240,13 +240,13 @@ def _moments(cells: Tensor, mean: Tensor, std: Tensor) -> tuple[Tensor, Tensor, 
     at_0 = (cells[..., 0], -mean / std, -1)
     at_1 = (cells[..., -1], (mean - 1) / std, 1)
     for clipped, edge, sign in (at_0, at_1):
-        # A normal variable beyond the edge has h = φ/Φ, mean m ± s·h and variance
-        # s²(1 − e·h − h²) (Tobin).
+        # Given that it is beyond 0 or 1, a normal variable has mean m ± s·h and variance
+        # s²(1 − e·h − h²), with e the `edge` and h = φ(e) / Φ(e) (Tobin).
         hazard = torch.exp(-0.5 * edge**2 - torch.special.log_ndtr(edge)) / _TWO_PI_ROOT
-        beyond = mean + sign * std * hazard
+        mean_beyond = mean + sign * std * hazard
         variance = std**2 * (1 - edge * hazard - hazard**2).clamp(min=0)
-        total = total + clipped * beyond
-        squares = squares + clipped * (beyond**2 + variance)
+        total = total + clipped * mean_beyond
+        squares = squares + clipped * (mean_beyond**2 + variance)
     return cells.sum(-1), total, squares
 
 
@@ -260,7 +260,7 @@ def _smooth(count: Tensor, total: Tensor, std: Tensor) -> Tensor:
     """
     bends = torch.eye(count.shape[1], dtype=torch.float64).diff(n=2, dim=0) / _BEND_STD
     variance = std**2
-    # The mean of all cells as a weak prior determines f where there are no data.
+    # A weak prior, with the mean of all cells, determines f where there are no data.
     level = (total.sum(1) / count.sum(1)).unsqueeze(1)
     precision = torch.diag_embed(count / variance + _LEVEL_PRECISION) + bends.T @ bends
     weighted = total / variance + _LEVEL_PRECISION * level

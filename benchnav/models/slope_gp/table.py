@@ -1,10 +1,9 @@
-"""Class-wise GPs as tables over slope, which prediction reads instead of evaluating the
-GPs.
+"""Class-wise GPs as tables over slope, which models read instead of evaluating the GPs.
 
-The tables are linear between nodes. For a function g the error is at most h²/8·max|g''|
-at step h = 0.1°. `tabulation_error` in the tests bounds |g''|, and so the error, from
-the parameters of the GPs: below 10⁻⁴ for those fitted to the shipped maps. Letters in
-shapes: C classes, G nodes, *B any leading dimensions, H×W cells.
+The tables are linear between nodes. For a function g the error is at most h²/8·max|g''|,
+with step h = 0.1°. `tabulation_error` in the tests bounds |g''|, and so the error, by
+the parameters of the GPs: below 10⁻⁴ for the GPs of the shipped maps. Letters in shapes:
+C classes, G nodes, *B any leading dimensions, H×W cells, K components.
 """
 
 from dataclasses import dataclass
@@ -30,8 +29,8 @@ class SoftModes(NamedTuple):
     """A second mode of each class's traversability, independent of slope.
 
     Args:
-        weight: fraction of the class's cells, in [0, 1), 0 for a class without a second
-            mode; shape [C].
+        weight: fraction of the class's cells in the mode, in [0, 1); 0 for a class without
+            a second mode; shape [C].
         mean: mean λ of the mode before clipping, shape [C].
         std: standard deviation of the mode before clipping, > 0, shape [C].
     """
@@ -47,7 +46,7 @@ class SlopeTable:
 
     Args:
         mean: latent mean, shape [C, G].
-        std: standard deviation of latent function plus noise, shape [C, G].
+        std: standard deviation of latent function plus noise, > 0, shape [C, G].
         noise_std: standard deviation of the noise only, shape [C].
         soft: the second modes; None if no class has one.
     """
@@ -65,18 +64,19 @@ class SlopeTable:
         n_nodes = len(table_slopes())
         expect(
             is_positive and self.mean.shape[1:] == (n_nodes,),
-            f"finite tables of {n_nodes} slopes and `std` > 0, got others.",
+            f"finite tables of the GPs over {n_nodes} slopes, with `std` > 0, got tables "
+            f"of shape {list(self.mean.shape)} or with other values. Train the GPs again.",
         )
 
     def lookup(self, slope_deg: Tensor) -> tuple[Tensor, Tensor]:
-        """Read the table of every class at each cell's slope; the main mode only.
+        """Return the main mode of every class at the slope of each cell.
 
         Args:
             slope_deg: slopes in degrees, clamped to [0, 90], shape [*B, H, W].
 
         Returns:
-            Means and standard deviations, dtype and device of the slopes, each of shape [*B,
-            C, H, W].
+            Means and standard deviations, each of shape [*B, C, H, W], with the dtype and
+            device of the slopes.
         """
         mean, std = self._read(slice(None), slope_deg)
         return mean.movedim(0, -3), std.movedim(0, -3)
@@ -85,12 +85,12 @@ class SlopeTable:
         """Return the mixture of each cell's own class at its slope.
 
         Args:
-            class_id: int64, shape [*B, H, W].
+            class_id: class of each cell, int64, shape [*B, H, W].
             slope_deg: slopes in degrees, clamped to [0, 90], shape [*B, H, W].
 
         Returns:
-            A mixture with parameters of shape [*B, K, H, W]: K = 1, or 2 if classes have
-            second modes.
+            A mixture with parameters of shape [*B, K, H, W]: K = 2 if any class has a
+            second mode, otherwise 1.
         """
         mean, std = self._read(class_id, slope_deg)
         if self.soft is None:

@@ -1,6 +1,4 @@
-"""Weights of the best epoch: kept and restored by training, and protected from a user's
-callbacks.
-"""
+"""Callbacks that restore the best epoch's weights and protect them from user callbacks."""
 
 import hashlib
 from collections.abc import Sequence
@@ -19,16 +17,16 @@ _TRUSTED = ("lightning.", "benchnav.models.training.")
 class KeepBest(Callback):
     """A callback that keeps and restores the weights of the best epoch, or of the last.
 
-    The best epoch has the lowest validation loss. The weights are part of the state that a
-    training resumes from. Lightning's `ModelCheckpoint` would write them to a second file,
-    which after a kill could be from another epoch, and would store only the loss.
+    The best epoch has the lowest validation loss. The weights and metrics are stored in the
+    state from which training resumes. Lightning's `ModelCheckpoint` would write the weights
+    to a second file, which could be from another epoch if training is killed.
 
     Args:
-        last: whether to keep the last epoch with a finite loss.
+        last: whether to keep the last epoch with a finite loss instead of the best epoch.
     """
 
     def __init__(self, last: bool = False) -> None:
-        """Start without weights."""
+        """Create the callback without weights."""
         self.last = last
         self.guard = WeightGuard()
         self.best: dict[str, Any] = {"loss": float("inf"), "metrics": {}, "weights": {}}
@@ -37,11 +35,11 @@ class KeepBest(Callback):
     def on_validation_epoch_end(
         self, trainer: lightning.Trainer, module: lightning.LightningModule
     ) -> None:
-        """Copy the weights if they are the best."""
+        """Copy the weights if the epoch is the best so far."""
         self.validated = True
         metrics = {
             name: value
-            for name, value in measured(trainer).items()
+            for name, value in current_metrics(trainer).items()
             if name.startswith("valid_")
         }
         loss = metrics["valid_loss"]
@@ -67,15 +65,15 @@ class KeepBest(Callback):
         self.guard.check_module(module)
         if not self.best["weights"]:
             raise ConfigError(
-                "Expected a finite validation loss, got none. Train with a lower "
-                "`learning_rate`."
+                "Expected a finite validation loss, got none in any epoch. Train with a "
+                "lower `learning_rate`."
                 if self.validated
-                else "Expected `trainer` to measure the split valid, got none: training "
+                else "Expected `trainer` to measure the split valid, got a training that "
                 "ended before the first validation. Train for longer, or validate more "
                 "often."
             )
         module.load_state_dict(self.best["weights"])
-        # Processes started by the trainer return its own metrics.
+        # Processes that the trainer starts return only the metrics of the trainer.
         metrics = self.best["metrics"].items()
         tensors = {name: torch.tensor(value) for name, value in metrics}
         trainer.callback_metrics.update(tensors)
@@ -92,21 +90,21 @@ class KeepBest(Callback):
         return self.best
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Resume from an earlier state."""
+        """Restore the state of an interrupted training."""
         self.best = state
 
 
 class WeightGuard(Checkpoint):
-    """A callback that raises an error if another one changes weights after training.
+    """A callback that raises an error if another callback changes weights after training.
 
-    Lightning calls a hook of a `Checkpoint` after those of all other callbacks, and before
-    the module's. Weights that differ from those noted in the same hook of the first
-    callback were therefore changed by a callback in between. Digests of bytes are compared,
+    `KeepBest`, the first callback, notes the weights in each hook. Lightning calls the same
+    hook of a `Checkpoint` after all other callbacks and before the module. If the weights
+    then differ, a callback in between has changed them. Digests of bytes are compared,
     because NaN does not equal itself.
     """
 
     def __init__(self) -> None:
-        """Start without weights."""
+        """Create the callback without weights."""
         self.digest = ""
 
     def note(self, module: torch.nn.Module) -> None:
@@ -150,12 +148,12 @@ class WeightGuard(Checkpoint):
         )
 
     def check_module(self, module: torch.nn.Module) -> None:
-        """Check that the module did not change its weights after its callbacks ended.
+        """Check that the module did not change its weights after the callbacks.
 
         Restoring the best epoch would undo such changes.
 
         Raises:
-            ConfigError: If it did.
+            ConfigError: If the module changed its weights.
         """
         if self.digest and _digest_of_weights(module) != self.digest:
             raise ConfigError(
@@ -174,6 +172,6 @@ def _digest_of_weights(module: torch.nn.Module) -> str:
     return digest.hexdigest()
 
 
-def measured(trainer: lightning.Trainer) -> dict[str, float]:
-    """Return the metrics of the trainer so far, by name."""
+def current_metrics(trainer: lightning.Trainer) -> dict[str, float]:
+    """Return the latest metrics of a trainer by name."""
     return {name: float(value) for name, value in trainer.callback_metrics.items()}

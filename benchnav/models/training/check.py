@@ -1,6 +1,4 @@
-"""Checks before training: inputs, maps, settings of the trainer, and hooks of the
-network.
-"""
+"""Checks before training: inputs, maps, settings of the trainer, and network hooks."""
 
 import json
 import traceback
@@ -38,10 +36,10 @@ class Trainable:
 
     Args:
         kind: class of the network.
-        config: its settings.
-        name: name of its parts; members of an ensemble have a number appended.
-        family: registered name of the model for checkpoints, or the name of a custom
-            class.
+        config: settings of the network and its training.
+        name: name of the network's part in a checkpoint; later members of an ensemble
+            have a number appended.
+        family: registered name of the model, or name of a custom class, for checkpoints.
         code: digest of the code of a custom class; empty for models of this package.
     """
 
@@ -68,16 +66,15 @@ def check_network(
     """Check that a network can be trained: build the trainer and try one batch.
 
     Args:
-        trainable: the network.
-        dataset: the maps.
+        trainable: network to train.
+        dataset: dataset of the maps.
         options: training options.
 
     Raises:
         ConfigError: If Lightning or the network does not accept the settings, the maps
-            lack an input, a hook returns an invalid value, or nothing would be trained
-            or measured.
-        DatasetError: If there are too few maps, or none of their cells has a value to
-            learn.
+            lack an input, a hook returns an invalid value, or no batch would be trained
+            on or measured.
+        DatasetError: If there are too few maps, or no cell has a value to learn.
     """
     kind = trainable.kind
     config = trainable.config
@@ -87,8 +84,9 @@ def check_network(
     check_inputs(network.inputs, available)
     expect(
         SEEN not in network.inputs or config.masking.share > 0,
-        f"`masking.share` > 0 for the input {SEEN}, got 0: if all cells are seen in "
-        "training, it carries no information.",
+        f"`masking.share` > 0 for the input `{SEEN}`, got 0. If all cells are seen in "
+        "training, this input carries no information. Raise `masking.share`, or leave "
+        "the input out.",
     )
     check_maps(dataset, kind.target, config.crop)
     _check_trainer(config, dataset, options)
@@ -97,14 +95,14 @@ def check_network(
         network.build(map_classes=class_names(dataset)).to(options.place)
     except BenchnavError:
         raise
-    except Exception as error:  # custom code may raise anything
-        raise _unfit(network, maps, error) from error
+    except Exception as error:  # custom code may raise any error
+        raise _batch_error(network, maps, error) from error
     try_network(network, maps)
-    has_own_predict = (
+    overrides_predict = (
         isinstance(network, TrainableModel)
         and type(network).predict is not TrainableModel.predict
     )
-    if has_own_predict:
+    if overrides_predict:
         observation = dataset.terrain(TRAIN, [0]).to(options.place).observe()
         side = config.crop or max(dataset.grid.shape)
         rows, columns = (slice(min(side, size)) for size in dataset.grid.shape)
@@ -112,8 +110,8 @@ def check_network(
             predict_observation(network.eval(), take_cells(observation, rows, columns))
         except BenchnavError:
             raise
-        except Exception as error:  # custom code may raise anything
-            raise _unfit(network, maps, error) from error
+        except Exception as error:  # custom code may raise any error
+            raise _batch_error(network, maps, error) from error
 
 
 def _check_trainer(
@@ -138,8 +136,8 @@ def _check_trainer(
         n_used = n_batches * limit if isinstance(limit, float) else limit
         expect(
             n_used >= 1,
-            f"`trainer.{name}` that leaves a batch of the {n_batches} of split {split}, "
-            f"got {limit}. Leave it out to take all.",
+            f"`trainer.{name}` to select at least one of the {n_batches} batches of split "
+            f"{split}, got {limit}. Leave it out to use all batches.",
         )
 
 
@@ -162,7 +160,7 @@ def _first_batch(
 
 
 def _check_settings(network: TrainableNetwork) -> None:
-    """Check that a checkpoint can store the settings, and types of simple hooks.
+    """Check that a checkpoint can store the settings, and check `inputs` and `stride`.
 
     Raises:
         ConfigError: If JSON cannot store the settings, or `inputs` or `stride` is
@@ -176,24 +174,24 @@ def _check_settings(network: TrainableNetwork) -> None:
         restored = read(type(network.config), stored, of(name))
     except BenchnavError:
         raise
-    except Exception as error:  # custom code may raise anything
+    except Exception as error:  # custom code may raise any error
         raise ConfigError(
-            f"Expected {name} with `inputs` and settings that JSON can store, numbers, "
-            f"text and lists of them, got: {one_line(error)}. Does its __init__ call "
-            "super().__init__(config)?"
+            f"Expected `inputs` and settings of {name} that JSON can store (numbers, text "
+            f"and lists of these), got: {one_line(error).rstrip('.')}. Check also that "
+            "__init__ calls super().__init__(config)."
         ) from error
     expect(
         restored == network.config,
-        f"settings of {name} that JSON preserves, got {stored!r}.",
+        f"settings of {name} that are unchanged after storage as JSON, got {stored!r}.",
     )
     expect(
         all(isinstance(item, str) for item in inputs),
-        f"`inputs` of {name} as names of layers, got {inputs!r}.",
+        f"`inputs` of {name} to be names of layers, got {inputs!r}.",
     )
     stride = network.stride
     expect(
         isinstance(stride, int) and stride >= 1,
-        f"`stride` of {name} ≥ 1, got {stride!r}.",
+        f"`stride` of {name} to be an integer ≥ 1, got {stride!r}.",
     )
 
 
@@ -201,11 +199,12 @@ def try_network(network: TrainableNetwork, maps: Mapping[str, Tensor]) -> None:
     """Call the hooks of a built network on one batch, without a training step.
 
     Args:
-        network: the network to train.
-        maps: B maps by field, which include its inputs and its target.
+        network: network to train.
+        maps: layers of B maps by name, including the network's inputs and target.
 
     Raises:
-        ConfigError: If it does not accept the maps, or a hook returns an invalid value.
+        ConfigError: If the network does not accept the maps, or a hook returns an invalid
+            value.
     """
     name = type(network).__name__
     target = maps[network.target]
@@ -219,8 +218,8 @@ def try_network(network: TrainableNetwork, maps: Mapping[str, Tensor]) -> None:
                     outputs = network.to_distribution(raw)
     except BenchnavError:
         raise
-    except Exception as error:  # custom code may raise anything
-        raise _unfit(network, maps, error) from error
+    except Exception as error:  # custom code may raise any error
+        raise _batch_error(network, maps, error) from error
     _check_loss(loss, target, name)
     if isinstance(network, TrainableModel):
         check_distribution(outputs, tuple(target.shape), target.device, name)
@@ -233,34 +232,35 @@ def try_network(network: TrainableNetwork, maps: Mapping[str, Tensor]) -> None:
         network.metrics.reset()
     except BenchnavError:
         raise
-    except Exception as error:  # custom code may raise anything
-        raise _unfit(network, maps, error) from error
+    except Exception as error:  # custom code may raise any error
+        raise _batch_error(network, maps, error) from error
 
 
 def _check_loss(loss: Any, target: Tensor, name: str) -> None:
     """Check that a loss is a finite scalar with a gradient, on the target's device."""
-    got = type(loss).__name__
+    description = type(loss).__name__
     if isinstance(loss, Tensor):
-        got = f"shape {list(loss.shape)}"
+        description = f"shape {list(loss.shape)}"
     expect(
-        got == "shape []",
-        f"`configure_losses` of {name} to give a loss that is one number, got {got}.",
+        description == "shape []",
+        f"`configure_losses` of {name} to return a loss that is a scalar, got "
+        f"{description}.",
     )
     expect(
         loss.device == target.device,
-        f"a loss of {name} on {target.device}, got one on {loss.device}.",
+        f"the loss of {name} on {target.device}, got it on {loss.device}.",
     )
     hint = ""
     if not bool(target.isfinite().any()):
         hint = " λ is NaN (not observed) in the whole batch."
     expect(
         bool(loss.isfinite()),
-        f"`configure_losses` of {name} to give a finite loss, got {loss.item()}.{hint}",
+        f"`configure_losses` of {name} to return a finite loss, got {loss.item()}.{hint}",
     )
     expect(
         loss.requires_grad,
-        f"a loss of {name} that has a gradient, got one without. Use the outputs in "
-        "it.",
+        f"a loss of {name} with a gradient, got a loss without one. Compute it from the "
+        "outputs.",
     )
 
 
@@ -276,72 +276,72 @@ def check_distribution(
         name: name of the model's class.
 
     Raises:
-        ConfigError: If it has another type, shape or device, or its mean, quantiles or
-            CDF are invalid.
+        ConfigError: If the prediction has the wrong type, shape or device, or its mean,
+            quantiles or CDF are invalid.
     """
-    owner = f"`to_distribution` of {name} to give"
+    expected = f"`to_distribution` of {name} to return"
     kind = type(predicted).__name__
     expect(
         isinstance(predicted, TraversabilityDistribution),
-        f"{owner} a TraversabilityDistribution, got {kind}.",
+        f"{expected} a TraversabilityDistribution, got {kind}.",
     )
     expect(
         is_dataclass(predicted),
-        f"{owner} a frozen dataclass of maps, got {kind}, which is not a dataclass.",
+        f"{expected} a frozen dataclass of maps, got {kind}, which is not a dataclass.",
     )
     expect(
         tuple(predicted.shape) == shape,
-        f"{owner} one of shape {list(shape)}, got {list(predicted.shape)}.",
+        f"{expected} a distribution of shape {list(shape)}, got {list(predicted.shape)}.",
     )
     expect(
         predicted.device == device,
-        f"{owner} one on {device}, got one on {predicted.device}.",
+        f"{expected} a distribution on {device}, got one on {predicted.device}.",
     )
     mean = predicted.mean()
     expect(
         bool(((mean >= 0) & (mean <= 1)).all()),
-        f"{owner} means of λ in [0, 1], got values outside or NaN.",
+        f"{expected} a distribution whose `mean` is in [0, 1], got values outside or NaN.",
     )
     levels = (0.01, 0.2, 0.5, 0.8, 0.99)
     quantiles = torch.stack([predicted.quantile(level).double() for level in levels])
     is_in_range = (quantiles[0] >= 0).all() and (quantiles[-1] <= 1).all()
     expect(
         bool((quantiles.diff(dim=0) >= -1e-6).all() and is_in_range),
-        f"{owner} one whose `quantile` ascends within [0, 1], got another. See "
-        "`benchnav.testing.check_model`.",
+        f"{expected} a distribution whose `quantile` ascends with the level and stays in "
+        "[0, 1], got one whose `quantile` does not. See `benchnav.testing.check_model`.",
     )
     values = (0.0, 0.2, 0.5, 0.8, 1.0)
     cdf = torch.stack([predicted.cdf(value).double() for value in values])
     expect(
         bool((cdf.diff(dim=0) >= -1e-6).all() and (cdf[-1] == 1).all()),
-        f"{owner} one whose `cdf` ascends to 1 at λ = 1, got another. See "
-        "`benchnav.testing.check_model`.",
+        f"{expected} a distribution whose `cdf` ascends and is 1 at λ = 1, got one whose "
+        "`cdf` does not. See `benchnav.testing.check_model`.",
     )
 
 
-def _unfit(
+def _batch_error(
     network: TrainableNetwork, maps: Mapping[str, Tensor], error: Exception
 ) -> BenchnavError:
-    """Return the error for a batch that a network rejects.
+    """Return the error for a network that fails on a batch.
 
-    It names the line of custom code, or else the architecture and encoder.
+    The error names the line of custom code, or else the architecture and encoder.
     """
     config = network.config
     batch, height, width = maps[network.target].shape
     owner = type(network).__name__
-    remedy = "Choose another."
-    custom = [
+    remedy = "Choose another network."
+    custom_frames = [
         frame
         for frame in traceback.extract_tb(error.__traceback__)
         if "site-packages" not in frame.filename and str(PACKAGE) not in frame.filename
     ]
-    if custom:
-        frame = custom[-1]
+    if custom_frames:
+        frame = custom_frames[-1]
         file = Path(frame.filename).name
         remedy = f"See {file}, line {frame.lineno}, in `{frame.name}`."
     elif hasattr(config, "architecture") and hasattr(config, "encoder"):
         owner = f"{config.architecture} of {config.encoder}"
     return out_of_memory_error(error) or ConfigError(
-        f"Expected a network that takes batches of {batch} maps of {height}×{width} "
-        f"cells, got {owner}, which does not: {one_line(error).rstrip('.')}. {remedy}"
+        f"Expected a network that accepts batches of {batch} maps of {height}×{width} "
+        f"cells, got {owner}, which fails: {one_line(error).rstrip('.')}. {remedy}"
     )

@@ -1,6 +1,4 @@
-"""Halves of `valid` for conformal recalibration: maps for early stopping and temperature,
-and maps for scores.
-"""
+"""Conformal recalibration on every second map of `valid`; training uses the other maps."""
 
 import numpy as np
 import torch
@@ -16,41 +14,44 @@ from benchnav.models.training.data import VALID
 _MIN_MAPS = 4
 
 
-def stopping_every(conformal: bool) -> int:
-    """Return n: early stopping and temperature use every n-th map of `valid`, from the first."""
+def stopping_step(conformal: bool) -> int:
+    """Return n: early stopping and temperature use every n-th map of `valid`."""
     return 2 if conformal else 1
 
 
 def scored_maps(count: int) -> range:
-    """Return the indices of the `count` maps of a split that `stopping_every` leaves out."""
+    """Return the indices of every second map of a split of `count` maps, for scores.
+
+    Early stopping and temperature do not use these maps.
+    """
     return range(1, count, 2)
 
 
 def check_valid(dataset: TerrainDataset) -> None:
-    """Check that the split `valid` of a dataset can be halved.
+    """Check that the split `valid` of a dataset has enough maps for recalibration.
 
     Raises:
-        ConfigError: If it has too few maps.
+        ConfigError: If the split has too few maps.
     """
     n_maps = dataset.map_count(VALID)
     expect(
         n_maps >= _MIN_MAPS,
         f"at least {_MIN_MAPS} maps in split {VALID} of {dataset.path} for "
-        f"`conformal`, which takes every second one, got {n_maps}. With n such maps "
-        f"the lowest level is 1 / (n + 1). Add maps to {VALID}.",
+        f"`conformal`, which uses every second map, got {n_maps}. Add maps to {VALID}: "
+        "with n maps for scores, the lowest guaranteed level is 1 / (n + 1).",
     )
 
 
 def conformal_table(
     model: TraversabilityModel, dataset: TerrainDataset, seed: int, device: torch.device
 ) -> ConformalTable:
-    """Predict every second map of `valid` and fit the levels for a model's quantiles.
+    """Fit the conformal table of a model to every second map of `valid`.
 
     Args:
         model: a model trained and calibrated on other maps.
         dataset: dataset of the maps.
-        seed: root seed of the draws within atoms.
-        device: where to compute.
+        seed: root seed of the random PIT values within atoms.
+        device: device of the computation.
     """
     scores = [
         _scores(model, dataset, index, seed, device)
@@ -66,7 +67,7 @@ def _scores(
     seed: int,
     device: torch.device,
 ) -> ndarray:
-    """Return the PIT of the observed cells of a map, float64."""
+    """Return the PIT values of the observed cells of a map, float64, shape [N]."""
     terrain = dataset.terrain(VALID, [index]).to(device)
     observed = terrain.traversability
     with torch.no_grad():

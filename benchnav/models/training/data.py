@@ -1,9 +1,9 @@
 """Training data: maps or squares cut from them, read on demand or stored in memory.
 
 The content of a batch is a pure function of seed, epoch and index. Order and
-augmentation are drawn from named random streams, so a resumed training sees the same
-batches, for any number of reading processes. Letters in shapes: B maps in all, b maps
-in a batch, H×W cells.
+augmentation are drawn from named random streams, so a resumed training gets the same
+batches, with any number of reading processes. Letters in shapes: b maps in a batch, H×W
+cells.
 """
 
 from collections.abc import Iterator, Sequence
@@ -38,25 +38,25 @@ from benchnav.models.training.masks import RandomMasks
 
 TRAIN, VALID = "train", "valid"
 
-_SYMMETRIES = tuple(range(8))  # of the square: four rotations, each plain or mirrored
-_SYMMETRIES_OF_RECTANGLE = (0, 1, 4, 5)  # those that preserve height and width
+_SYMMETRIES = tuple(range(8))  # four rotations of a square, each with or without mirror
+_SYMMETRIES_OF_RECTANGLE = (0, 1, 4, 5)  # symmetries that preserve height and width
 _MIN_VARIANCE = 1e-4
 
 Batch = dict[str, Tensor]
 
 
 class MapDataset(TerrainMaps):
-    """Maps by field, indexed by a whole batch at a time.
+    """Maps of a split; an index, a `MapKey`, selects a whole batch.
 
     Args:
         path: path of the dataset.
-        split: name of one of its splits.
+        split: name of a split of the dataset.
         fields: fields to return; `rgb` is uint8, [b, 3, H, W], and `seen` is 1 in observed
-            cells.
-        in_memory: whether to read all maps at once.
+            cells, 0 elsewhere.
+        in_memory: whether to read all maps at once and store them in memory.
         crop: side in cells of the squares cut from maps; 0 for whole maps.
         seed: root seed of the squares that `chunks` cuts.
-        step: n to use every n-th map only, from the first.
+        step: n to use only every n-th map, starting with the first.
         masks: masks of the maps; None if all cells are observed.
     """
 
@@ -74,7 +74,7 @@ class MapDataset(TerrainMaps):
         """Check split and fields, and read the maps if `in_memory`."""
         stored = [name for name in fields if name != SEEN]
         if masks and "slope_deg" in fields and "elevation_m" not in fields:
-            stored.append("elevation_m")  # slopes are those of observed elevation
+            stored.append("elevation_m")  # masks compute slopes from noisy elevation
         super().__init__(path, split, stored)
         self.crop = crop
         self.seed = seed
@@ -85,16 +85,16 @@ class MapDataset(TerrainMaps):
             self._memory = super().read(range(self._maps))
 
     def __len__(self) -> int:
-        """Return the number of maps in use."""
+        """Return the number of maps that are used."""
         return len(range(0, self._maps, self.step))
 
     def read(self, indices: Sequence[int]) -> Batch:
-        """Read maps without masks, by their indices among those in use."""
+        """Read maps without masks, by their indices among the maps that are used."""
         return self._with_seen(super().read([self.step * index for index in indices]))
 
     def __getitem__(self, key: MapKey) -> Batch:  # type: ignore[override]
         """Return all fields of the maps in `key`, shape [b, *, H, W]."""
-        # Squares of the same map are cut from one reading.
+        # A map of which several squares are cut is read once.
         map_ids, positions = key.maps.unique(return_inverse=True)
         maps = self.read(map_ids.tolist())
         squares = list(
@@ -112,7 +112,7 @@ class MapDataset(TerrainMaps):
         return self._masked(batch, key.visibility)
 
     def chunks(self, device: torch.device = CPU) -> Iterator[tuple[range, Batch]]:
-        """Yield all maps in order without augmentation, in chunks with their indices.
+        """Yield the indices and fields of chunks of maps, in order without augmentation.
 
         Args:
             device: device of the chunks.
@@ -144,14 +144,14 @@ class MapDataset(TerrainMaps):
         return {**maps, SEEN: torch.ones(shape[0], *shape[-2:])}
 
     def _masked(self, batch: Batch, visibility: Tensor) -> Batch:
-        """Mask a batch, and drop the fields that were read for the masks only."""
+        """Mask a batch, and drop the fields that were read only for the masks."""
         if self.masks is None:
             return batch
         masked = self.masks.apply(batch, visibility)
         return {name: masked[name] for name in self.output_fields}
 
     def _cut(self, layer: Tensor, origin: Sequence[int]) -> Tensor:
-        """Return the square of a layer, [*, H, W], at an origin, or the whole layer."""
+        """Return the square at an origin of a layer [*, H, W]; the layer without `crop`."""
         if not self.crop:
             return layer
         row, column = origin
@@ -166,8 +166,9 @@ def apply_jitter(rgb: Tensor, factors: Tensor) -> Tensor:
     """Change brightness, contrast and saturation of each image, in this order.
 
     Args:
-        rgb: uint8, shape [b, 3, H, W].
-        factors: factors of the three, 1 for no change, shape [b, 3].
+        rgb: images, uint8, shape [b, 3, H, W].
+        factors: factors of brightness, contrast and saturation, 1 for no change, shape
+            [b, 3].
     """
     if bool((factors == 1).all()):
         return rgb
@@ -184,9 +185,9 @@ def apply_symmetry(maps: Tensor, symmetry: int, name: str = "") -> Tensor:
     """Rotate maps by 90° `symmetry // 2` times, then mirror them if `symmetry` is odd.
 
     Args:
-        maps: shape [*B, H, W].
-        symmetry: 0–7; 0 changes nothing.
-        name: name of the field; directions turn with the map.
+        maps: values of one field, shape [*, H, W].
+        symmetry: index of the symmetry, 0–7; 0 changes nothing.
+        name: name of the field; the values of directions are rotated and mirrored too.
     """
     n_turns, is_mirrored = divmod(symmetry, 2)
     result = torch.rot90(maps, n_turns, (-2, -1))
@@ -200,10 +201,10 @@ def apply_symmetry(maps: Tensor, symmetry: int, name: str = "") -> Tensor:
 
 @dataclass(frozen=True, kw_only=True)
 class Augmentation:
-    """Augmentation of training maps.
+    """Settings of the augmentation of training maps.
 
     Args:
-        jitter: maximum relative change of brightness, contrast and saturation.
+        jitter: maximum relative change of brightness, contrast and saturation, in [0, 1).
         symmetries: whether maps are rotated and mirrored.
     """
 
@@ -217,8 +218,8 @@ class Loading:
 
     Args:
         in_memory: whether to store all maps in memory.
-        workers: number of processes that read ahead; 0 reads in this process.
-        valid_every: n to use every n-th map of `valid` only.
+        workers: number of processes that read ahead; if 0, this process reads.
+        valid_every: n to use only every n-th map of `valid`.
     """
 
     in_memory: bool = False
@@ -230,16 +231,16 @@ class MapData(lightning.LightningDataModule):
     """The maps of the splits `train` and `valid`.
 
     Training maps are rotated and mirrored at random, all fields in the same way.
-    Synthetic maps stay physical, because their light comes from a random direction; a
-    photo has a fixed direction of light. If several processes train together, each
-    takes its part of every batch.
+    Synthetic maps remain realistic, because their light has a random direction; light in
+    a photo has a fixed direction. If several processes train together, each of them
+    receives a part of every batch.
 
     Args:
         dataset: dataset of the maps.
         batch_size: maximum number of maps per batch.
         seed: root seed of order and augmentation.
-        fields: fields to read.
-        augmentation: augmentation of training maps.
+        fields: names of the fields to read.
+        augmentation: settings of the augmentation of training maps.
         crop: side in cells of the squares for training and validation; 0 for whole
             maps.
         loading: settings for reading maps.
@@ -276,9 +277,9 @@ class MapData(lightning.LightningDataModule):
         self.valid = open_split(VALID, loading.valid_every)
 
     def scale(self, inputs: Sequence[str]) -> dict[str, LayerScale]:
-        """Return the scales of layers, from all training cells with a value.
+        """Return the scale of each input layer, from all training cells with a value.
 
-        The layer `seen` is not scaled.
+        The scale of `seen` has mean 0 and standard deviation 1.
         """
         layers = [name for name in inputs if name not in (SEEN, "rgb")]
         stored = [name for name in inputs if name != SEEN]
@@ -316,7 +317,7 @@ class MapData(lightning.LightningDataModule):
         )
 
     def val_dataloader(self) -> DataLoader[Batch]:
-        """Return batches as stored, in order."""
+        """Return batches of validation maps in order, without augmentation."""
         return self._load(self.valid)
 
     def _load(self, maps: MapDataset, **order: Any) -> DataLoader[Batch]:
@@ -334,7 +335,7 @@ class MapData(lightning.LightningDataModule):
             shards=tuple(shard.maps for shard in shards),
             **order,
         )
-        # Its own generator prevents the loader from drawing from PyTorch's global one.
+        # With its own generator, the loader does not draw from PyTorch's global generator.
         return DataLoader(
             maps,
             batch_size=None,
@@ -354,12 +355,12 @@ def _colour_counts(rgb: Tensor) -> Tensor:
 
 
 def _colour_scale(counts: Tensor) -> LayerScale:
-    """Return the scale of colours from counts of the values of each channel."""
+    """Return the scale of colours from counts [3, 256] of the values of each channel."""
     fraction = counts.double() / counts.sum(1, keepdim=True)
     level = torch.arange(256.0, dtype=torch.float64)
     mean = (fraction * level).sum(1)
     variance = (fraction * level**2).sum(1) - mean**2
-    # Terrain of a single colour would have no scale.
+    # Terrain of a single colour has variance 0.
     std = variance.clamp(min=1).sqrt()
     return LayerScale(mean.float(), std.float(), torch.ones(()))
 
@@ -369,13 +370,13 @@ def _layer_scale(name: str, sums: Tensor, n_cells: int) -> LayerScale:
 
     Args:
         name: name of the layer.
-        sums: sum and sum of squares of its values, shape [2].
+        sums: sum and sum of squares of the layer's values, shape [2].
         n_cells: number of cells with a value.
     """
     if is_azimuth(name):
         return LayerScale(torch.zeros(2), torch.ones(2), torch.ones(()))
     mean, square = (sums / max(1, n_cells)).unbind()
-    # A constant layer would have no scale.
+    # A constant layer has variance 0.
     std = (square - mean**2).clamp(min=_MIN_VARIANCE).sqrt()
     rms = square.clamp(min=1).sqrt()
     return LayerScale(mean.float().view(1), std.float().view(1), rms.float())
@@ -385,14 +386,14 @@ def open_dataset(data: str) -> TerrainDataset:
     """Open a dataset to train on, by path or id.
 
     Raises:
-        DatasetError: If it has no splits `train` and `valid`.
+        DatasetError: If the dataset has no split `train` or no split `valid`.
     """
     dataset = TerrainDataset(find_dataset(data))
     if not {TRAIN, VALID} <= set(dataset.splits):
         raise DatasetError(
             f"Expected splits train and valid in {dataset.path} to train on, got "
-            f"{sorted(dataset.splits)}. Create a dataset with them, for example "
-            "`benchnav-datagen create paper-v1`."
+            f"{sorted(dataset.splits)}. Create a dataset with both splits, for example "
+            "with `benchnav-datagen create paper-v1`."
         )
     return dataset
 
@@ -401,20 +402,20 @@ def check_maps(dataset: TerrainDataset, field: str, crop: int = 0) -> None:
     """Check that a network can learn from a dataset.
 
     Args:
-        dataset: the maps.
+        dataset: dataset of the maps.
         field: field to learn, `class_id` or `traversability`.
         crop: side in cells of the squares cut from maps; 0 for whole maps.
 
     Raises:
-        ConfigError: If the squares are larger than the maps.
-        DatasetError: If there are fewer than two maps or squares for training, or none
+        ConfigError: If the squares are larger than the maps or smaller than 8 cells.
+        DatasetError: If there are fewer than two maps or squares for training, or no map
             for validation; or if no cell of a split has a value to learn.
     """
     shape = dataset.grid.shape
     expect(
         crop == 0 or 8 <= crop <= min(shape),
-        f"`crop` in 8–{min(shape)} cells, the shorter side of the maps, or 0, "
-        f"got {crop}.",
+        f"`crop` of 8 cells to {min(shape)}, the shorter side of the maps, or of 0 for "
+        f"whole maps, got {crop}.",
     )
     values_to_learn = {
         "class_id": "cells with a class",
@@ -426,12 +427,12 @@ def check_maps(dataset: TerrainDataset, field: str, crop: int = 0) -> None:
         if n_maps * squares_per_map(shape, crop) < min_maps:
             raise DatasetError(
                 f"Expected at least {min_maps} maps in {location}, got {n_maps}. Add "
-                "maps to it."
+                "maps to this split."
             )
         chunks = (maps[field] for _, maps in dataset.chunks(split, (field,)))
         if not any(map(_has_values, chunks)):
             raise DatasetError(
-                f"Expected {values_to_learn} in {location} to learn from, got none. "
+                f"Expected {values_to_learn} in {location} for training, got none. "
                 "Train on another dataset."
             )
 
@@ -441,5 +442,5 @@ def _has_values(values: np.ndarray) -> bool:
 
 
 def training_digest(dataset: TerrainDataset) -> str:
-    """Return a digest of the splits to train on, including the meaning of their maps."""
+    """Return the digests of the splits `train` and `valid`, as one text."""
     return ",".join(f"{name}:{dataset.split_digest(name)}" for name in (TRAIN, VALID))

@@ -1,4 +1,4 @@
-"""Trainable models by name, file or module."""
+"""Search for trainable models by name, file or module."""
 
 from pathlib import Path
 from typing import Any
@@ -32,9 +32,9 @@ def find_trainable(source: str, settings: dict[str, Any]) -> Trainable:
     config_kind = config_class(kind)
     if config_kind is None or not issubclass(config_kind, TrainingConfig):
         raise ConfigError(
-            f"Expected {owner} to be created with one parameter `config`, a "
-            "benchnav.models.TrainingConfig, got another. Write def __init__(self, "
-            "config: MyConfig = MyConfig()), where MyConfig is a subclass of it."
+            f"Expected __init__ of {owner} to have one parameter, `config`, a subclass of "
+            "benchnav.models.TrainingConfig, got other parameters. Write def "
+            "__init__(self, config: MyConfig = MyConfig()) with such a class MyConfig."
         )
     config = read(config_kind, settings, of(owner))
     name = kind.__name__
@@ -45,18 +45,18 @@ def find_trainable(source: str, settings: dict[str, Any]) -> Trainable:
         name in registered and registry.find("model", name).target is not kind
     ):
         raise ConfigError(
-            f"Expected a class whose name no model of this package has, got {name!r}, "
-            "which its checkpoints could not distinguish. Rename it."
+            f"Expected a class whose name no model of this package has, got {name!r}. "
+            "Rename the class, since checkpoints identify it by its name."
         )
     code = "" if match.shipped else match.digest
     return Trainable(kind=kind, config=config, name=name, family=name, code=code)
 
 
 def find_kind(source: str) -> registry.Found:
-    """Find the class of a model; names are limited to trainable models.
+    """Find the class of a model by the name of a model, file or module.
 
     Raises:
-        ConfigError: If the class does not exist or cannot be imported.
+        ConfigError: If the class or name does not exist or cannot be imported.
     """
     is_file = source.endswith(".py") or Path(f"{source}.py").is_file()
     is_name = ":" not in source and not is_file

@@ -1,10 +1,9 @@
-"""One training with Lightning: without its messages, with progress and logs, resumable
-after a kill.
+"""Training of one part with Lightning, with progress and logs; it can be resumed.
 
 If a training has a folder, it writes after each epoch the state to resume from
 (`last.ckpt`, a Lightning checkpoint) and the metrics (`metrics.csv`, and TensorBoard's
-events). A resumed training ends with the weights of an uninterrupted one, bit for bit
-on a CPU, because the content of a batch depends only on seed and epoch.
+events). A resumed training ends with the same weights as an uninterrupted training, bit
+for bit on a CPU, because the content of a batch depends only on seed and epoch.
 """
 
 import inspect
@@ -44,7 +43,7 @@ from benchnav.core.errors import (
 from benchnav.core.settings import check_known, one_line
 from benchnav.core.store import MAX_JOBS, sole_writer, write_text
 from benchnav.models.config import TrainOptions
-from benchnav.models.training.best import KeepBest, measured
+from benchnav.models.training.best import KeepBest, current_metrics
 from benchnav.models.training.history import AtomicCheckpointIO, History
 from benchnav.models.training.trackers import described, make_callbacks, make_loggers
 
@@ -52,7 +51,7 @@ STATE = "last.ckpt"
 SETTINGS = "settings.json"
 HISTORY = "metrics.csv"
 
-_PARTIAL = f".{STATE}.*.partial"  # left by a kill during a write
+_PARTIAL = f".{STATE}.*.partial"  # files that remain if a write is killed
 
 # Settings of Lightning's trainer that this module determines.
 _FIXED = {
@@ -80,21 +79,21 @@ _WITHOUT_EFFECT = {"max_epochs", "log_every_n_steps", "detect_anomaly", "acceler
 
 @dataclass(frozen=True, kw_only=True)
 class FitOptions(TrainOptions):
-    """Training options, independent of the model.
+    """Training options that do not depend on the model.
 
     Args:
         folder: folder for logs and for the state to resume from, with a subfolder per
-            part of a model; if None, nothing is written.
+            part of a model; None to write no files.
 
     Raises:
-        ConfigError: If `workers` is out of range, the device does not exist, or the
-            trainer has no such setting or does not allow it.
+        ConfigError: If `workers` is out of range, the device does not exist, or `trainer`
+            has an unknown or invalid setting.
     """
 
     folder: Path | None = None
 
     def __post_init__(self) -> None:
-        """Check the settings by name."""
+        """Check the options and the names of the trainer's settings."""
         expect(
             0 <= self.workers <= MAX_JOBS,
             f"`workers` in 0–{MAX_JOBS}, got {self.workers}.",
@@ -102,12 +101,12 @@ class FitOptions(TrainOptions):
         requested = self.trainer or {}
         expect(
             "accelerator" not in requested,
-            "no `trainer.accelerator`, which is now `device`: auto, cpu or cuda.",
+            "no `trainer.accelerator`, got one. Set `device` instead: auto, cpu or cuda.",
         )
         options = sorted(_DEFAULTS.keys() - _FIXED)
         for name in requested:
             check_known("settings of `trainer`", name, options)
-        # Invalid trackers are rejected before any training.
+        # Reject invalid loggers and callbacks before training.
         self.make_loggers(None)
         self.make_callbacks()
         devices = requested.get("devices", 1)
@@ -121,7 +120,7 @@ class FitOptions(TrainOptions):
 
     @property
     def place(self) -> torch.device:
-        """The device."""
+        """The device of the training."""
         return find_device(self.device)
 
     @property
@@ -138,7 +137,7 @@ class FitOptions(TrainOptions):
         return json.loads(json.dumps(settings, default=str, sort_keys=True))
 
     def make_loggers(self, folder: Path | None) -> list[Logger] | None:
-        """Create the requested loggers, which write to a folder; None for the default."""
+        """Create the requested loggers, which write to `folder`; None if none is given."""
         specs = (self.trainer or {}).get("logger")
         return None if specs is None or specs is True else make_loggers(specs, folder)
 
@@ -151,7 +150,7 @@ class FitOptions(TrainOptions):
         """Return all settings of the trainer except loggers and callbacks, by name.
 
         Args:
-            defaults: settings where the options have none.
+            defaults: settings to use if the options do not set them.
         """
         accelerator = self.place.type
         common = {"precision": default_precision(accelerator), "devices": 1}
@@ -176,17 +175,17 @@ def fit(
 
     Args:
         module: module to train.
-        part: name of the part of a model.
+        part: name of the part of the model.
         options: training options.
-        settings: plain data that affect the result; an interrupted training with
-            other settings is not resumed.
-        callbacks: additional callbacks.
+        settings: settings that affect the result, as plain data; an interrupted training
+            with other settings is not resumed.
+        callbacks: callbacks in addition to those of the options.
         data: loaders or data module, as arguments of the trainer's `fit`.
-        defaults: settings of Lightning's trainer where the options have none; without
-            `precision`, `default_precision` applies.
+        defaults: settings of Lightning's trainer to use if the options do not set them;
+            the default of `precision` is `default_precision`.
 
     Returns:
-        Metrics by name.
+        Values of the metrics after training, by name.
 
     Raises:
         CheckpointError: If the interrupted training is damaged or has other settings.
@@ -231,7 +230,7 @@ def fit(
         trainer_settings |= options.chosen(**defaults)
         trainer = make_trainer(callbacks, **trainer_settings)
         _run(trainer, module, data, state, options.place)
-        return measured(trainer)
+        return current_metrics(trainer)
 
 
 def _run(
@@ -259,14 +258,14 @@ def _run(
     except MisconfigurationException as error:
         raise _unusable(error) from error
     except (RuntimeError, EOFError, KeyError, pickle.UnpicklingError) as error:
-        # A callback monitors a metric that is not measured.
+        # The error of a callback that monitors a metric that is not measured.
         if "conditioned on metric" in str(error):
             raise _unusable(error) from error
         if state is None or trainer.global_step:
             raise
         raise CheckpointError(
             f"{state} is damaged: {type(error).__name__} {error}. Pass --overwrite to "
-            "restart."
+            "restart the training."
         ) from error
 
 
@@ -275,12 +274,12 @@ say = rank_zero_only(print)
 
 
 def is_first_process() -> bool:
-    """Return whether this is the only process, or the first of those training together."""
+    """Return whether this is the first of the processes that train together."""
     return not getattr(rank_zero_only, "rank", 0)
 
 
 def interrupted(options: FitOptions, parts: Sequence[str]) -> list[str]:
-    """Return the parts whose interrupted training is in the folder of the options."""
+    """Return the parts whose training was interrupted and can be resumed."""
     return [
         part
         for part in parts
@@ -289,13 +288,13 @@ def interrupted(options: FitOptions, parts: Sequence[str]) -> list[str]:
 
 
 def forget(options: FitOptions, part: str) -> None:
-    """Remove the state to resume a part's training from; its logs stay."""
+    """Remove the state from which a part's training could be resumed; keep the logs."""
     if options.folder and is_first_process():
         _drop(options.folder / part, STATE, _PARTIAL)
 
 
 def differing(expected: Mapping[str, Any], stored: Mapping[str, Any]) -> str:
-    """Return the settings that differ, such as "another `seed`"; empty if none."""
+    """Return the settings that differ, such as "another `seed`"; empty if all are equal."""
     a = _flat(expected)
     b = _flat(stored)
     names = sorted(name for name in {**a, **b} if a.get(name) != b.get(name))
@@ -303,7 +302,7 @@ def differing(expected: Mapping[str, Any], stored: Mapping[str, Any]) -> str:
 
 
 def _flat(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings as plain data, with those of a network at the top level."""
+    """Return settings as plain data, with the content of `config` at the top level."""
     plain = json.loads(json.dumps(settings, default=str))
     return plain | plain.pop("config", {})
 
@@ -312,7 +311,7 @@ def default_precision(accelerator: str) -> str:
     """Return bf16-mixed if the device has bfloat16 arithmetic, otherwise 32-true.
 
     Args:
-        accelerator: "cpu", or else a GPU.
+        accelerator: "cpu" or the name of a GPU accelerator, such as "cuda".
     """
     if accelerator != "cpu":
         has_bf16 = torch.cuda.is_bf16_supported(including_emulation=False)
@@ -325,7 +324,7 @@ def default_precision(accelerator: str) -> str:
 
 
 def _prepare(folder: Path, resume: bool, settings: Mapping[str, Any]) -> Path | None:
-    """Create the folder; return the state to resume from, if any.
+    """Create the folder of a training, and return the state to resume from or None.
 
     Raises:
         CheckpointError: If the interrupted training has other settings.
@@ -337,9 +336,9 @@ def _prepare(folder: Path, resume: bool, settings: Mapping[str, Any]) -> Path | 
         differences = differing(settings, stored)
         if differences:
             raise CheckpointError(
-                f"Expected the settings of the interrupted training in {folder} to "
-                f"resume it, got {differences}. Repeat its settings, or pass "
-                "--overwrite to restart."
+                f"Expected the settings of the interrupted training in {folder} for "
+                f"--resume, got {differences}. Use the same settings again, or pass "
+                "--overwrite to restart the training."
             )
         return state
     if is_first_process():
@@ -359,7 +358,7 @@ def make_trainer(callbacks: list[Callback], **settings: Any) -> lightning.Traine
     """Create Lightning's trainer.
 
     Raises:
-        ConfigError: If it does not accept the settings.
+        ConfigError: If Lightning does not accept the settings.
     """
     has_checkpoint = any(isinstance(c, Checkpoint) for c in callbacks)
     has_progress_bar = any(isinstance(c, ProgressBar) for c in callbacks)
@@ -373,19 +372,19 @@ def make_trainer(callbacks: list[Callback], **settings: Any) -> lightning.Traine
             use_distributed_sampler=False,
             **settings,
         )
-    except Exception as error:  # Lightning raises various exceptions for settings
+    except Exception as error:  # Lightning raises errors of many types for settings
         raise out_of_memory_error(error) or _unusable(error) from error
 
 
 def _unusable(error: Exception) -> ConfigError:
     return ConfigError(
-        f"Expected settings of `trainer` that Lightning takes, got: {one_line(error)}"
+        f"Expected settings of `trainer` that Lightning accepts, got: {one_line(error)}"
     )
 
 
 @contextmanager
 def quietly() -> Iterator[None]:
-    """Suppress Lightning's hints for its developers."""
+    """Suppress the messages and warnings of Lightning."""
     with quiet("lightning.pytorch", "lightning.fabric"), warnings.catch_warnings():
         warnings.filterwarnings("ignore", module=r"lightning\..*")
         yield

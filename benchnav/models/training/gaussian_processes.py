@@ -1,4 +1,4 @@
-"""Training of the class-wise GPs of a fused model, on maps or on a robot's slip logs."""
+"""Training of the class-wise GPs of a fused model, on maps or slip logs."""
 
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -31,8 +31,8 @@ from benchnav.models.training.data import TRAIN, VALID, open_dataset, training_d
 from benchnav.models.training.fit import FitOptions, fit, say
 from benchnav.models.training.target import existing, fresh_checkpoint, open_target
 
-_HELD_OUT = 0.1  # fraction of the rows of slip logs
-_MIN_ROWS = 10  # of a class in slip logs; fewer raise a warning
+_HELD_OUT = 0.1  # fraction of the rows of slip logs that is held out
+_MIN_ROWS = 10  # number of rows of a class below which a warning is printed
 
 
 def fit_gps(
@@ -41,9 +41,9 @@ def fit_gps(
     """Train the class-wise GPs on sums over cells, in float64 and without randomness.
 
     Args:
-        config: settings.
-        sums: sums over the cells of all classes, from maps or from a robot's logs.
-        device: where to train.
+        config: settings of the GPs.
+        sums: sums over the cells of all classes, from maps or slip logs.
+        device: device of the training.
 
     Returns:
         The GPs, on the CPU.
@@ -55,8 +55,8 @@ def fit_gps(
         soft = None
         bins = sums.bins(censored)
     model = LatentGPs(config, sums.steepest_deg, soft)
-    # Each batch has all cells. Its own generator prevents the loader from drawing from
-    # PyTorch's global one.
+    # Each batch has all cells. With its own generator, the loader does not draw from
+    # PyTorch's global generator.
     batches: Any = [bins] * config.epoch_steps
     loader = DataLoader(batches, batch_size=None, generator=torch.Generator())
     fit(
@@ -73,7 +73,7 @@ def fit_gps(
 
 
 def train_gps(data: str, out: str, config: LatentGPConfig, options: FitOptions) -> None:
-    """Train the GPs on a dataset or on slip logs, into a checkpoint.
+    """Train the GPs on a dataset or on slip logs, and save them in a checkpoint.
 
     Args:
         data: path or id of a dataset, or path of slip logs.
@@ -95,7 +95,7 @@ def train_gps(data: str, out: str, config: LatentGPConfig, options: FitOptions) 
 def train_gps_on_maps(
     config: LatentGPConfig, dataset: TerrainDataset, options: FitOptions
 ) -> Part:
-    """Train the GPs on the split `train` and return them as a part of a checkpoint."""
+    """Train the GPs on the split `train`, and return them as a part of a checkpoint."""
     names = [item.name for item in dataset.recipe.classes]
     model = _fit_and_say(config, sum_split(dataset, TRAIN), names, options.device)
     has_truth = dataset.truth_of(VALID) == "generated"
@@ -115,9 +115,9 @@ def train_gps_on_maps(
 def _train_on_logs(
     data: str, out: str, config: LatentGPConfig, options: FitOptions
 ) -> None:
-    """Train the GPs on slip logs, into a checkpoint.
+    """Train the GPs on slip logs, and save them in a checkpoint.
 
-    The logs are read with the class table of the checkpoint if it exists.
+    If the checkpoint exists, its class names are used to read the logs.
     """
     checkpoint = existing(Path(out), options.overwrite)
     known_classes = checkpoint.class_names if checkpoint else ()
@@ -130,10 +130,10 @@ def _train_on_logs(
     if rare:
         replaced = ""
         if checkpoint and GP in checkpoint.parts:
-            replaced = f"; the GPs for them in {out} are dropped"
+            replaced = f". The GPs of these classes in {out} are replaced"
         tell(
             f"benchnav-train: warning: {data} has fewer than {_MIN_ROWS} rows of "
-            f"{len(rare)} of {len(counts)} classes ({', '.join(rare)}); their GPs stay "
+            f"{len(rare)} of {len(counts)} classes ({', '.join(rare)}); their GPs remain "
             f"close to the prior, which is vague{replaced}"
         )
     metrics = {}
@@ -156,7 +156,7 @@ def _train_on_logs(
 def _held_out(
     cells: Cells, drive: Tensor | None, seed: int
 ) -> tuple[Cells, Cells, str] | None:
-    """Return rows to learn from, held-out rows and their description; None if too few."""
+    """Return training rows, held-out rows and a description; None if there are too few."""
     n_drives = 0 if drive is None else len(drive.unique())
     if drive is not None and n_drives > 1:
         mask = hold_out_drives(drive, _HELD_OUT, seed)
@@ -172,7 +172,7 @@ def _held_out(
 def _fit_and_say(
     config: LatentGPConfig, sums: SlopeSums, class_names: Sequence[str], device: Device
 ) -> LatentGPs:
-    """Train the GPs, and print the classes with a second mode."""
+    """Train the GPs, and print which classes have a second mode."""
     model = fit_gps(config, sums, device)
     if model.soft:
         modes = zip(class_names, *(v.tolist() for v in model.soft), strict=True)

@@ -1,4 +1,4 @@
-"""History of a training: metrics per epoch, and atomic checkpoints to resume from."""
+"""Table of the metrics of each epoch, and atomic checkpoints to resume training from."""
 
 import math
 from collections.abc import Mapping
@@ -15,23 +15,23 @@ from lightning.pytorch.callbacks import Callback
 from benchnav.core.command import tell
 from benchnav.core.errors import TrainingError
 from benchnav.core.store import replacing, write_text
-from benchnav.models.training.best import measured
+from benchnav.models.training.best import current_metrics
 
 _LOSSES = ("train_loss", "valid_loss", "loss")
 
 
 @dataclass(eq=False)
 class History(Callback):
-    """A callback that writes metrics to a table, a row per epoch, and prints them.
+    """A callback that writes metrics to a table, one row per epoch, and prints them.
 
-    Lightning's `CSVLogger` writes training and validation in separate rows, and restarts
-    its table when a training is resumed. The metrics are printed on standard error.
+    Lightning's `CSVLogger` would write training and validation in separate rows, and start a
+    new table when a training is resumed. The metrics are printed on standard error.
 
     Args:
-        path: the table, CSV; None for no table.
-        part: name of the part to print; empty for no output, because a terminal shows
+        path: path of the table, CSV; None to write no table.
+        part: name of the part to print; empty to print nothing, since terminals show
             Lightning's progress bar.
-        rows: content of the table.
+        rows: rows of the table so far, each with its metrics by name.
     """
 
     path: Path | None
@@ -41,12 +41,12 @@ class History(Callback):
     def on_train_epoch_end(
         self, trainer: lightning.Trainer, module: lightning.LightningModule
     ) -> None:
-        """Add a row.
+        """Add a row for the epoch.
 
         Raises:
             TrainingError: If a loss is not finite.
         """
-        metrics = measured(trainer)
+        metrics = current_metrics(trainer)
         epoch = trainer.current_epoch + 1
         row: dict[str, float] = {
             "epoch": epoch,
@@ -62,8 +62,8 @@ class History(Callback):
         for name, value in metrics.items():
             if name in _LOSSES and not math.isfinite(value):
                 raise TrainingError(
-                    f"{name} became {value} in epoch {epoch}. Train with a lower "
-                    "`learning_rate`, or fix the loss. Nothing was kept of this epoch."
+                    f"Expected a finite {name}, got {value} in epoch {epoch}, which is not "
+                    "saved. Train with a lower `learning_rate`, or correct the loss."
                 )
 
     def state_dict(self) -> dict[str, Any]:
@@ -71,15 +71,15 @@ class History(Callback):
         return {"rows": self.rows}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Resume from an earlier state."""
+        """Restore the state of an interrupted training."""
         self.rows = list(state["rows"])
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
     """A writer of Lightning checkpoints that replaces files atomically.
 
-    Lightning moves a temporary file, which is not atomic if temporary files are on another
-    disk.
+    Lightning would move a temporary file, which is not atomic if temporary files are on
+    another disk.
     """
 
     def save_checkpoint(
@@ -91,10 +91,10 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 
 
 def in_words(metrics: Mapping[str, float], prefix: str = "") -> str:
-    """Return the metrics whose names start with a prefix as text, without the prefix."""
-    chosen = {
+    """Return the metrics whose names start with a prefix, as text without the prefix."""
+    selected = {
         name.removeprefix(prefix): value
         for name, value in metrics.items()
         if name.startswith(prefix)
     }
-    return ", ".join(f"{name} {value:.4f}" for name, value in chosen.items())
+    return ", ".join(f"{name} {value:.4f}" for name, value in selected.items())

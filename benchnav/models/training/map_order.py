@@ -1,9 +1,9 @@
 """Order of the maps in an epoch of training, and the random numbers of each map.
 
-Maps in a fully random order would open one of thousands of shards for nearly every map.
-Therefore the shards are shuffled and cut into windows, and the maps of a window are
-shuffled: the files of a window are opened once. Letters in shapes: B maps in all, b
-maps in a batch.
+In a fully random order of maps, nearly every map would be in another of thousands of
+shards, whose file would be opened again. Therefore the shards are shuffled and divided
+into windows, and the maps within a window are shuffled, so that each file is opened once.
+Letters in shapes: B maps in total, b maps in a batch.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,19 +17,19 @@ from torch.utils.data import Sampler
 
 from benchnav.core import rng
 
-# Below the number of files that a reader keeps open, so that few are opened twice.
+# Below the number of files that a reader keeps open, so that few files are opened twice.
 WINDOW_SHARDS = 100
 
 
 def map_order(shards: Sequence[int], seed: int, epoch: int) -> np.ndarray:
-    """Draw the order of an epoch, a pure function of its arguments.
+    """Return the random order of the maps in an epoch, by seed and epoch.
 
     Windows have nearly equal numbers of shards, at most 100. Shards that fit into one
     window are shuffled as if all their maps were in one file.
 
     Args:
-        shards: number of maps in each shard, in order.
-        seed: root seed.
+        shards: number of maps in each shard, in the order of the shards.
+        seed: root seed of the order.
         epoch: index of the epoch.
 
     Returns:
@@ -71,7 +71,7 @@ def crop_origins(
     Args:
         shape: (H, W) of the maps.
         crop: side of the squares in cells; 0 for whole maps, whose origin is 0.
-        seed: root seed.
+        seed: root seed of the squares.
         epoch: index of the epoch.
         count: number of squares in the epoch.
 
@@ -89,12 +89,12 @@ def draw_visibility(seed: int, epoch: int, count: int) -> np.ndarray:
     """Draw the random numbers of `RandomMasks`, by seed, epoch and index.
 
     Args:
-        seed: root seed.
+        seed: root seed of the random numbers.
         epoch: index of the epoch.
         count: number of maps in the epoch.
 
     Returns:
-        Uniform in (0, 1), float64, shape [count, 8].
+        Uniform random numbers in (0, 1), float64, shape [count, 8].
     """
     key = rng.stream_key(seed, "models", "map look")
     return rng.uniform(key, np.array([epoch]), (count, 8))[0]
@@ -112,17 +112,17 @@ class MapSampler(Sampler[MapKey]):
     Args:
         maps: number of maps.
         batch_size: maximum number of maps per batch.
-        seed: root seed.
-        symmetries: symmetries to draw from; (0,) leaves maps unchanged.
+        seed: root seed of order and augmentation.
+        symmetries: indices of the symmetries to draw from; (0,) leaves maps unchanged.
         jitter: maximum relative change of brightness, contrast and saturation.
         shuffle: whether order, symmetries and squares change each epoch.
-        process: (i, n): take the i-th of n interleaved parts of each batch, for one of n
-            processes.
+        process: (i, n) for the i-th of n processes that train together: every n-th map of a
+            batch is used, starting with map i.
         crop: side in cells of the squares cut from maps; 0 for whole maps.
-        shape: (H, W) of the maps that squares are cut from.
+        shape: (H, W) of the maps.
         epoch: index of the epoch of the next iteration.
-        shards: number of maps in each file of the dataset, in order; empty for a single
-            file.
+        shards: number of maps in each file of the dataset, in the order of the files;
+            empty for a single file.
     """
 
     maps: int
@@ -143,7 +143,7 @@ class MapSampler(Sampler[MapKey]):
 
     @property
     def length(self) -> int:
-        """Number of maps, or of squares of maps, per epoch."""
+        """Number of maps per epoch, or of squares if maps are cut."""
         if not self.shuffle:
             return self.maps
         return self.maps * squares_per_map(self.shape, self.crop)
@@ -175,5 +175,5 @@ class MapSampler(Sampler[MapKey]):
         batches = zip(*(np.array_split(v, len(self)) for v in arrays), strict=True)
         first, step = self.process
         for batch in batches:
-            start = min(first, len(batch[0]) - 1)  # each process has at least one map
+            start = min(first, len(batch[0]) - 1)  # each process gets at least one map
             yield MapKey(*(torch.from_numpy(values[start::step]) for values in batch))

@@ -1,10 +1,9 @@
-"""Random masks of training maps, so that a network learns to predict partly observed
-terrain.
+"""Random masks of training maps, to train a network for partly observed terrain.
 
-A masked map shows what a robot observes on a straight path with a camera of all-round
-view, without occlusion by hills: cells within a radius of the path, with noise that
-grows with distance. Unobserved cells have the training mean, as in a robot's map
-(`benchnav.planning.sensing`). Losses and metrics count observed cells only: in other
+A masked map is what a robot observes on a straight path with an all-round camera, without
+occlusion by hills: cells within a radius of the path, with noise that grows with distance
+to the path. Unobserved cells have the training mean, as in a robot's map
+(`benchnav.planning.sensing`). Losses and metrics use only observed cells: in unobserved
 cells a network could learn only the frequency of classes, which the terrain statistics
 describe better.
 Letters in shapes: b maps in a batch, H×W cells.
@@ -25,11 +24,11 @@ from benchnav.models.config import Masking
 
 @dataclass(frozen=True, kw_only=True)
 class RandomMasks:
-    """Masks maps at random.
+    """Random masks of maps.
 
     Args:
         masking: settings of the masks.
-        means: of the training maps, by layer, as in `GroundStatistics`.
+        means: means of the training maps by layer, as in `GroundStatistics`.
         resolution_m: cell width in metres.
     """
 
@@ -41,16 +40,16 @@ class RandomMasks:
         """Mask a batch.
 
         Args:
-            maps: by field, each of shape [b, *, H, W]; `slope_deg` requires
-                `elevation_m`.
-            uniform: uniform random numbers of each map: whether it is masked, the radius,
-                both ends of the path (x, y), the driven fraction of the path, and the
-                seed of its noise; float64, shape [b, 8].
+            maps: fields of b maps by name, each of shape [b, *, H, W]; `slope_deg`
+                requires `elevation_m`.
+            uniform: uniform random numbers of each map, which determine whether the map
+                is masked, the radius, both ends of the path (x, y), the driven fraction of
+                the path, and the seed of the noise; float64, shape [b, 8].
 
         Returns:
-            The same fields and `seen`. Colour and elevation of unobserved cells, and the
-            slopes next to them, are the training mean. Other layers are NaN in these
-            cells, and `class_id` is unlabelled.
+            The same fields and `seen`. In unobserved cells, colour and elevation are the
+            training mean, `class_id` is unlabelled, and other fields are NaN. Slope is the
+            training mean in unobserved cells and their neighbours.
         """
         height, width = next(iter(maps.values())).shape[-2:]
         distance = path_distances(uniform[:, 2:7], (height, width), self.resolution_m)
@@ -78,30 +77,30 @@ class RandomMasks:
         return batch
 
     def _mask_colour(self, rgb: Tensor, seen: Tensor, noise: Tensor) -> Tensor:
-        """Return noisy colours, and the mean colour in unobserved cells."""
+        """Return noisy colours, or the mean colour in unobserved cells."""
         noisy = rgb + self.masking.colour_noise * noise
         colour = noisy.round().clamp(0, 255).to(rgb.dtype)
         mean = torch.tensor(self.means["rgb"]).round().to(rgb.dtype)
         return torch.where(seen[:, None], colour, mean[:, None, None])
 
     def _mask_slope(self, slope: Tensor, seen: Tensor) -> Tensor:
-        """Return slopes, and the mean slope where a neighbouring cell is unobserved."""
+        """Return slopes, or the mean slope in unobserved cells and their neighbours."""
         unseen = (~seen).float()
         near_unseen = torch.nn.functional.max_pool2d(unseen, 3, stride=1, padding=1) > 0
         return torch.where(near_unseen, self.means["slope_deg"][0], slope)
 
 
 def path_distances(path: Tensor, shape: tuple[int, int], resolution_m: float) -> Tensor:
-    """Return the distances of cells to straight paths.
+    """Return the distances of cells to straight paths, one path per map.
 
     Args:
         path: start (x, y) and end (x, y) as fractions of the map's sides, and the
             driven fraction of the path, shape [b, 5].
-        shape: (H, W).
+        shape: (H, W) of the maps.
         resolution_m: cell width in metres.
 
     Returns:
-        Metres from the cell centres, float64, shape [b, H, W].
+        Distances of the cell centres in metres, float64, shape [b, H, W].
     """
     height, width = shape
     rows = (torch.arange(height, dtype=torch.float64) + 0.5) * resolution_m
@@ -122,8 +121,8 @@ def _normal(seeds: Tensor, is_masked: Tensor, shape: tuple[int, ...]) -> Tensor:
     """Return standard normal noise of each map, shape [b, *shape]; 0 if not masked.
 
     Args:
-        seeds: a number in (0, 1) per map, shape [b].
-        is_masked: bool, shape [b, 1, 1].
+        seeds: seed of each map, a number in (0, 1), shape [b].
+        is_masked: whether each map is masked, bool, shape [b, 1, 1].
         shape: shape of the noise of a map.
     """
     noise = []

@@ -1,4 +1,4 @@
-"""Training of networks: classifiers, trainable models of this package, and custom ones."""
+"""Training of networks: classifiers and trainable models, including custom models."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -32,7 +32,7 @@ from benchnav.models.training.check import (
 from benchnav.models.training.conformal import (
     check_valid,
     conformal_table,
-    stopping_every,
+    stopping_step,
 )
 from benchnav.models.training.data import (
     TRAIN,
@@ -57,8 +57,8 @@ from benchnav.models.training.history import in_words
 from benchnav.models.training.masks import RandomMasks
 from benchnav.models.training.target import Target, fresh_checkpoint, open_target
 
-MAX_MEMBERS = 1000  # of an ensemble
-_MIN_SCORED_MAPS = 19  # 1 / (n + 1) is then 0.05
+MAX_MEMBERS = 1000  # maximum number of members of an ensemble
+_MIN_SCORED_MAPS = 19  # number n of maps for which the lowest level 1 / (n + 1) is 0.05
 
 
 def fit_model(
@@ -69,16 +69,16 @@ def fit_model(
     settings: dict[str, Any],
     members: int = 1,
 ) -> None:
-    """Train any model: the fused one in two stages, every other in one.
+    """Train a model of any kind and save it as a checkpoint.
 
     Args:
         how: training options.
         model: registered name, package.module:Class or path/to/file.py:Class.
         data: path or id of a dataset.
         out: folder of the checkpoint.
-        settings: settings of the model as plain data by name; for the fused model
-            those of its stages, `classifier` and `gp`.
-        members: number of networks.
+        settings: settings of the model as plain data by name; for the fused model, the
+            settings of its stages under `classifier` and `gp`.
+        members: number of networks of an ensemble, 1–1000.
     """
     if find_kind(model).target is not FusedModel:
         trainable = find_trainable(model, settings)
@@ -87,7 +87,8 @@ def fit_model(
     unknown = [name for name in settings if name not in (CLASSIFIER, GP)]
     expect(
         not unknown,
-        f"`settings` of {model!r} among {CLASSIFIER}, {GP}, got {', '.join(unknown)}.",
+        f"`settings` of {model!r} to be among {CLASSIFIER} and {GP}, got "
+        f"{', '.join(unknown)}.",
     )
     classifier = read(ClassifierConfig, settings.get(CLASSIFIER, {}), of(CLASSIFIER))
     gp = read(LatentGPConfig, settings.get(GP, {}), of(GP))
@@ -115,16 +116,16 @@ def train_networks(
         train_options: training options.
         data: path or id of a dataset.
         out: folder of the checkpoint.
-        trainable: the networks.
-        gp: settings of the GPs; None to leave them out.
-        members: number of networks.
+        trainable: network to train.
+        gp: settings of the GPs; None to train no GPs.
+        members: number of networks of an ensemble, 1–1000.
     """
     expect(1 <= members <= MAX_MEMBERS, f"`members` in 1–{MAX_MEMBERS}, got {members}.")
     check_seed(train_options.seed, members)
     dataset = open_dataset(data)
     trainer = dict(train_options.trainer or {})
     config = trainable.config
-    # Options that are settings of the network take precedence.
+    # Training options take precedence over settings of the network.
     config = replace(
         config,
         max_epochs=trainer.pop("max_epochs", config.max_epochs),
@@ -160,13 +161,13 @@ def train_networks(
         raise KeyboardInterrupt(_resume_hint(target, all_parts, options)) from None
     if not target.changed and is_first_process():
         finished = " and ".join(sorted(target.checkpoint.parts))
-        print(f"{out} was finished already and holds {finished}")
+        print(f"{out} was finished already and contains {finished}")
 
 
 def _has_symmetries(
     options: TrainOptions, config: TrainingConfig, dataset: TerrainDataset
 ) -> bool:
-    """Return whether to rotate and mirror training maps; by default not with a photo."""
+    """Return whether to rotate and mirror training maps; by default not maps of a photo."""
     if not config.symmetries:
         return False
     if options.symmetries is not None:
@@ -174,14 +175,14 @@ def _has_symmetries(
     has_photo = "rgb" in config.inputs and dataset.has_photo(TRAIN)
     if has_photo:
         say(
-            "note: maps with a photo are not turned or mirrored; pass --symmetries "
-            "true to do so"
+            "note: maps with a photo are not rotated and mirrored; pass --symmetries true "
+            "to rotate and mirror them"
         )
     return not has_photo
 
 
 def _resume_hint(target: Target, parts: Sequence[str], options: FitOptions) -> str:
-    """Return what an interrupted training has finished, and how to resume it."""
+    """Return the finished parts and epochs of an interrupted training, and a remedy."""
     finished = [name for name in parts if name in target.checkpoint.parts]
     finished += [
         f"the finished epochs of {name}"
@@ -189,10 +190,10 @@ def _resume_hint(target: Target, parts: Sequence[str], options: FitOptions) -> s
         if name not in finished
     ]
     if not finished:
-        return "nothing was finished; give the same command again"
+        return "nothing was finished; run the same command again"
     instead = " instead of --overwrite" if options.overwrite else ""
     return (
-        f"{' and '.join(finished)} kept; to resume, give the same command with "
+        f"{' and '.join(finished)} kept; to resume, run the same command with "
         f"--resume{instead}"
     )
 
@@ -209,13 +210,12 @@ def fit_network(
 
     Args:
         trainable: network to train.
-        dataset: the maps.
-        seed: root seed of weights, order and augmentation.
-        options: training options; unless they set a precision, it is bf16-mixed where
-            that is fast.
-        part: name of the part of a model; if empty, that of `trainable`.
-        half_precision: whether its kernels will be stored as float16; they are rounded
-            before the network is calibrated and measured.
+        dataset: dataset of the maps.
+        seed: root seed of weights, map order and augmentation.
+        options: training options; the default of precision is `default_precision`.
+        part: name of the part of the model; if empty, that of `trainable`.
+        half_precision: whether the kernels will be stored as float16; if so, they are
+            rounded before the network is calibrated and measured.
 
     Returns:
         The network with the selected weights, on the CPU, and its metrics on `valid`
@@ -233,7 +233,7 @@ def fit_network(
         Loading(
             in_memory=options.in_memory,
             workers=options.workers,
-            valid_every=stopping_every(options.conformal),
+            valid_every=stopping_step(options.conformal),
         ),
         masks_of(config, dataset),
     )
@@ -272,16 +272,17 @@ def fit_network(
         network.calibrate(data.valid, options.place)
     except BenchnavError:
         raise
-    except Exception as error:  # custom code may raise anything
+    except Exception as error:  # custom code may raise any error
         raise out_of_memory_error(error) or ConfigError(
             f"Expected `calibrate` of {type(network).__name__} to succeed, got: "
-            f"{one_line(error)} Fix it, and train again with --overwrite."
+            f"{one_line(error).rstrip('.')}. Correct it, and train again with "
+            "--overwrite."
         ) from error
     return network.cpu(), metrics
 
 
 def masks_of(config: TrainingConfig, dataset: TerrainDataset) -> RandomMasks | None:
-    """Return the masks of a training; None if maps are fully observed."""
+    """Return the random masks of a training; None if no map is masked."""
     if not config.masking.share:
         return None
     return RandomMasks(
@@ -294,9 +295,9 @@ def masks_of(config: TrainingConfig, dataset: TerrainDataset) -> RandomMasks | N
 def train_parts(
     target: Target, trainable: Trainable, dataset: TerrainDataset, parts: list[str]
 ) -> None:
-    """Train the missing networks of a checkpoint, and calibrate their pool.
+    """Train the missing networks of a checkpoint, and calibrate their average.
 
-    The seeds are `seed`, `seed` + 1, ….
+    The networks have the seeds `seed`, `seed` + 1, ….
     """
     options = target.options
     for seed, part in enumerate(parts, options.seed):
@@ -317,7 +318,7 @@ def train_parts(
         fields_of(members[0]),
         crop=trainable.config.crop,
         seed=options.seed,
-        step=stopping_every(options.conformal),
+        step=stopping_step(options.conformal),
         masks=masks_of(trainable.config, dataset),
     )
     temperature = trainable.kind.fit_pool(members, maps, options.seed, options.place)
@@ -358,7 +359,7 @@ def _train_part(
 def calibrate_conformal(
     target: Target, trainable: Trainable, dataset: TerrainDataset
 ) -> None:
-    """Recalibrate a model on the maps of `valid` that its parts have not seen.
+    """Recalibrate a model on the maps of `valid` that its training has not used.
 
     A model that is already recalibrated does not change.
     """
@@ -370,13 +371,13 @@ def calibrate_conformal(
     table = conformal_table(model, dataset, options.seed, options.place)
     level = table.values[table.levels.index(0.2)]
     say(
-        f"conformal: by {table.maps} maps of {VALID}, the lower fifth is read at "
-        f"level {level:.3f}"
+        f"conformal: with {table.maps} maps of {VALID}, the guaranteed quantile at level "
+        f"0.2 is the model's quantile at level {level:.3f}"
     )
     if table.maps < _MIN_SCORED_MAPS:
         min_level = 1 / (table.maps + 1)
         say(
-            f"note: levels under 1 / {table.maps + 1} = {min_level:.2f} give the "
-            f"lowest λ; give {VALID} more maps"
+            f"note: quantiles at levels below 1 / {table.maps + 1} = {min_level:.2f} are "
+            f"the lowest λ; add maps to {VALID} for lower levels"
         )
     target.set_conformal(table.plain())

@@ -1,8 +1,7 @@
-"""Target of a training: the checkpoint that receives the parts, and checks of its present
-content.
+"""Target of a training: the checkpoint that receives parts, and checks of its content.
 
-All checks precede any work. If several processes train together, only the first checks
-and writes.
+The checks are made before training. If several processes train together, only the first
+process checks and writes.
 """
 
 from collections.abc import Mapping
@@ -22,7 +21,7 @@ from benchnav.models.checkpoint import (
     Checkpoint,
     Part,
     load_checkpoint,
-    open_place,
+    open_for_writing,
     save_checkpoint,
 )
 from benchnav.models.config import TrainingConfig
@@ -42,11 +41,11 @@ class Target:
 
     Args:
         folder: folder of the checkpoint.
-        checkpoint: present content.
+        checkpoint: current content of the checkpoint.
         digest: digest of the training data.
         options: training options.
-        maps: training data; None for a robot's logs.
-        changed: whether anything was saved.
+        maps: dataset of the training; None for slip logs.
+        changed: whether a part or calibration was saved.
     """
 
     folder: Path
@@ -61,18 +60,18 @@ class Target:
 
         Args:
             name: name of the part.
-            config: settings of its training; for a `TrainingConfig`, settings of the
+            config: settings of the part; if it is a `TrainingConfig`, settings of the
                 trainer are compared as well.
-            seed: its root seed.
+            seed: root seed of the part.
 
         Raises:
-            CheckpointError: If it was trained with other settings.
+            CheckpointError: If the part was trained with other settings.
         """
         part = self.checkpoint.parts.get(name)
         if part is None:
             return False
         options = self.options
-        # Parts of earlier versions lack settings added later, and those of the trainer.
+        # Parts of earlier versions lack newer settings and the settings of the trainer.
         expected = {**asdict(config), "seed": seed, "data": self.digest}
         stored = {
             key: part.config.get(key, default)
@@ -90,7 +89,7 @@ class Target:
                 stored |= {f"trainer.{k}": v for k, v in part.trainer.items()}
         differences = differing(expected, stored)
         if not differences:
-            forget(options, name)  # a kill may have prevented this after saving
+            forget(options, name)  # training may have been killed before it did this
             return True
         remedy = "pass --overwrite instead of --resume"
         if interrupted(options, [name]):
@@ -98,13 +97,13 @@ class Target:
                 "pass --overwrite with --resume to resume the training that replaces it"
             )
         raise CheckpointError(
-            f"Expected the {name} in {self.folder} to be of these settings, seed and "
-            f"maps, got others: of seed {part.seed} and {part.data_id}, {differences}. "
-            f"Repeat its settings, or {remedy}."
+            f"Expected the {name} in {self.folder} to have the same settings, seed and "
+            f"maps, got a part with seed {part.seed}, trained on {part.data_id}, with "
+            f"{differences}. Use its settings again, or {remedy}."
         )
 
     def add(self, name: str, part: Part) -> None:
-        """Save a trained part, and the statistics of the terrain that it was trained on."""
+        """Save a trained part, and the terrain statistics of its training maps."""
         self.checkpoint = self.checkpoint.with_part(name, part)
         if self.maps and not self.changed and is_first_process():
             self.checkpoint = replace(self.checkpoint, ground=_ground_of(self.maps))
@@ -112,7 +111,7 @@ class Target:
         forget(self.options, name)
 
     def set_pool_temperature(self, temperature: float) -> None:
-        """Save the temperature of the pool of networks."""
+        """Save the temperature of the average of an ensemble's members."""
         if temperature != self.checkpoint.pool_temperature:
             self.checkpoint = replace(
                 self.checkpoint, pool_temperature=temperature, conformal={}
@@ -120,7 +119,7 @@ class Target:
             self._save()
 
     def set_conformal(self, table: Mapping[str, Any]) -> None:
-        """Save the table of a conformal recalibration."""
+        """Save the table of the conformal recalibration."""
         self.checkpoint = replace(self.checkpoint, conformal=table)
         self._save()
 
@@ -140,7 +139,7 @@ def fresh_checkpoint(
     """Return a checkpoint without parts.
 
     Args:
-        dataset: training data; its classes become those of the checkpoint.
+        dataset: dataset of the training, whose class names the checkpoint takes.
         model: family of the model.
         code: digest of the code of a custom class.
     """
@@ -159,32 +158,33 @@ def open_target(
     options: FitOptions,
     maps: TerrainDataset | None = None,
 ) -> Target:
-    """Open the checkpoint that receives the parts.
+    """Open the checkpoint that receives the trained parts.
 
     Args:
         out: folder of the checkpoint, which need not exist.
-        fresh: a checkpoint without parts, of the family and classes to train.
+        fresh: a checkpoint without parts, with the model and classes of the training.
         parts: names of the parts to train.
         digest: digest of the training data.
-        options: training options, and whether parts may be replaced.
-        maps: training data; None for a robot's logs.
+        options: training options, including whether parts may be replaced.
+        maps: dataset of the training; None for slip logs.
 
     Raises:
-        CheckpointError: If parts would be lost or do not match.
-        ConfigError: If the folder is not a checkpoint.
+        CheckpointError: If parts would be lost, or the checkpoint does not match the
+            training.
+        ConfigError: If the folder exists and is not a checkpoint.
     """
     unfinished = interrupted(options, parts)
-    # Only the first process checks; the others ignore what it may have saved already.
+    # Only the first process checks; other processes ignore what it has already saved.
     is_other_process = not (options.resume or is_first_process())
     may_replace = options.overwrite or is_other_process
     if unfinished and not (options.resume or may_replace):
         raise CheckpointError(
             f"Expected no interrupted training in {options.folder}, got one of "
             f"{' and '.join(unfinished)}. Pass --resume to resume it, or --overwrite "
-            "to restart."
+            "to restart it."
         )
     # An unwritable checkpoint is reported before the training instead of after it.
-    with open_place(out) as (folder, _):
+    with open_for_writing(out) as (folder, _):
         checkpoint = existing(folder, may_replace) or fresh
     if not may_replace:
         _check_family(folder, checkpoint, fresh)
@@ -200,7 +200,7 @@ def open_target(
         }
         checkpoint = replace(checkpoint, parts=remaining)
     elif not options.resume and not checkpoint.parts.keys().isdisjoint(parts):
-        # GPs alone train quickly and have no folder to resume from.
+        # If only GPs are trained, there is no folder to resume from.
         resume = ""
         if options.folder:
             resume = ", or --resume to resume an interrupted training"
@@ -217,11 +217,11 @@ def _check_family(folder: Path, checkpoint: Checkpoint, fresh: Checkpoint) -> No
     """Check that a checkpoint has the model, code and classes of the training.
 
     Raises:
-        CheckpointError: If it does not.
+        CheckpointError: If the checkpoint has another model, code or class names.
     """
     if checkpoint.code != fresh.code and checkpoint.model == fresh.model:
         raise CheckpointError(
-            f"Expected checkpoint {folder} to be of the present code of "
+            f"Expected checkpoint {folder} to be trained with the current code of "
             f"{fresh.model}, got one of other code. Pass --overwrite to replace it."
         )
     if (checkpoint.model, checkpoint.class_names) != (fresh.model, fresh.class_names):
@@ -236,10 +236,7 @@ def _check_family(folder: Path, checkpoint: Checkpoint, fresh: Checkpoint) -> No
 
 
 def _ground_of(dataset: TerrainDataset) -> GroundStatistics | None:
-    """Return statistics of a dataset's terrain; None if λ was not observed.
-
-    Without observed λ only classes can be learned.
-    """
+    """Return the terrain statistics of a dataset; None if it has no observed λ."""
     try:
         return fit_ground(dataset)
     except DatasetError:
@@ -250,7 +247,8 @@ def existing(folder: Path, overwrite: bool) -> Checkpoint | None:
     """Return the checkpoint in a folder.
 
     Returns:
-        None if the folder has no checkpoint, or a damaged one that may be overwritten.
+        The checkpoint; None if the folder has no checkpoint, or has a damaged checkpoint
+        and `overwrite` is true.
     """
     try:
         return load_checkpoint(folder) if (folder / CONFIG).is_file() else None
@@ -261,7 +259,7 @@ def existing(folder: Path, overwrite: bool) -> Checkpoint | None:
 
 
 def _defaults(kind: type) -> dict[str, Any]:
-    """Return the defaults of all settings as plain data; None for those without one."""
+    """Return the default of each setting as plain data; None if it has no default."""
     defaults: dict[str, Any] = {}
     for item in fields(kind):
         value: Any = item.default

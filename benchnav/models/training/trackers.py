@@ -1,9 +1,10 @@
-"""Loggers and callbacks of Lightning that a user names as text and that training creates.
+"""Loggers and callbacks of Lightning that users specify as text.
 
-A class is named as `CSVLogger`, `package.module.Class`, `package.module:Class` or
-`path/to/file.py:Class`; with arguments as `{class_path: …, init_args: {…}}`, and
-several as a list. Loggers do not affect the training. Callbacks may; they are recorded,
-with a digest of the code of those that are not part of Lightning.
+A class is specified as `CSVLogger`, `package.module.Class`, `package.module:Class` or
+`path/to/file.py:Class`, or with arguments as `{class_path: …, init_args: {…}}`; several
+are specified as a list. Loggers do not affect the result of training. Callbacks may
+affect it, so they are recorded, with a digest of the code of callbacks that are not part
+of Lightning.
 """
 
 import importlib
@@ -28,8 +29,8 @@ from benchnav.core.sources import (
     load_file,
 )
 
-# Callbacks of Lightning whose effect on weights or rates restoring the kept epoch would
-# undo, with a remedy.
+# Callbacks of Lightning that are rejected, with a remedy: training restores the weights of
+# an epoch and determines the batches, which would undo their effect.
 _UNDONE = {
     "StochasticWeightAveraging": "`fit swag` averages weights.",
     "WeightAveraging": "`fit swag` averages weights.",
@@ -47,8 +48,8 @@ def make_loggers(specs: Any, folder: Path | None) -> list[Logger]:
     """Create the loggers that a user requests.
 
     Args:
-        specs: one or a list, as text, mapping or object; False for none.
-        folder: output folder of loggers without `save_dir`.
+        specs: one logger or a list, as text, mapping or object; False for no logger.
+        folder: output folder of loggers whose specification has no `save_dir`.
 
     Raises:
         ConfigError: If a class does not exist, its package is missing, or it does not
@@ -63,11 +64,10 @@ def make_callbacks(specs: Any) -> list[Callback]:
     """Create the callbacks that a user requests.
 
     Args:
-        specs: one or a list, as text, mapping or object.
+        specs: one callback or a list, as text, mapping or object.
 
     Raises:
-        ConfigError: As in `make_loggers`, or if the effect of a callback on weights or
-            rates would be undone.
+        ConfigError: As in `make_loggers`, or if the effect of a callback would be undone.
     """
     callbacks = [_create("callbacks", spec, None) for spec in _as_list(specs)]
     for name, remedy in _UNDONE.items():
@@ -75,14 +75,15 @@ def make_callbacks(specs: Any) -> list[Callback]:
         for callback in callbacks:
             expect(
                 not isinstance(callback, kind),
-                "`trainer.callbacks` that leave weights and rates unchanged, got "
-                f"{type(callback).__name__}, whose effect would be undone. {remedy}",
+                "`trainer.callbacks` that change neither weights, learning rate nor batch "
+                f"size, got {type(callback).__name__}, whose effect would be undone. "
+                f"{remedy}",
             )
     return callbacks
 
 
 def described(specs: Any) -> list[dict[str, Any]]:
-    """Return callbacks as plain data: class, arguments, and a digest of foreign code."""
+    """Return callbacks as plain data: class, arguments, and a digest of custom code."""
     records = []
     for spec in _as_list(specs):
         arguments: dict[str, Any] = {}
@@ -106,7 +107,7 @@ def _as_list(specs: Any) -> list[Any]:
 
 
 def _split(setting: str, spec: Any) -> tuple[str, dict[str, Any]]:
-    """Return the name of a class, and its arguments."""
+    """Return the name of a class and its arguments from a specification."""
     if isinstance(spec, str):
         return spec, {}
     is_valid = (
@@ -117,8 +118,8 @@ def _split(setting: str, spec: Any) -> tuple[str, dict[str, Any]]:
     )
     expect(
         is_valid,
-        f"`trainer.{setting}` as a class or as {{class_path: CLASS, init_args: {{…}}}}, "
-        f"got {spec!r}.",
+        f"`trainer.{setting}` as the name of a class or as {{class_path: CLASS, "
+        f"init_args: {{…}}}}, got {spec!r}.",
     )
     return spec["class_path"], dict(spec.get("init_args") or {})
 
@@ -127,7 +128,7 @@ def _class(setting: str, class_path: str) -> type:
     """Return the class of a logger or callback.
 
     Raises:
-        ConfigError: If it does not exist or has the wrong base.
+        ConfigError: If the class does not exist or has the wrong base class.
     """
     module, base = _LIGHTNING[setting]
     options = [name for name in vars(module) if _is_kind(getattr(module, name), base)]
@@ -147,8 +148,8 @@ def _class(setting: str, class_path: str) -> type:
             content = path.read_bytes()
         except OSError as error:
             raise ConfigError(
-                f"Expected `trainer.{setting}` in a file, got {owner!r}, which cannot "
-                f"be read: {error.strerror}."
+                f"Expected `trainer.{setting}` in a file that can be read, got "
+                f"{owner!r}: {error.strerror}."
             ) from error
         kind = attribute(load_file(path.resolve(), content), owner, name)
     else:
@@ -156,14 +157,14 @@ def _class(setting: str, class_path: str) -> type:
             kind = attribute(importlib.import_module(owner), owner, name)
         except BenchnavError:
             raise
-        except Exception as error:  # a user's module may raise anything
+        except Exception as error:  # a custom module may raise any error
             raise out_of_memory_error(error) or ConfigError(
-                f"Expected `trainer.{setting}` from a module, got {class_path!r}: "
-                f"{one_line(error)}"
+                f"Expected `trainer.{setting}` from a module that can be imported, got "
+                f"{class_path!r}: {one_line(error)}"
             ) from error
     expect(
         _is_kind(kind, base),
-        f"`trainer.{setting}` as a class of lightning's {base.__name__}, got "
+        f"`trainer.{setting}` as a subclass of lightning's {base.__name__}, got "
         f"{class_path!r}.",
     )
     return kind
@@ -187,12 +188,12 @@ def _create(setting: str, spec: Any, folder: Path | None) -> Any:
         package = error.name or _package_in(str(error))
         raise ConfigError(
             f"Expected the package that {class_path} needs, got none: "
-            f"{one_line(error)[:160]} "
-            f"Install it, such as: pip install {package.partition('.')[0]}"
+            f"{one_line(error)[:160].rstrip('.')}. Install the package, for example: pip "
+            f"install {package.partition('.')[0]}"
         ) from error
-    except Exception as error:  # a user's class may raise anything
+    except Exception as error:  # a custom class may raise any error
         raise out_of_memory_error(error) or ConfigError(
-            f"Expected arguments that {class_path} takes, got: {one_line(error)[:300]}"
+            f"Expected arguments that {class_path} accepts, got: {one_line(error)[:300]}"
         ) from error
 
 

@@ -1,7 +1,7 @@
-"""Statistics of batch normalisation for weights other than the trained ones.
+"""Statistics of batch normalisation for other weights than the trained weights.
 
-Such statistics are valid for one set of weights only. Letter in shapes: S statistics of
-all layers.
+Each set of weights needs its own statistics. Letter in shapes: S statistics of all
+layers.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,12 +24,12 @@ def norms_of(network: nn.Module) -> dict[str, Any]:
 
 
 def size_of(norms: Mapping[str, Any]) -> int:
-    """Return the number of statistics S."""
+    """Return S, the number of statistics of all layers."""
     return sum(2 * norm.num_features for norm in norms.values())
 
 
 def to_buffers(norms: Mapping[str, Any], row: Tensor) -> dict[str, Tensor]:
-    """Return buffers by name, from a row of all statistics, shape [S]."""
+    """Return the buffers by name from all statistics in one row, shape [S]."""
     names = []
     sizes = []
     for name, norm in norms.items():
@@ -42,23 +42,23 @@ def to_buffers(norms: Mapping[str, Any], row: Tensor) -> dict[str, Tensor]:
 def statistics_of(
     network: nn.Module, weights: Mapping[str, Tensor], batches: Sequence[Any]
 ) -> Tensor:
-    """Average the statistics of a few batches under given weights.
+    """Return the statistics of a network with other weights, averaged over batches.
 
-    The network itself is returned to evaluation with its own statistics.
+    Afterwards the network is in evaluation mode and has its original statistics.
 
     Args:
         network: network to evaluate.
-        weights: by name, in place of the network's own.
+        weights: weights by name, used instead of the network's weights.
         batches: arguments of the network, one tuple per batch.
 
     Returns:
-        A row of all statistics, shape [S].
+        All statistics in one row, shape [S].
     """
     norms = norms_of(network).values()
     originals = [(norm, norm.momentum, deepcopy(norm.state_dict())) for norm in norms]
     for norm in norms:
         norm.reset_running_stats()
-        norm.momentum = None  # the average of all batches
+        norm.momentum = None  # for the plain average over all batches
     network.train()
     for batch in batches:
         functional_call(network, dict(weights), batch)

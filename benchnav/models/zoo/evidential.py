@@ -1,11 +1,11 @@
-"""Deep evidential regression: a normal-inverse-gamma distribution over mean and variance
-of each cell.
+"""Deep evidential regression: each cell's mean and variance are normal-inverse-gamma.
 
-λ is then Student-t with 2α degrees of freedom, location γ and squared scale β (1 + ν) /
-(ν α). The prediction is a mixture of Gaussians with a common mean, whose precisions are
-weighted by the gamma distribution, clipped to [0, 1]; its CDF is within 10⁻⁴ of that of
-the t. The loss is the authors', without censoring. The likelihood does not identify the
-epistemic part, β / (ν (α − 1)): the model is a reference row with a known weakness.
+λ then has a Student-t distribution with 2α degrees of freedom, location γ and squared
+scale β (1 + ν) / (ν α). The prediction is a mixture of Gaussians with a common mean and
+with precisions weighted by the gamma distribution, clipped to [0, 1]; its CDF differs
+from that of the Student-t by at most 10⁻⁴. The loss is that of Amini et al., without
+censoring. The likelihood does not identify the epistemic part, β / (ν (α − 1)), so the
+model serves only as a baseline.
 Sources: Amini et al. (2020), "Deep evidential regression"; Meinert et al. (2023), "The
 unreasonable effectiveness of deep evidential regression". Letters in shapes: B maps,
 H×W cells, K nodes.
@@ -27,11 +27,11 @@ from benchnav.models.nets.trainable import Loss
 # γ, ν > 0, α > 1 and β > 0, each of shape [B, 1, H, W].
 Evidence = tuple[Tensor, Tensor, Tensor, Tensor]
 
-# Nodes of log precision, in its standard deviations.
+# Nodes of log precision, in standard deviations from its mean.
 _NODES = torch.linspace(-7, 3.5, 20, dtype=torch.float64)
-_MIN_EVIDENCE = 1e-3  # of ν and α − 1
+_MIN_EVIDENCE = 1e-3  # minimum of ν and of α − 1
 _MIN_BETA = 1e-5
-_FIRST = (0.5, 0.5413, 0.5413, -2.25)  # γ = 0.5, ν = 1, α = 2, β = 0.1
+_FIRST = (0.5, 0.5413, 0.5413, -2.25)  # numbers for γ = 0.5, ν = 1, α = 2, β = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,8 +39,8 @@ class EvidentialConfig(JoinedConfig):
     """Settings of the network and its training.
 
     Args:
-        regulariser: weight of |λ − γ| (2ν + α), which reduces the evidence if the mean is
-            wrong.
+        regulariser: weight of |λ − γ| (2ν + α), which reduces the evidence where the mean
+            is wrong; finite, ≥ 0.
     """
 
     regulariser: float = 0.01
@@ -50,15 +50,15 @@ class EvidentialConfig(JoinedConfig):
         super().__post_init__()
         expect(
             0 <= self.regulariser < math.inf,
-            f"`regulariser` ≥ 0, got {self.regulariser!r}.",
+            f"`regulariser` ≥ 0 and finite, got {self.regulariser!r}.",
         )
 
 
 class EvidentialModel(JoinedModel):
-    """Evidence of each cell.
+    """Model that predicts γ, ν, α and β of each cell.
 
     Args:
-        config: settings.
+        config: settings of the model and its training.
     """
 
     no_graph: ClassVar[str] = "needs the digamma function, which ONNX lacks"
@@ -72,7 +72,7 @@ class EvidentialModel(JoinedModel):
         return torch.tensor(_FIRST)
 
     def to_outputs(self, numbers: Tensor) -> Evidence:
-        """Return γ, ν, α and β."""
+        """Return γ, ν, α and β, each of shape [B, 1, H, W]."""
         mean, *raw = numbers.chunk(4, dim=1)
         nu, alpha, beta = (nn.functional.softplus(value) for value in raw)
         return mean, nu + _MIN_EVIDENCE, alpha + 1 + _MIN_EVIDENCE, beta + _MIN_BETA
@@ -105,16 +105,16 @@ def evidential_loss(evidence: Evidence, observed: Tensor, regulariser: float) ->
     The regulariser is |λ − γ| (2ν + α).
 
     Args:
-        evidence: γ, ν, α and β.
+        evidence: γ, ν, α and β, each of shape [B, 1, H, W].
         observed: λ, NaN if not observed, shape [B, H, W].
-        regulariser: its weight.
+        regulariser: weight of the regulariser.
 
     Returns:
-        Mean over the observed cells, a scalar; 0 without observed cells.
+        Mean over the observed cells, a scalar; 0 if no cell is observed.
     """
     mean, nu, alpha, beta = (value.squeeze(1) for value in evidence)
-    seen = observed.isfinite()
-    error = torch.where(seen, observed, 0.5) - mean
+    has_value = observed.isfinite()
+    error = torch.where(has_value, observed, 0.5) - mean
     omega = 2 * beta * (1 + nu)
     nll = (
         0.5 * (math.pi / nu).log()
@@ -124,4 +124,4 @@ def evidential_loss(evidence: Evidence, observed: Tensor, regulariser: float) ->
         - torch.lgamma(alpha + 0.5)
     )
     loss = nll + regulariser * error.abs() * (2 * nu + alpha)
-    return torch.where(seen, loss, 0.0).sum() / seen.sum().clamp(min=1)
+    return torch.where(has_value, loss, 0.0).sum() / has_value.sum().clamp(min=1)

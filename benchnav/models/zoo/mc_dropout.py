@@ -1,11 +1,10 @@
-"""Monte Carlo dropout: one network under many dropout masks, as draws from a posterior
-of its weights.
+"""Monte Carlo dropout: the average prediction of one network under many dropout masks.
 
-A mask drops channels, the same in all cells of a map, before each layer behind the
-image network: the features and both hidden layers. The masks of prediction are drawn
-once from the seed and stored with the weights, so a prediction depends neither on the
-batch nor on a generator. The image features are computed once for all masks. The
-Gaussians of all masks are averaged.
+The masks stand for draws from a posterior of the weights. A mask drops the same channels
+in all cells of a map, from the image features and from both hidden layers. The masks for
+prediction are drawn once from the seed and stored with the weights, so a prediction
+depends neither on the batch nor on a generator. The image features are computed once for
+all masks.
 Sources: Gal and Ghahramani (2016), "Dropout as a Bayesian approximation"; Kendall and
 Gal (2017), "What uncertainties do we need in Bayesian deep learning for computer
 vision?". Letters in shapes: B maps, H×W cells, K masks.
@@ -33,8 +32,8 @@ class DropoutConfig(MeanVarianceConfig):
     """Settings of the network and its training.
 
     Args:
-        dropout: probability that a channel is dropped.
-        masks: K, number of masks that a prediction averages.
+        dropout: probability that a channel is dropped, in (0, 1).
+        masks: K, number of masks over which a prediction is averaged, at least 1.
     """
 
     dropout: float = 0.2
@@ -48,10 +47,10 @@ class DropoutConfig(MeanVarianceConfig):
 
 
 class DropoutModel(MeanVarianceModel):
-    """Average of the predictions under K dropout masks.
+    """Model whose prediction is the average over K dropout masks.
 
     Args:
-        config: settings.
+        config: settings of the model and its training.
     """
 
     masks: Tensor
@@ -61,7 +60,7 @@ class DropoutModel(MeanVarianceModel):
         super().__init__(config)
 
     def make_modules(self, scale: Mapping[str, LayerScale] | None) -> None:
-        """Create the network and the masks: a row each, with the channels of all layers."""
+        """Create the network and the masks; a mask is a row of the channels of all layers."""
         super().make_modules(scale)
         layers = (*self.joint, self.head)
         self.widths = [
@@ -73,22 +72,22 @@ class DropoutModel(MeanVarianceModel):
         self.register_buffer("masks", torch.from_numpy(uniform >= self.config.dropout))
 
     def forward(self, maps: Maps) -> Gaussians:
-        """Compute the outputs: training draws a mask per map, evaluation uses the K masks.
+        """Compute the outputs, with one new mask per map in training, else with K masks.
 
         Returns:
-            Means and standard deviations, each of shape [B, 1, H, W]; in evaluation [B,
-            K, H, W].
+            Means and standard deviations, each of shape [B, 1, H, W]; in evaluation mode
+            [B, K, H, W].
         """
         features = self.features(maps)
         if self.training:
             size = (len(features), sum(self.widths))
             uniform = torch.rand(size, device=features.device)
-            return self._under(uniform >= self.config.dropout, features)
-        outputs = [self._under(mask[None], features) for mask in self.masks]
+            return self._outputs_under(uniform >= self.config.dropout, features)
+        outputs = [self._outputs_under(mask[None], features) for mask in self.masks]
         means, stds = zip(*outputs, strict=True)
         return torch.cat(means, 1), torch.cat(stds, 1)
 
-    def _under(self, masks: Tensor, features: Tensor) -> Gaussians:
+    def _outputs_under(self, masks: Tensor, features: Tensor) -> Gaussians:
         """Return the outputs under masks, bool, shape [B or 1, channels of all layers]."""
         kept_fraction = 1 - self.config.dropout
         first, second, third = (

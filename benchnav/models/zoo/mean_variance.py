@@ -1,13 +1,13 @@
 """Mean and variance: one Gaussian per cell, clipped to [0, 1], by maximum likelihood.
 
-The likelihood is censored: at 0 and 1 it is that of the mass clipped there. If `beta` is
-above 0, each cell's gradient is multiplied by σ^(2β), so that training does not neglect
-cells with a large variance.
+The likelihood is censored: at 0 and 1 it is the probability mass that is clipped there.
+If `beta` is above 0, each cell's gradient is multiplied by σ^(2β), so that training does
+not neglect cells with a large variance.
 Sources: Nix and Weigend (1994), "Estimating the mean and variance of the target
 probability distribution"; Tobin (1958), "Estimation of relationships for limited
 dependent variables"; Seitzer et al. (2022), "On the pitfalls of heteroscedastic
-uncertainty estimation" (β-NLL). Letters in shapes: B maps, H×W cells, K Gaussians that
-are averaged.
+uncertainty estimation" (β-NLL). Letters in shapes: B maps, H×W cells, K averaged
+Gaussians.
 """
 
 import math
@@ -35,8 +35,8 @@ class MeanVarianceConfig(JoinedConfig):
     """Settings of the network and its training.
 
     Args:
-        beta: β in [0, 1] of the β-NLL; 0 is the plain likelihood, 1 weighs errors
-            independently of the variance.
+        beta: β of the β-NLL, in [0, 1]; at 0 the loss is the plain likelihood, at 1 the
+            weight of an error does not depend on the variance.
     """
 
     beta: float = 0.0
@@ -48,10 +48,10 @@ class MeanVarianceConfig(JoinedConfig):
 
 
 class MeanVarianceModel(JoinedModel):
-    """One Gaussian per cell; subclasses average several with equal weights.
+    """Model of one Gaussian per cell; subclasses average several with equal weights.
 
     Args:
-        config: settings.
+        config: settings of the model and its training.
     """
 
     def __init__(self, config: MeanVarianceConfig) -> None:
@@ -68,9 +68,9 @@ class MeanVarianceModel(JoinedModel):
         return mean, to_std(width)
 
     def configure_losses(self) -> Loss:
-        """Return the likelihood; training weighs it by `beta`, validation does not.
+        """Return the negative log-likelihood, which training weighs by `beta`.
 
-        The plain likelihood is a proper score.
+        Validation uses the plain likelihood, a proper score.
         """
 
         def loss(outputs: Gaussians, observed: Tensor) -> Tensor:
@@ -82,7 +82,7 @@ class MeanVarianceModel(JoinedModel):
     def to_distribution(self, outputs: Gaussians) -> TraversabilityMixture:
         """Return the average of the Gaussians, with parameters of shape [B, K, H, W].
 
-        It equals the result of `core.pooled.pool`.
+        The average equals the result of `core.pooled.pool`.
         """
         means, stds = outputs
         weights = torch.full_like(means, 1 / means.shape[1])
@@ -97,19 +97,19 @@ def beta_nll(
     The negative log-likelihood of each cell is multiplied by σ^(2β).
 
     Args:
-        means: before clipping, shape [B, K, H, W].
-        stds: before clipping, > 0, shape [B, K, H, W].
+        means: means before clipping, shape [B, K, H, W].
+        stds: standard deviations before clipping, > 0, shape [B, K, H, W].
         observed: λ in [0, 1], NaN if not observed, shape [B, H, W].
-        beta: β; σ² is the mean over K and has no gradient.
+        beta: β in [0, 1]; σ² is the mean variance over K and has no gradient.
 
     Returns:
-        Mean over the observed cells, a scalar; 0 without observed cells.
+        Mean over the observed cells, a scalar; 0 if no cell is observed.
     """
-    seen = observed.isfinite()
+    has_value = observed.isfinite()
     # Unobserved cells need a finite value: NaN times 0 would enter the gradients.
-    finite = torch.where(seen, observed, 0.5).unsqueeze(1)
+    finite = torch.where(has_value, observed, 0.5).unsqueeze(1)
     component = component_log_prob(means, stds, finite)
     log_prob = component.logsumexp(1) - math.log(means.shape[1])
     if beta:
         log_prob = log_prob * stds.detach().square().mean(1) ** beta
-    return -torch.where(seen, log_prob, 0.0).sum() / seen.sum().clamp(min=1)
+    return -torch.where(has_value, log_prob, 0.0).sum() / has_value.sum().clamp(min=1)

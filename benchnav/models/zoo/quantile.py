@@ -1,12 +1,12 @@
 """Quantile regression: the quantiles of λ at many levels at once, by the pinball loss.
 
 The quantile function is a median plus slopes ≥ 0 over normal scores between the levels,
-so that quantiles cannot cross; it is clipped to [0, 1]. Equal slopes are a Gaussian,
-with which training starts. The targets of observed 0 and 1 are −0.1 and 1.1: quantiles
-of an atom then lie clearly outside [0, 1] and are clipped to it. This is exact, since
-clipping is monotone. The loss does not determine the tails: half of the probability
-beyond the outermost levels is assigned to 0 and to 1, so that no observation has zero
-probability.
+so that quantiles cannot cross; it is clipped to [0, 1]. Training starts with equal
+slopes, which make it Gaussian. Observed 0 and 1 are replaced by the targets −0.1 and 1.1,
+so that the quantiles of an atom lie clearly outside [0, 1] before clipping. This is
+exact, since clipping is monotone. The loss does not determine the tails: half of the
+probability below the lowest level is assigned to 0, and half of that above the highest
+level to 1, so that no observation has zero probability.
 Sources: Koenker and Bassett (1978), "Regression quantiles"; Powell (1986), "Censored
 regression quantiles". Letters in shapes: B maps, H×W cells, Q inner levels.
 """
@@ -24,12 +24,12 @@ from benchnav.models.config import JoinedConfig
 from benchnav.models.nets.joined import JoinedModel
 from benchnav.models.nets.trainable import Loss
 
-INNER = LEVELS[1:-1]
-_ALL = (0.0, INNER[0] / 2, *INNER, (1 + INNER[-1]) / 2, 1.0)
-_MEDIAN = INNER.index(0.5)
-_BEYOND = 0.1
-_NORMAL_SCORES = torch.special.ndtri(torch.tensor(INNER, dtype=torch.float64))
-_STEPS = _NORMAL_SCORES.diff().float().view(-1, 1, 1)
+INNER_LEVELS = LEVELS[1:-1]
+_ALL_LEVELS = (0.0, INNER_LEVELS[0] / 2, *INNER_LEVELS, (1 + INNER_LEVELS[-1]) / 2, 1.0)
+_MEDIAN_INDEX = INNER_LEVELS.index(0.5)
+_TARGET_MARGIN = 0.1
+_NORMAL_SCORES = torch.special.ndtri(torch.tensor(INNER_LEVELS, dtype=torch.float64))
+_SCORE_STEPS = _NORMAL_SCORES.diff().float().view(-1, 1, 1)
 _FIRST_STD = 0.2
 
 
@@ -39,10 +39,10 @@ class QuantileConfig(JoinedConfig):
 
 
 class QuantileModel(JoinedModel):
-    """Quantiles at the inner levels of `benchnav.core.quantiles`.
+    """Model that predicts quantiles at the inner levels of `benchnav.core.quantiles`.
 
     Args:
-        config: settings.
+        config: settings of the model and its training.
     """
 
     def __init__(self, config: QuantileConfig) -> None:
@@ -53,31 +53,31 @@ class QuantileModel(JoinedModel):
         """Return numbers for a Gaussian of mean 0.5 and standard deviation 0.2."""
         slope = math.log(math.expm1(_FIRST_STD))  # softplus⁻¹
         median = torch.full((1,), 0.5)
-        return torch.cat([median, torch.full((len(INNER) - 1,), slope)])
+        return torch.cat([median, torch.full((len(INNER_LEVELS) - 1,), slope)])
 
     def to_outputs(self, numbers: Tensor) -> Tensor:
         """Return quantiles before clipping, ascending, shape [B, Q, H, W]."""
         slopes = nn.functional.softplus(numbers[:, 1:])
-        rise = (slopes * _STEPS.to(numbers.device)).cumsum(1)
+        rise = (slopes * _SCORE_STEPS.to(numbers.device)).cumsum(1)
         rise = torch.cat([torch.zeros_like(rise[:, :1]), rise], 1)
-        return numbers[:, :1] + rise - rise[:, _MEDIAN : _MEDIAN + 1]
+        return numbers[:, :1] + rise - rise[:, _MEDIAN_INDEX : _MEDIAN_INDEX + 1]
 
     def configure_losses(self) -> Loss:
         """Return the mean pinball loss over the inner levels."""
 
         def loss(outputs: Tensor, observed: Tensor) -> Tensor:
-            upper = torch.where(observed >= 1, 1 + _BEYOND, observed)
-            target = torch.where(observed <= 0, -_BEYOND, upper)
-            return pinball(outputs, INNER, target)
+            upper = torch.where(observed >= 1, 1 + _TARGET_MARGIN, observed)
+            target = torch.where(observed <= 0, -_TARGET_MARGIN, upper)
+            return pinball(outputs, INNER_LEVELS, target)
 
         return loss
 
     def to_distribution(self, outputs: Tensor) -> QuantileDistribution:
-        """Return a CDF piecewise linear between the quantiles clipped to [0, 1]."""
-        inside = outputs.clamp(0, 1)
-        zeros = torch.zeros_like(inside[:, :2])
-        ones = torch.ones_like(inside[:, :2])
-        return QuantileDistribution(torch.cat([zeros, inside, ones], 1), _ALL)
+        """Return the distribution of the quantiles clipped to [0, 1]."""
+        clipped = outputs.clamp(0, 1)
+        zeros = torch.zeros_like(clipped[:, :2])
+        ones = torch.ones_like(clipped[:, :2])
+        return QuantileDistribution(torch.cat([zeros, clipped, ones], 1), _ALL_LEVELS)
 
     def sharpen(
         self, distribution: TraversabilityDistribution
@@ -85,24 +85,24 @@ class QuantileModel(JoinedModel):
         """Apply the temperature T: the new quantile at u is the old one at Φ(T·Φ⁻¹(u))."""
         if self.temperature == 1:
             return distribution
-        old_levels = ndtr(self.temperature * ndtri(_ALL))
-        return quantiles_at(distribution, old_levels.tolist(), _ALL)
+        old_levels = ndtr(self.temperature * ndtri(_ALL_LEVELS))
+        return quantiles_at(distribution, old_levels.tolist(), _ALL_LEVELS)
 
 
 def pinball(quantiles: Tensor, levels: tuple[float, ...], observed: Tensor) -> Tensor:
-    """Return the pinball loss max(u e, (u − 1) e), e = observed λ − quantile at u.
+    """Return the pinball loss max(u e, (u − 1) e), with e = observed λ − quantile at u.
 
     Args:
         quantiles: shape [B, Q, H, W].
-        levels: u of each quantile, Q numbers in (0, 1).
+        levels: level u of each quantile, Q numbers in (0, 1).
         observed: λ, NaN if not observed, shape [B, H, W].
 
     Returns:
-        Mean over levels and observed cells, a scalar; 0 without observed cells.
+        Mean over levels and observed cells, a scalar; 0 if no cell is observed.
     """
-    seen = observed.isfinite()
-    error = torch.where(seen, observed, 0.5).unsqueeze(1) - quantiles
+    has_value = observed.isfinite()
+    error = torch.where(has_value, observed, 0.5).unsqueeze(1) - quantiles
     level = torch.tensor(levels, dtype=quantiles.dtype, device=quantiles.device)
     level = level.view(-1, 1, 1)
     loss = torch.maximum(level * error, (level - 1) * error).mean(1)
-    return torch.where(seen, loss, 0.0).sum() / seen.sum().clamp(min=1)
+    return torch.where(has_value, loss, 0.0).sum() / has_value.sum().clamp(min=1)

@@ -1,11 +1,11 @@
-"""SWAG: a Gaussian over the weights of the last training steps; draws from it predict.
+"""SWAG: the average prediction of networks whose weights are drawn from a Gaussian.
 
-Training does not stop early. The learning rate falls to a constant; from then on,
-running means and standard deviations of all weights are updated (the diagonal form).
-The seed fixes the draws. After training, the statistics of batch normalisation are
-computed again for each draw, on a few batches of training maps, and stored. A
-checkpoint has three numbers per weight: the last value, its mean and its standard
-deviation.
+The Gaussian is fitted to the weights of the last training steps, in its diagonal form:
+training does not stop early, and once the learning rate has fallen to a constant, the
+running mean and standard deviation of each weight are updated. The seed determines the
+draws. After training, the statistics of batch normalisation are computed for each draw,
+on a few batches of training maps, and stored. A checkpoint has three numbers per weight:
+its last value, mean and standard deviation.
 Sources: Maddox et al. (2019), "A simple baseline for Bayesian uncertainty in deep
 learning"; Izmailov et al. (2018), "Averaging weights leads to wider optima and better
 generalization". Letters in shapes: B maps, H×W cells, K draws.
@@ -37,7 +37,7 @@ from benchnav.models.zoo.mean_variance import (
     MeanVarianceModel,
 )
 
-_BATCHES = 4  # of training maps, for the statistics of a draw
+_N_BATCHES = 4  # number of batches of training maps for the statistics of a draw
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,9 +45,10 @@ class SWAGConfig(MeanVarianceConfig):
     """Settings of the network and its training.
 
     Args:
-        collect: fraction of all steps, the last ones, whose weights are collected.
-        collect_rate: learning rate during these steps, relative to `learning_rate`.
-        draws: K, number of sets of weights that a prediction averages.
+        collect: fraction of the training steps, at the end, whose weights are collected;
+            in (0, 0.8].
+        collect_rate: learning rate in these steps, relative to `learning_rate`; in (0, 1].
+        draws: K, number of draws of the weights over which a prediction is averaged.
     """
 
     collect: float = 0.4
@@ -66,12 +67,12 @@ class SWAGConfig(MeanVarianceConfig):
 
 
 class SWAGModel(MeanVarianceModel):
-    """Average of the predictions under K draws of the weights.
+    """Model whose prediction is the average over K draws of the weights.
 
-    Before the draws are created, the current weights predict.
+    Until the statistics of the draws are computed, the current weights are used.
 
     Args:
-        config: settings.
+        config: settings of the model and its training.
     """
 
     stops_early: ClassVar[bool] = False
@@ -89,29 +90,30 @@ class SWAGModel(MeanVarianceModel):
     def make_modules(self, scale: Mapping[str, LayerScale] | None) -> None:
         """Register buffers for weight moments and for the statistics of each draw."""
         super().make_modules(scale)
-        self.names = [name for name, _ in self.named_parameters()]
+        self.weight_names = [name for name, _ in self.named_parameters()]
         self.norms = norms_of(self)
         for index, weights in enumerate(self.parameters()):
             self.register_buffer(f"mean_{index}", torch.zeros_like(weights.detach()))
             self.register_buffer(f"std_{index}", torch.zeros_like(weights.detach()))
         statistics = torch.zeros(self.config.draws * size_of(self.norms))
-        self.register_buffer("statistics", statistics)  # stays float32
+        # A one-dimensional buffer, since these are stored as float32.
+        self.register_buffer("statistics", statistics)
         self.register_buffer("collected", torch.zeros((), dtype=torch.int64))
         self.register_buffer("is_drawn", torch.zeros((), dtype=torch.bool))
         self.register_buffer("draw_seed", torch.tensor(self.seed))
 
-    def forward(self, maps: Maps, alone: bool = False) -> Gaussians:
+    def forward(self, maps: Maps, use_current: bool = False) -> Gaussians:
         """Compute the outputs.
 
         Args:
-            maps: B maps by field, which include `inputs`.
-            alone: whether to use the current weights instead of the draws.
+            maps: layers of B maps by name, including `inputs`.
+            use_current: whether to use the current weights instead of the draws.
 
         Returns:
-            Means and standard deviations, each of shape [B, 1, H, W], or [B, K, H, W] if
-            there are draws.
+            Means and standard deviations, each of shape [B, K, H, W], or [B, 1, H, W]
+            from the current weights.
         """
-        if alone or self.training or not self.is_drawn:
+        if use_current or self.training or not self.is_drawn:
             return super().forward(maps)
         outputs = [
             functional_call(self, self.draw(index), (maps, True))
@@ -121,11 +123,11 @@ class SWAGModel(MeanVarianceModel):
         return torch.cat(means, 1), torch.cat(stds, 1)
 
     def draw(self, index: int) -> dict[str, Tensor]:
-        """Return the weights of a draw by name, with its statistics if computed."""
+        """Return the weights of a draw by name, and its statistics if computed."""
         key = rng.stream_key(int(self.draw_seed), "models", "swag", index)
         generator = rng.generator(key)
         weights: dict[str, Tensor] = {}
-        for i, name in enumerate(self.names):
+        for i, name in enumerate(self.weight_names):
             mean = self.get_buffer(f"mean_{i}")
             std = self.get_buffer(f"std_{i}")
             noise = torch.randn(mean.shape, generator=generator)
@@ -164,18 +166,18 @@ class SWAGModel(MeanVarianceModel):
             std = self.get_buffer(f"std_{index}")
             deviation = weights - mean
             mean += deviation / count
-            # Standard deviations fit in float16, squares would not. Source: Welford
-            # (1962).
+            # Standard deviations are stored, since squares exceed the range of float16.
+            # Source: Welford (1962).
             sum_of_squares = std.square() * (count - 1) + deviation * (weights - mean)
             std.copy_((sum_of_squares / count).clamp(min=0).sqrt())
 
     def on_fit_end(self) -> None:
-        """Compute the statistics of each draw on training maps, in the first epoch's order."""
+        """Compute the statistics of each draw on the first batches of training maps."""
         if not self.collected:
             return
         loader = self.trainer.datamodule.train_dataloader()  # type: ignore[attr-defined]
         batches = []
-        for batch in islice(loader, _BATCHES):
+        for batch in islice(loader, _N_BATCHES):
             maps = {name: batch[name].to(self.device) for name in self.inputs}
             batches.append((maps, True))
         rows = [

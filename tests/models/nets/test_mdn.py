@@ -636,7 +636,7 @@ def test_the_command_trains_a_checkpoint_that_is_evaluated(
         (["--out", "x", "--mdn.components", "0"], "components"),
         (["--out", "x", "--mdn.encoder", "resnet19"], "resnet19"),
         (["--out", "x", "--trainer.logger", "1"], "logger"),
-        (["--out", "."], "something else"),
+        (["--out", "."], "contains no config.json"),
         ([], "out"),
     ],
 )

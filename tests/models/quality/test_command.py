@@ -42,8 +42,7 @@ def test_a_table_is_printed_and_nothing_written(
         assert f"{value:.4f}" in row
     assert f"test/hs {nearest_colour_accuracy(dataset, 'test/hs'):.4f}" in out
     assert (
-        out.splitlines()[-1]
-        == "columns: --out FOLDER writes quality.md, which explains them"
+        out.splitlines()[-1] == "to explain the columns, --out FOLDER writes quality.md"
     )
     assert max(map(len, out.splitlines())) <= 124
     assert err.splitlines() == ["splits: 0/2", "splits: 1/2", "splits: 2/2"]
@@ -198,7 +197,7 @@ def test_a_series_is_drawn_where_there_is_one(
         (["oracle", "--data", "DATA", "--splits", "[test/hg]"], "test/hg"),
         (["oracle", "--data", "DATA", "--json", "no/such/folder.json"], "no/such"),
         (["oracle", "--data", "DATA", "--json", "folder"], "folder"),
-        (["oracle", "--data", "DATA", "--out", "folder"], "something else"),
+        (["oracle", "--data", "DATA", "--out", "folder"], "which is not an evaluation"),
         (
             ["oracle", "--data", "DATA", "--out", "folder/file/deeper/out"],
             "folder/file",

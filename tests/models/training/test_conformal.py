@@ -25,7 +25,7 @@ from benchnav.models.training import networks
 from benchnav.models.training.conformal import (
     conformal_table,
     scored_maps,
-    stopping_every,
+    stopping_step,
 )
 from benchnav.models.training.data import MapDataset
 from benchnav.models.training.map_order import MapSampler
@@ -74,7 +74,7 @@ def test_one_half_is_every_second_map_and_the_other_is_the_rest(
 ) -> None:
     whole = MapDataset(maps.path, "valid", FIELDS)
     half = MapDataset(
-        maps.path, "valid", FIELDS, in_memory, step=stopping_every(conformal=True)
+        maps.path, "valid", FIELDS, in_memory, step=stopping_step(conformal=True)
     )
     assert (len(whole), len(half), list(scored_maps(7))) == (7, 4, [1, 3, 5])
     every = whole.read(range(7))["rgb"]
@@ -158,7 +158,8 @@ def test_a_users_own_model_is_recalibrated_and_kept(
     out = tmp_path / "mine"
     fit_model(HOW, OWN, str(maps.path), str(out), {"max_epochs": 1, "batch_size": 2})
     assert (
-        "note: levels under 1 / 4 = 0.25 give the lowest λ" in capsys.readouterr().out
+        "note: quantiles at levels below 1 / 4 = 0.25 are the lowest λ"
+        in capsys.readouterr().out
     )
     model = load_model(f"{OWN}@{out}")
     assert isinstance(model, ConformalModel)
@@ -173,7 +174,7 @@ def test_a_users_own_model_is_recalibrated_and_kept(
     )
     check_model(f"{OWN}@{out}", shapes=((20, 37),))
     card = (out / "README.md").read_text()
-    assert "recalibrated by 3 maps" in card
+    assert "recalibrated on 3 maps" in card
     assert "ensemble" not in card
     assert json.loads((out / "config.json").read_text())["conformal"]["maps"] == 3
 

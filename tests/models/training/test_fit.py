@@ -205,7 +205,7 @@ def test_a_training_of_other_settings_is_not_gone_on_with(
     config = replace(SMALL, **other) if isinstance(other, dict) else SMALL
     options = FitOptions(device="cpu", folder=cut, resume=True, trainer=EXACT)
     name = next(iter(other)) if isinstance(other, dict) else other
-    with pytest.raises(CheckpointError, match=f"to resume it, got another `{name}"):
+    with pytest.raises(CheckpointError, match=f"for --resume, got another `{name}"):
         fit_network(
             trainable(config),
             dataset,
@@ -233,7 +233,7 @@ def test_a_training_is_not_gone_on_with_under_other_settings_of_the_trainer(
     )
     for name, value in OTHER_TRAINERS.items():
         with pytest.raises(
-            CheckpointError, match=rf"got another `trainer\.{name}`\. Repeat"
+            CheckpointError, match=rf"got another `trainer\.{name}`\. Use the same"
         ):
             train(dataset, cut, resume=True, **{name: value})
     assert (
@@ -269,7 +269,7 @@ def test_settings_of_the_trainer_that_change_nothing_are_neither_kept_nor_compar
         ({"limit_val_batches": 0.5}, "trainer.limit_val_batches"),
         ({"limit_train_batches": 0}, "trainer.limit_train_batches"),
         ({"check_val_every_n_epoch": 9}, "trainer.check_val_every_n_epoch"),
-        ({"gradient_clip_val": "many"}, "Lightning takes"),
+        ({"gradient_clip_val": "many"}, "Lightning accepts"),
     ],
 )
 def test_a_trainer_that_would_learn_or_measure_nothing_is_refused_first(
@@ -414,7 +414,7 @@ def test_settings_reach_the_trainer(dataset: TerrainDataset) -> None:
         max_epochs=1,
     )
     assert seen == [(1, 2)]
-    with pytest.raises(ConfigError, match="Lightning takes"):
+    with pytest.raises(ConfigError, match="Lightning accepts"):
         fit(
             model,
             "x",

@@ -79,7 +79,7 @@ class Plain(TraversabilityDistribution):
 
 BROKEN = {
     "shape": ("return (scores * seen).sum() / seen.sum().clamp(min=1)", "return scores",
-        "a loss that is one number, got shape"),
+        "a loss that is a scalar, got shape"),
     "nan": ("(scores * seen).sum()", "(scores * seen).sum() * float('nan')", "a finite loss, got nan"),
     "no gradient": ("(scores * seen).sum() /", "(scores * seen).sum().detach() /", "that has a gradient"),
     "no number": ("return crps", "return lambda outputs, observed: 3.0", "one number, got float"),
@@ -87,12 +87,12 @@ BROKEN = {
                      "to give a TraversabilityDistribution, got Tensor"),
     "distribution's shape": ("TraversabilityMixture(torch.ones_like(mean), mean, std)",
                              "TraversabilityMixture(*(v[..., 1:] for v in (torch.ones_like(mean), mean, std)))",
-                             r"to give one of shape \[2, 32, 32\], got \[2, 32, 31\]"),
+                             r"to return a distribution of shape \[2, 32, 32\], got \[2, 32, 31\]"),
     "means": ("mean, std)\n\n", "mean, std * torch.nan)\n\n", r"means of λ in \[0, 1\]"),
     "quantiles": ("return TraversabilityMixture(torch.ones_like(mean), mean, std)", "return Own(mean[:, 0], std[:, 0])",
-                  "one whose `quantile` ascends"),
+                  "a distribution whose `quantile` ascends"),
     "falling cdf": ("return TraversabilityMixture(torch.ones_like(mean), mean, std)",
-                    "return Own(mean[:, 0], std[:, 0], falls=True)", "one whose `cdf` ascends to 1"),
+                    "return Own(mean[:, 0], std[:, 0], falls=True)", "a distribution whose `cdf` ascends"),
     "no dataclass": ("return TraversabilityMixture(torch.ones_like(mean), mean, std)", "return Plain(mean[:, 0])",
                      "a frozen dataclass of maps, got Plain"),
     "raises": ("hidden = self.config.hidden", "hidden = self.config.width",
@@ -136,11 +136,11 @@ def test_a_hook_that_does_not_fit_is_refused_before_anything_is_trained(
 HOOKS = {
     "no metric": (
         "def configure_metrics(self): return {'mae': 3}",
-        "Expected a network that takes batches",
+        "Expected a network that accepts batches",
     ),
     "metrics": (
         "def update_metrics(self, outputs, target): self.metrics['rmse'].update(target, 3)",
-        "Expected a network that takes batches",
+        "Expected a network that accepts batches",
     ),
     "schedule": (
         "def configure_schedule(self, optimizer, steps): return 1 / 0",
@@ -148,7 +148,7 @@ HOOKS = {
     ),
     "predict": (
         "def predict(self, observation): return super().predict(observation).mean()",
-        "Expected the model to give a TraversabilityDistribution .* got Tensor",
+        "Expected the model to return a TraversabilityDistribution .* got Tensor",
     ),
     "predict raises": (
         "def predict(self, observation): return 1 / 0",
@@ -205,7 +205,7 @@ def test_settings_that_no_checkpoint_could_keep_are_refused(
         )
         == 2
     )
-    assert "settings that JSON can store" in capfd.readouterr().err
+    assert "`inputs` and settings of" in capfd.readouterr().err
     assert not Path("c.training").exists()
 
 
@@ -248,7 +248,7 @@ def test_a_class_of_a_name_that_is_ours_is_refused(
         ),
         (
             ["own.py:CellModel", "--settings.inputs", "[]"],
-            "`inputs` as layers, each once",
+            "`inputs` of at least one layer, each named once",
         ),
         (["own.py:CellModel", "--settings.width", "3"], "got 'width'"),
         (["own.py:CellModel", "--crop", "33"], r"`crop` in 8–32 cells"),

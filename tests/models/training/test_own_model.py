@@ -80,8 +80,8 @@ def test_it_is_trained_calibrated_and_kept_as_data(
     assert "| inputs | ['rgb', 'slope_deg', 'elevation_m'] |" in card
     assert "SHA-256 of its code was" in card
     assert "Loading runs that file." in card
-    assert "It is an ensemble: what its 2 networks predict is averaged" in card
-    assert ("widened by the temperature" in card) == (kept.pool_temperature != 1)
+    assert "It is an ensemble: the predictions of its 2 networks are averaged" in card
+    assert ("calibrated by the temperature" in card) == (kept.pool_temperature != 1)
 
 
 def test_layers_are_scaled_by_the_training_maps(
@@ -277,7 +277,8 @@ def test_a_checkpoint_of_a_users_class_needs_the_class(trained: Path) -> None:
         EXAMPLE.read_text().replace("class CellModel", "class Other")
     )
     with pytest.raises(
-        CheckpointError, match=r"of the class Other, got .* which is one of 'CellModel'"
+        CheckpointError,
+        match=r"of the class Other, got .* which is of the class 'CellModel'",
     ):
         load_model(f"{trained / 'other.py'}:Other@{trained / 'c'}")
     with pytest.raises(
@@ -423,7 +424,10 @@ def test_a_loss_that_is_no_number_ends_training_and_says_the_epoch(
         )
         for words in ((), ("--resume",)):
             assert call("train", *command, *words) == 1
-            assert f"{name} became nan in epoch 2." in capsys.readouterr().err
+            assert (
+                f"Expected a finite {name}, got nan in epoch 2,"
+                in capsys.readouterr().err
+            )
             assert not Path(name).exists()
         table = pd.read_csv(f"{name}.training/CellModel/metrics.csv")
         assert table["epoch"].tolist() == [1, 2]

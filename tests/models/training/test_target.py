@@ -121,10 +121,10 @@ def test_resuming_keeps_parts_of_the_same_settings_seed_and_maps(
     assert not state.exists()
     assert not target.has_part("classifier", NetConfig(), 0)
     for config, seed in ((Config(width=4), 0), (Config(), 1)):
-        with pytest.raises(CheckpointError, match="Repeat its settings"):
+        with pytest.raises(CheckpointError, match="Use its settings again"):
             target.has_part("gp", config, seed)
     target.digest = "other"
-    with pytest.raises(CheckpointError, match="Repeat its settings"):
+    with pytest.raises(CheckpointError, match="Use its settings again"):
         target.has_part("gp", Config(), 0)
 
 
@@ -154,14 +154,18 @@ def test_a_network_is_kept_if_the_trainer_and_the_precision_are_the_same(
     # of an earlier version
     assert holds(replace(kept, trainer=None), gradient_clip_val=3)
     with pytest.raises(
-        CheckpointError, match=r"another `trainer\.gradient_clip_val`\. Repeat"
+        CheckpointError,
+        match=r"another `trainer\.gradient_clip_val`\. Use its settings",
     ):
         holds(kept, gradient_clip_val=0.6)
     with pytest.raises(
-        CheckpointError, match=r"another `trainer\.limit_train_batches`\. Repeat"
+        CheckpointError,
+        match=r"another `trainer\.limit_train_batches`\. Use its settings",
     ):
         holds(kept, limit_train_batches=2)
-    with pytest.raises(CheckpointError, match=r"another `half_precision`\. Repeat"):
+    with pytest.raises(
+        CheckpointError, match=r"another `half_precision`\. Use its settings"
+    ):
         holds(kept, half_precision=False)
     # processes, which no such trainer trains
     assert holds(kept, False, Config, gradient_clip_val=0.6)
@@ -243,7 +247,7 @@ def test_a_part_of_an_earlier_version_has_the_defaults_of_settings_that_came_lat
     target = Target(tmp_path / "mine", shipped, classifier.data_digest, FitOptions())
     assert "encoder_depth" not in classifier.config
     assert target.has_part("classifier", ClassifierConfig(), 0)
-    with pytest.raises(CheckpointError, match="got others"):
+    with pytest.raises(CheckpointError, match="got one that does not"):
         target.has_part("classifier", ClassifierConfig(encoder_depth=3), 0)
 
 

@@ -20,7 +20,7 @@ from benchnav.models.config import JoinedConfig
 from benchnav.models.zoo.evidential import EvidentialConfig, evidential_loss
 from benchnav.models.zoo.mc_dropout import DropoutConfig
 from benchnav.models.zoo.mean_variance import MeanVarianceConfig, beta_nll
-from benchnav.models.zoo.quantile import INNER, QuantileModel, pinball
+from benchnav.models.zoo.quantile import INNER_LEVELS, QuantileModel, pinball
 from benchnav.models.zoo.swag import SWAGConfig
 from tests.factories import normal
 from tests.models.zoo.support import make
@@ -118,16 +118,18 @@ def test_the_pinball_loss_by_its_definition(
 
 def test_the_pinball_loss_is_least_at_the_quantiles() -> None:
     drawn = np.random.default_rng(0).beta(2, 5, 20_001)
-    right = torch.from_numpy(np.quantile(drawn, INNER)).float().view(1, -1, 1, 1)
+    right = torch.from_numpy(np.quantile(drawn, INNER_LEVELS)).float().view(1, -1, 1, 1)
     observed = torch.from_numpy(drawn).float().view(1, 1, -1)
 
     def loss(quantiles: Tensor) -> float:
         return float(
-            pinball(quantiles.expand(-1, -1, -1, observed.shape[-1]), INNER, observed)
+            pinball(
+                quantiles.expand(-1, -1, -1, observed.shape[-1]), INNER_LEVELS, observed
+            )
         )
 
     least = loss(right)
-    for place in (0, 20, 35, len(INNER) - 1):
+    for place in (0, 20, 35, len(INNER_LEVELS) - 1):
         for off in (-0.02, 0.02):
             other = right.clone()
             other[:, place] += off
@@ -139,10 +141,10 @@ def test_the_pinball_loss_is_least_at_the_quantiles() -> None:
 def test_quantiles_never_cross_and_stay_in_range(seed: int, spread: float) -> None:
     network = untrained()
     numbers = spread * torch.randn(
-        1, len(INNER), 2, 2, generator=torch.Generator().manual_seed(seed)
+        1, len(INNER_LEVELS), 2, 2, generator=torch.Generator().manual_seed(seed)
     )
     found = network.to_distribution(network.to_outputs(numbers))
-    assert found.levels[2:-2] == INNER == LEVELS[1:-1]
+    assert found.levels[2:-2] == INNER_LEVELS == LEVELS[1:-1]
     assert bool((found.values.diff(dim=1) >= 0).all())
     assert bool(((found.values >= 0) & (found.values <= 1)).all())
 
@@ -209,7 +211,7 @@ def test_the_temperature_moves_quantiles_as_normal_scores() -> None:
 
 def test_no_observation_is_impossible() -> None:
     network = make("quantile")
-    found = network.to_distribution(torch.full((1, len(INNER), 1, 1), 0.5))
+    found = network.to_distribution(torch.full((1, len(INNER_LEVELS), 1, 1), 0.5))
     below, at = found.cdf_limits(1.0)
     assert float(at - below) == pytest.approx(0.0025)
     assert float(found.cdf(0.0)) == pytest.approx(0.0005)

@@ -52,7 +52,7 @@ def test_moments_are_those_of_the_last_steps(trained: Any) -> None:
         seen = np.stack(
             [weights[name].double().numpy() for weights in Watched.weights[-6:]]
         )
-        place = model.names.index(name)
+        place = model.weight_names.index(name)
         np.testing.assert_allclose(
             model.get_buffer(f"mean_{place}"), seen.mean(0), rtol=1e-4, atol=1e-6
         )
@@ -142,7 +142,7 @@ def test_a_prediction_is_the_average_of_plain_networks_of_the_drawn_weights(
 
 def test_draws_are_normal_about_the_mean_and_of_the_seed(trained: Any) -> None:
     model, _ = trained
-    place = model.names.index("network.head.1.weight")
+    place = model.weight_names.index("network.head.1.weight")
     mean, std = model.get_buffer(f"mean_{place}"), model.get_buffer(f"std_{place}")
     drawn = torch.stack(
         [model.draw(index)["network.head.1.weight"] for index in range(3)]
@@ -170,7 +170,7 @@ def test_weights_that_are_kept_in_half_precision_keep_their_deviations(
     layers = {"rgb": seen.rgb, "slope_deg": seen.slope_deg}
     first, second = whole.predict_raw(layers), half.predict_raw(layers)
     torch.testing.assert_close(first.means, second.means, rtol=0.02, atol=0.02)
-    place = whole.names.index("joint.0.weight")
+    place = whole.weight_names.index("joint.0.weight")
     torch.testing.assert_close(
         whole.get_buffer(f"std_{place}"),
         half.get_buffer(f"std_{place}"),

@@ -1,4 +1,4 @@
-"""Models of a comparison: the requested and the privileged ones, and their costs."""
+"""Models of a comparison, requested and privileged, and their costs."""
 
 import statistics
 import time
@@ -12,7 +12,10 @@ import torch
 from benchnav.core.errors import BenchnavError, ConfigError, expect
 from benchnav.core.terrain import Terrain
 from benchnav.models.base import PrivilegedModel, TraversabilityModel, predict
-from benchnav.models.checkpoint_folders import find_checkpoint, split_own
+from benchnav.models.checkpoint_folders import (
+    find_checkpoint,
+    split_class_and_checkpoint,
+)
 from benchnav.models.predictor import (
     Ideal,
     Oracle,
@@ -21,10 +24,11 @@ from benchnav.models.predictor import (
     trained_on,
 )
 
-# Added to every comparison if the truth is available; the better informed model first.
+# Models that are added to each comparison if the truth is available; the one that
+# receives more of the truth is first.
 PRIVILEGED = ("oracle", "ideal")
 _N_REPETITIONS = 15
-_MAX_TIMING_MS = 5000.0
+_MAX_TIMING_MS = 5000.0  # total time after which no prediction is repeated
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,19 +49,19 @@ class Candidate:
 
     @property
     def privileged(self) -> bool:
-        """Whether it is a reference that receives part of the truth, out of competition."""
+        """Whether the model receives part of the truth, so that it does not compete."""
         return isinstance(self.model, PrivilegedModel)
 
     @property
     def needs_truth(self) -> bool:
-        """Whether it predicts by the class table, which fits generated terrain only."""
+        """Whether the model predicts from the class table, valid only on generated maps."""
         return isinstance(self.model, Oracle | Ideal)
 
 
 def load_candidate(
     source: str, label: str, model: TraversabilityModel | None = None
 ) -> Candidate:
-    """Return a model as a candidate; if not given, it is loaded from its source."""
+    """Return a candidate; if `model` is None, load it from its source."""
     return Candidate(
         label=label,
         source=source,
@@ -67,7 +71,7 @@ def load_candidate(
 
 
 def find_candidates(sources: Sequence[str]) -> list[Candidate]:
-    """Load the models to compare: those requested in order, then the privileged ones.
+    """Load the models to compare: the requested models in order, then privileged models.
 
     Args:
         sources: arguments of `load_model`, at least one.
@@ -79,7 +83,7 @@ def find_candidates(sources: Sequence[str]) -> list[Candidate]:
     """
     expect(
         len(sources) > 0,
-        "one model or more to compare, got none. Name checkpoints or models.",
+        "at least one model to compare, got none. Give checkpoints or names of models.",
     )
     by_location: dict[str, list[str]] = {}
     for source in sources:
@@ -89,7 +93,8 @@ def find_candidates(sources: Sequence[str]) -> list[Candidate]:
         if len(same) > 1:
             listed = " and ".join(same)
             raise ConfigError(
-                f"Expected models that differ, got {listed}. Name each model once."
+                f"Expected models that differ, got {listed}, which are the same. Give "
+                "each model once."
             )
     models = {source: load_model(source) for source in sources}
     for name in PRIVILEGED:
@@ -112,7 +117,7 @@ def _folder(source: str) -> Path | None:
 
 
 def _labels(sources: Sequence[str]) -> dict[str, str]:
-    """Return short names of models, or the whole source if short names coincide."""
+    """Return short names of models, or their sources if short names are equal."""
     short = {source: _short_name(source) for source in sources}
     counts = Counter(short.values())
     labels = {}
@@ -124,7 +129,7 @@ def _labels(sources: Sequence[str]) -> dict[str, str]:
 
 def _short_name(source: str) -> str:
     """Return the name of a checkpoint's folder, or of the class in a module or file."""
-    part_and_checkpoint = split_own(source)
+    part_and_checkpoint = split_class_and_checkpoint(source)
     if part_and_checkpoint:
         return Path(part_and_checkpoint[1]).name
     module, _, name = source.rpartition(":")
@@ -135,7 +140,7 @@ def _short_name(source: str) -> str:
 
 
 def count_parameters(model: TraversabilityModel) -> int | None:
-    """Return the number of weights in a model's networks; None without networks."""
+    """Return the number of weights in a model's networks; None if it has no network."""
     networks = list(networks_of(model))
     sizes: dict[int, int] = {}
     for network in networks:
@@ -147,7 +152,7 @@ def count_parameters(model: TraversabilityModel) -> int | None:
 def prediction_ms(model: TraversabilityModel, terrain: Terrain) -> float:
     """Return the median time of a prediction in milliseconds.
 
-    The median is over 15 repetitions after a warm-up, or fewer if they exceed 5 s.
+    The median is over 15 repetitions after a warm-up, or fewer if all take more than 5 s.
 
     Args:
         model: any model.

@@ -40,15 +40,12 @@ _GREYS = ("0.35", "0.6")
 _MARK_HEIGHT_IN = 0.075
 _MIN_ROW_HEIGHT_IN = 0.16
 _BY_SEVERITY = ("crps", "pinball")
-_MARKED_EVERY = 4
+_MARKED_EVERY = 4  # number of points per marker
 _ARROWS = {"higher": " ↑", "lower": " ↓", "": ""}
 
 
 def model_looks(models: Sequence[str], privileged: Sequence[str]) -> Looks:
-    """Return the line style of each model, as keywords of `Axes.plot`.
-
-    Privileged models are grey.
-    """
+    """Return the line style of each model, as keywords of `Axes.plot`."""
     competing = [model for model in models if model not in privileged]
     looks = line_looks(competing)
     for index, model in enumerate(privileged):
@@ -60,13 +57,13 @@ def model_looks(models: Sequence[str], privileged: Sequence[str]) -> Looks:
     return {model: {**looks[model], "ms": 3, "lw": 1} for model in models}
 
 
-def _draw_tallies(
+def _split_panels(
     data: Comparison,
 ) -> tuple[Drawing, list[tuple[Axes, str, MapTally, Mapping[str, Any]]]]:
-    """Create a panel per split.
+    """Create a figure with one panel per split, for one line per model in each panel.
 
     Returns:
-        The figure; and panel, model, tally and style of each line.
+        The figure; and the panel, model, tally and style of each line to draw.
     """
     splits = list(dict.fromkeys(split for split, _ in data.tallies))
     width = page_width(len(splits), 3)
@@ -144,13 +141,13 @@ class _Calibration(Figure):
     name = "calibration"
     title = "Calibration of the predicted distributions of λ"
     text = (
-        "Fraction of observed λ below a predicted quantile, minus the level of the "
-        "quantile, over that level. 0 is calibrated. Above 0 at the left: low λ is "
-        "more frequent than predicted."
+        "Vertical: fraction of observed λ below a predicted quantile, minus the level "
+        "of the quantile. Horizontal: the level. 0 is calibrated. Above 0 at the left: "
+        "low λ is more frequent than predicted."
     )
 
     def draw(self, data: Comparison) -> Drawing:
-        figure, lines = _draw_tallies(data)
+        figure, lines = _split_panels(data)
         for panel in figure.axes:
             panel.axhline(0, color="0.4", lw=0.8, label="calibrated")
         for panel, model, tally, look in lines:
@@ -169,25 +166,25 @@ class _Sparsification(Figure):
     name = "sparsification"
     title = "Sparsification: uncertainty against error"
     text = (
-        "Mean error |λ − E[λ]| of the remaining cells over the fraction of cells "
-        "removed: the most uncertain first (lines), or those with the largest error "
-        "first (dotted). The area between the two is AUSE."
+        "Vertical: mean error |λ − E[λ]| of the remaining cells. Horizontal: fraction "
+        "of cells removed, the most uncertain cells first (lines) or the cells with the "
+        "largest error first (dotted). The area between both lines is AUSE."
     )
 
     def draw(self, data: Comparison) -> Drawing:
-        figure, lines = _draw_tallies(data)
+        figure, lines = _split_panels(data)
         for panel, model, tally, look in lines:
             removed, by_width, by_error = tally.curves()
             panel.plot(
                 removed, by_width, label=model, markevery=2 * _MARKED_EVERY, **look
             )
             panel.plot(removed, by_error, color=look["color"], lw=0.8, ls=":")
-        panel.set_ylim(bottom=0)  # of all panels, whose axes are linked
+        panel.set_ylim(bottom=0)  # applies to all panels, whose axes are linked
         figure.supxlabel(
             "fraction of cells removed, those with the widest intervals first"
         )
         figure.supylabel("mean |E[λ] − λ| of remaining cells", fontsize=TITLE)
-        label = "largest errors first, the best order"
+        label = "largest errors first (best possible order)"
         best = Line2D([], [], color="0.4", lw=0.8, ls=":", label=label)
         legend_outside(figure, [best], 5, side="upper center")
         return figure
@@ -198,8 +195,8 @@ class _Severity(Figure):
     title = "Quality over the severity of a shift"
     text = (
         "CRPS and pinball loss of the lower fifth over the severity of each scenario: "
-        "0 is the training maps, 1 the scenario itself. Lines are 95 % intervals over "
-        "maps."
+        "0 is the training maps, 1 the scenario itself. Vertical lines are 95 % "
+        "intervals over maps."
     )
 
     def needs(self, data: Comparison) -> bool:
@@ -230,7 +227,7 @@ class _Severity(Figure):
 
 
 def comparison_figures(comparison: Comparison) -> list[Figure]:
-    """List the figures of a comparison that apply."""
+    """Return the figures that apply to a comparison."""
     figures = (_Measures(), _Calibration(), _Sparsification(), _Severity())
     return applicable(figures, comparison)
 

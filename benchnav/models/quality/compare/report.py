@@ -30,7 +30,7 @@ from benchnav.stats.tables import (
 COSTS = {
     "prediction_ms": (
         "ms a\nmap",
-        "median time of predicting one map, in milliseconds.",
+        "median time to predict one map, in milliseconds.",
     ),
     "parameters": ("parameters\n", "number of weights of all networks of the model."),
 }
@@ -44,12 +44,13 @@ class Comparison:
     """Measurements of several models.
 
     Args:
-        models: information by label, such as `source`, `privileged`, `parameters`,
-            `prediction_ms`; competing models first.
-        summary: a row per split and model, with `split`, `model` and the columns of
-            `scores.summarise`.
-        pairs: `split` and the columns of `scores.compare_pairs`, for all splits.
-        best: `split`, `model` and the columns of `scores.against_best`, for all splits.
+        models: information on each model by label, such as `source`, `privileged`,
+            `parameters` and `prediction_ms`; competing models first.
+        summary: table with a row per split and model: `split`, `model` and the columns
+            of `scores.summarise`.
+        pairs: table of all splits: `split` and the columns of `scores.compare_pairs`.
+        best: table of all splits: `split`, `model` and the columns of
+            `scores.against_best`.
         tallies: sums over maps, by split and model.
     """
 
@@ -115,8 +116,8 @@ def comparison_table(
     Args:
         title: title of the table.
         comparison: measurements of the models.
-        all_columns: whether to include both errors of E[λ]; otherwise the error
-            relative to observed λ is shown only if the other is missing.
+        all_columns: whether to show both errors of E[λ]; if false, the error relative to
+            observed λ is shown only if the error relative to the true mean is missing.
     """
     numbers = comparison.numbers
     hidden = {score.name for score in TAIL_RATES}
@@ -148,9 +149,9 @@ def comparison_table(
         cell = partial(_cell, name, marked)
         columns.append(Column(heading, cell, meaning))
     note = (
-        "best of its split by this measure, and all without a significant difference "
-        f"from it (permutation test by map, Holm, p ≥ {ALPHA}). Privileged models (†) "
-        "do not compete."
+        "best model of its split by this measure, and all models that do not differ "
+        f"significantly from it (permutation test by map, Holm, p ≥ {ALPHA}). "
+        "Privileged models (†) do not compete."
     )
     return table_of(
         numbers.to_dict("records"),
@@ -183,7 +184,7 @@ def _cell(name: str, marked: set[tuple[str, str, str]], row: Row) -> str:
 
 
 def difference_table(comparison: Comparison) -> Table:
-    """Return differences to the best, a row per split, measure and competing model."""
+    """Return differences to the best, one row per split, measure and competing model."""
     rows = comparison.best[comparison.best["difference"].notna()]
 
     def p_cell(row: Row) -> str:
@@ -197,8 +198,8 @@ def difference_table(comparison: Comparison) -> Table:
         Column(
             "difference",
             lambda row: signed(row["difference"], 4),
-            "the model minus the best, by this measure; for “in 90 %” the difference "
-            "of the distances from 0.9.",
+            "measure of the model minus that of the best model; for “in 90 %”, the "
+            "difference between their distances from 0.9.",
         ),
         Column(
             "95 % interval",
@@ -212,7 +213,7 @@ def difference_table(comparison: Comparison) -> Table:
             "all pairs of competing models, within measure and split (Holm).",
         ),
     ]
-    note = "" if rows["alike"].all() else f"p under {ALPHA}."
+    note = "" if rows["alike"].all() else f"p < {ALPHA}."
     return table_of(
         rows.to_dict("records"),
         columns,
@@ -243,7 +244,7 @@ def comparison_json(header: Mapping[str, Any], comparison: Comparison) -> str:
 
 
 def comparison_csv(comparison: Comparison) -> str:
-    """Return the numbers as CSV, a row per split and model, with their intervals."""
+    """Return the numbers and their intervals as CSV, one row per split and model."""
     numbers = comparison.numbers
     columns = ["split", "model", "privileged", "units"]
     for score in COMPARED:

@@ -45,7 +45,7 @@ def test_one_model_under_two_names_is_refused(
         find_candidates([str(checkpoint_path), "tiny"])
     with pytest.raises(ConfigError, match="colours and colours"):
         find_candidates(["colours", "colours"])
-    with pytest.raises(ConfigError, match="one model or more"):
+    with pytest.raises(ConfigError, match="at least one model to compare"):
         find_candidates([])
     copy = shutil.copytree(checkpoint_path, tmp_path / "other" / "tiny")
     found = find_candidates([str(checkpoint_path), str(copy)])

@@ -78,7 +78,7 @@ def test_a_table_is_printed_and_nothing_written(
         ):
             assert f"{value:.4f}" in [cell.rstrip("*") for cell in row]
     assert err.splitlines()[-1] == "models and splits: 8/8"
-    assert "no difference can be significant with so few maps: test/std, test/hs" in out
+    assert "too few maps for any difference to be significant: test/std, test/hs" in out
     assert "statistical units: test/std 2 maps, test/hs 2 maps" in out
     assert "with 1 thread" in out or "threads" in out
     assert list(tmp_path.iterdir()) == []
@@ -299,7 +299,8 @@ def test_a_model_of_other_classes_is_compared_by_traversability_and_said_to_be(
     )
     out = capfd.readouterr().out
     assert (
-        "foreign is compared by λ only: its classes are not those of these maps" in out
+        "foreign is compared only by λ, since its classes differ from those of the maps"
+        in out
     )
     first, second = (
         line.split()
@@ -333,7 +334,10 @@ def test_where_the_truth_is_unknown_no_model_is_given_the_class_table_for_it(
         ["valid", "colours"],
         *(["test/std", name] for name in ("colours", "oracle", "ideal")),
     ]
-    assert "oracle and ideal are left out on valid: the truth is unknown there" in out
+    assert (
+        "oracle and ideal are left out on valid, where the true distribution is unknown"
+        in out
+    )
     assert (
         "RMSE λ" in " ".join(out.split())
         or "unknown on valid: RMSE E[λ] is a dash" in out
@@ -380,10 +384,10 @@ def test_a_model_that_is_worse_than_none_is_told_so(
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        ([], "one model or more"),
+        ([], "at least one model"),
         (["colours", "colours"], "models that differ"),
         (["colour"], "Did you mean 'colours'"),
-        (["colours", "--out", "folder"], "is something else than a comparison"),
+        (["colours", "--out", "folder"], "is not a comparison"),
     ],
 )
 def test_bad_input_is_refused_in_one_line_before_any_work(

@@ -128,7 +128,7 @@ def test_sparsification_shows_both_rankings_of_every_split(tallies: Tallies) -> 
         assert low == 0
         assert high > max(float(np.max(line.get_ydata())) for line in axes.lines)  # type: ignore[arg-type]
     names = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert names == [*MODELS, "largest errors first, the best order"]
+    assert names == [*MODELS, "largest errors first (best possible order)"]
     assert (
         axes.lines[1].get_linestyle()
         == figure.legends[0].get_lines()[-1].get_linestyle()
