@@ -117,7 +117,7 @@ class Experience:
         """Update the knowledge of the episodes that are due, bool, shape [B]."""
         learner = self._learner
         now = self._current()
-        needs_prediction = now.has_news & due
+        needs_prediction = now.has_new_appearance & due
         if bool(needs_prediction.any()):
             # Only some episodes are updated: a prediction costs more than selecting.
             members = needs_prediction.nonzero()[:, 0]
@@ -126,14 +126,18 @@ class Experience:
             now = learner.put(now, members, updated)
         needs_update = (due & ~needs_prediction)[:, None, None]
         sensed = now.sensed
-        news = now.has_news
+        news = now.has_new_appearance
         has_measurements = sensed.mask & needs_update
         if bool(has_measurements.any()):
             # The whole batch is updated: selecting costs more than the update.
             no_news = torch.zeros_like(news)
-            now = replace(now, sensed=_only(sensed, needs_update), has_news=no_news)
+            now = replace(
+                now, sensed=_only(sensed, needs_update), has_new_appearance=no_news
+            )
             now, _ = learner.update(now, truth)
-            now = replace(now, sensed=_only(sensed, ~needs_update), has_news=news)
+            now = replace(
+                now, sensed=_only(sensed, ~needs_update), has_new_appearance=news
+            )
         self._knowledge = now
 
     def _cached_start(

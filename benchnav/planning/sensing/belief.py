@@ -179,7 +179,7 @@ class Fields:
 
     belief: Belief[Any]
     state: Any
-    names: tuple[int, ...]
+    indices: tuple[int, ...]
 
     def sample(self, count: int, key: int, cells: Tensor | None = None) -> Tensor:
         """Draw `count` fields of each episode, shape [B, M, H, W].
@@ -189,7 +189,7 @@ class Fields:
             key: root key of the random streams; see `Problem.sample_fields`.
             cells: mask of the requested cells, bool, shape [B, H, W]; None for all.
         """
-        keys = [rng.stream_key(key, "fields", name) for name in self.names]
+        keys = [rng.stream_key(key, "fields", index) for index in self.indices]
         if cells is None:
             return self.belief.sample_fields(self.state, count, keys)
         return self.belief.sample_cells(self.state, count, keys, cells)
@@ -197,8 +197,8 @@ class Fields:
     def select(self, members: Tensor) -> "Fields":
         """Return some episodes, by index, int64."""
         state = self.belief.select(self.state, members)
-        names = tuple(self.names[index] for index in members.tolist())
-        return Fields(self.belief, state, names)
+        indices = tuple(self.indices[index] for index in members.tolist())
+        return Fields(self.belief, state, indices)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -223,19 +223,19 @@ class Predicted(Batch):
             scores: normal scores, shape [B, M, H, W].
             cells: mask of the requested cells, bool, shape [B, H, W]; None for all.
         """
-        if self._rows is None:
+        if self._score_rows is None:
             return fields_of(self.prior, scores)
-        scores = scores.to(self._rows)
+        scores = scores.to(self._score_rows)
         fields = torch.zeros_like(scores)
-        for member, rows in enumerate(self._rows):
-            mask: Any = ... if cells is None else cells[member]
-            cell_scores = scores[member][:, mask].movedim(0, -1)
+        for episode, rows in enumerate(self._score_rows):
+            mask: Any = ... if cells is None else cells[episode]
+            cell_scores = scores[episode][:, mask].movedim(0, -1)
             cell_values = value_at(rows[mask], cell_scores)
-            fields[member][:, mask] = cell_values.movedim(-1, 0)
+            fields[episode][:, mask] = cell_values.movedim(-1, 0)
         return fields.to(self.prior.dtype)
 
     @cached_property
-    def _rows(self) -> Tensor | None:
+    def _score_rows(self) -> Tensor | None:
         """Scores of the table's values in each cell, float32, shape [B, H, W, K].
 
         None if quantiles of the prediction are fast.
@@ -317,24 +317,26 @@ def draw_scores(covariance: CovarianceModel, count: int, keys: Sequence[int]) ->
         keys: a stream key for each of B episodes.
     """
     # One episode at a time: the last bits of a product depend on the size of the batch.
-    return torch.stack([_scores_of_one(covariance, count, key) for key in keys])
+    return torch.stack([_scores_of_episode(covariance, count, key) for key in keys])
 
 
-def _scores_of_one(covariance: CovarianceModel, count: int, key: int) -> Tensor:
+def _scores_of_episode(covariance: CovarianceModel, count: int, key: int) -> Tensor:
     """Return the scores of an episode, shape [M, H, W]."""
     shape = covariance.grid.shape
-    scores = _white(key, count, shape)
+    scores = _white_noise(key, count, shape)
     if covariance.correlation_m:
-        down, across = (_root(size, covariance.correlation_cells) for size in shape)
-        scores = down @ scores @ across
+        row_root, column_root = (
+            _correlation_root(size, covariance.correlation_cells) for size in shape
+        )
+        scores = row_root @ scores @ column_root
     nugget = covariance.nugget
     if nugget:
-        independent = _white(rng.stream_key(key, "nugget"), count, shape)
-        scores = math.sqrt(1 - nugget) * scores + math.sqrt(nugget) * independent
+        nugget_noise = _white_noise(rng.stream_key(key, "nugget"), count, shape)
+        scores = math.sqrt(1 - nugget) * scores + math.sqrt(nugget) * nugget_noise
     return scores
 
 
-def _white(key: int, count: int, shape: tuple[int, int]) -> Tensor:
+def _white_noise(key: int, count: int, shape: tuple[int, int]) -> Tensor:
     """Return standard normals, float32, shape [M, H, W]."""
     n_numbers = count * math.prod(shape)
     # PyTorch draws numbers in blocks of sixteen, and any remainder by another method.
@@ -344,7 +346,7 @@ def _white(key: int, count: int, shape: tuple[int, int]) -> Tensor:
 
 
 @lru_cache(maxsize=64)
-def _root(size: int, correlation_cells: float) -> Tensor:
+def _correlation_root(size: int, correlation_cells: float) -> Tensor:
     """Return the symmetric root of the correlations along one axis.
 
     Float32, shape [size, size].

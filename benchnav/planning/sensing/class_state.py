@@ -35,7 +35,7 @@ class ClassesState(Batch):
             shape [B, 2, H, W].
         pair: index of the pair of each cell, from 1; 0 if the cell has no pair, int64,
             shape [B, H, W].
-        odds: predicted log odds of the first class, float64, shape [B, H, W].
+        log_odds: predicted log odds of the first class, float64, shape [B, H, W].
         p_first: posterior probability of the first class under even prior odds,
             float64, shape [B, H, W].
         labels: labels of the chains; a set bit is the first class, int64, shape
@@ -47,7 +47,7 @@ class ClassesState(Batch):
     per_class: tuple[CopulaState, CopulaState]
     density: Tensor
     pair: Tensor
-    odds: Tensor
+    log_odds: Tensor
     p_first: Tensor
     labels: Tensor
     sweeps: Tensor
@@ -57,8 +57,8 @@ class ClassesState(Batch):
 
         It is 1 for cells without a pair.
         """
-        log_odds = self.odds + torch.logit(self.p_first, eps=MIN_PROBABILITY)
-        return torch.where(self.pair > 0, torch.sigmoid(log_odds), 1.0)
+        posterior = self.log_odds + torch.logit(self.p_first, eps=MIN_PROBABILITY)
+        return torch.where(self.pair > 0, torch.sigmoid(posterior), 1.0)
 
 
 def log_density_ratio(given_class: CopulaState, cells: Tensor, value: Tensor) -> Tensor:
@@ -81,7 +81,9 @@ def log_density_ratio(given_class: CopulaState, cells: Tensor, value: Tensor) ->
     return torch.where(high > low, 0.0, log_prob + log_normal)
 
 
-def note(state: ClassesState, sensed: Measurement) -> tuple[ClassesState, Tensor]:
+def add_measurement(
+    state: ClassesState, sensed: Measurement
+) -> tuple[ClassesState, Tensor]:
     """Add a measurement to the observations under either class.
 
     Returns:
@@ -90,14 +92,14 @@ def note(state: ClassesState, sensed: Measurement) -> tuple[ClassesState, Tensor
     changed = torch.zeros_like(sensed.mask)
     per_class = []
     density = state.density.clone()
-    for part, given_class in enumerate(state.per_class):
-        noted, is_new = copula_state.note(given_class, sensed)
+    for class_index, given_class in enumerate(state.per_class):
+        with_measurement, is_new = copula_state.add_measurement(given_class, sensed)
         if bool(is_new.any()):
-            class_density = density[:, part]
+            class_density = density[:, class_index]
             class_density[is_new] = _new_density(
                 given_class, sensed, is_new, class_density[is_new]
             )
-        per_class.append(noted)
+        per_class.append(with_measurement)
         changed |= is_new
     first, second = per_class
     return replace(state, per_class=(first, second), density=density), changed
@@ -124,21 +126,21 @@ def _new_density(
     return torch.where(is_repeated, total, density)
 
 
-def moved_cells(before: ClassesState, after: ClassesState) -> Tensor:
+def rescored_cells(before: ClassesState, after: ClassesState) -> Tensor:
     """Return a mask of observed cells with other scores or another pair.
 
     Bool, shape [B, H, W].
     """
-    moved = before.pair != after.pair
+    is_rescored = before.pair != after.pair
     for old, new in zip(before.per_class, after.per_class, strict=True):
         for name in ("lower", "upper"):
             old_end = getattr(old, name)
             new_end = getattr(new, name)
             # Infinite ends may be equal, but their difference is NaN.
             is_close = (old_end - new_end).abs() <= _SAME_SCORE
-            moved |= ~((old_end == new_end) | is_close)
+            is_rescored |= ~((old_end == new_end) | is_close)
     observed = after.per_class[0].observed
-    return moved & observed & (after.pair > 0)
+    return is_rescored & observed & (after.pair > 0)
 
 
 def evidence_of(state: ClassesState) -> Evidence:
@@ -161,7 +163,7 @@ def evidence_of(state: ClassesState) -> Evidence:
     )
 
 
-def labelled(state: ClassesState) -> CopulaState:
+def scores_of_likelier_class(state: ClassesState) -> CopulaState:
     """Return the scores observed under the more probable class of each cell.
 
     Intervals that differ from before have no terms.
@@ -209,14 +211,14 @@ def moments_of(state: ClassesState) -> tuple[Tensor, Tensor, Tensor]:
     cavity_precision = (1 / variance - copula.precision[cells]).clamp(min=1)
     centre = (mean / variance - copula.shift[cells]) / cavity_precision
     cavity = 1 / cavity_precision
-    for part, given_class in enumerate(state.per_class):
+    for class_index, given_class in enumerate(state.per_class):
         new_mean, new_std = _moments_given(given_class, cells, centre, cavity)
         # The posterior already holds under the more probable class.
-        is_chosen = is_first == (part == 0)
+        is_chosen = is_first == (class_index == 0)
         new_skew = torch.zeros_like(new_std)
         updates = (means, new_mean), (stds, new_std), (skews, new_skew)
         for values, new_values in updates:
-            class_values = values[:, part]
+            class_values = values[:, class_index]
             old_values = class_values[cells]
             class_values[cells] = torch.where(is_chosen, old_values, new_values)
     return means, stds, skews

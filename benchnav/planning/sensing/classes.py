@@ -47,23 +47,23 @@ from benchnav.planning.sensing.chains import draw_labels
 from benchnav.planning.sensing.class_state import (
     MIN_PROBABILITY,
     ClassesState,
+    add_measurement,
     evidence_of,
-    labelled,
     log_density_ratio,
     moments_of,
-    moved_cells,
-    note,
+    rescored_cells,
+    scores_of_likelier_class,
 )
 from benchnav.planning.sensing.copula import Copula
 from benchnav.planning.sensing.labels import (
     CHAINS,
-    Lattice,
+    Couplings,
     count_bits,
-    fair,
-    noise,
+    fair_labels,
+    sweep_bits,
     sweep_labels,
 )
-from benchnav.planning.sensing.pairs import split, statistics_of
+from benchnav.planning.sensing.pairs import split_by_class, statistics_of
 from benchnav.planning.sensing.score_table import TabulatedDistribution
 from benchnav.planning.sensing.sensor import Measurement
 
@@ -71,7 +71,7 @@ _MAX_STRENGTH = 0.88  # ln(1 + √2) is critical
 _FIRST_SWEEPS = 40  # of cells without measurements, on whole maps
 _MORE_SWEEPS = 10  # of cells whose appearance is observed later
 _MIN_STD = 1e-9  # of a score, as a divisor
-_SAME_ODDS = 0.01  # maximum difference of log odds that counts as none
+_SAME_LOG_ODDS = 0.01  # maximum difference of log odds that counts as none
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ class Classes(Belief[ClassesState]):
             ConfigError: If the prediction has no classes, or the statistics do not list
                 the look-alike classes.
         """
-        first, second, pair, odds = split(prior, covariance)
+        first, second, pair, log_odds = split_by_class(prior, covariance)
         copula = self._copula.init(first, covariance)
         under_second = self._copula.init(second, covariance)
         zeros = torch.zeros_like(copula.mean)
@@ -129,9 +129,9 @@ class Classes(Belief[ClassesState]):
             per_class=(copula, under_second),
             density=density,
             pair=pair,
-            odds=odds,
+            log_odds=log_odds,
             p_first=zeros + 0.5,
-            labels=_fair(pair),
+            labels=_fair_labels_for(pair),
             sweeps=torch.zeros_like(pair[:, 0, 0]),
         )
         return self._sweep(state, pair > 0, _FIRST_SWEEPS)
@@ -149,40 +149,42 @@ class Classes(Belief[ClassesState]):
         one.
         """
         updated = state
-        renewed = torch.zeros_like(sensed.mask)
+        has_new_prediction = torch.zeros_like(sensed.mask)
         if prior is not None:
-            updated, renewed = self._with_prior(state, prior)
-        updated, changed = note(updated, sensed)
-        rescored = renewed & moved_cells(state, updated)
-        updated = self._draw_labels(updated, changed | rescored)
-        copula = labelled(updated)
+            updated, has_new_prediction = self._with_prior(state, prior)
+        updated, changed = add_measurement(updated, sensed)
+        is_rescored = has_new_prediction & rescored_cells(state, updated)
+        updated = self._draw_labels(updated, changed | is_rescored)
+        copula = scores_of_likelier_class(updated)
         other_lower = copula.lower != updated.copula.lower
         other_upper = copula.upper != updated.copula.upper
-        other_label = other_lower | other_upper
-        new = changed | (copula.observed & (renewed | other_label))
-        copula = self._copula.learn(copula, new)
+        is_relabelled = other_lower | other_upper
+        to_condition = changed | (
+            copula.observed & (has_new_prediction | is_relabelled)
+        )
+        copula = self._copula.learn(copula, to_condition)
         updated = replace(updated, copula=copula)
         # Rows of the tables for `at`.
         cells = self.changed(state, updated)
         first, second = updated.per_class
-        first_table = copula.table.having(first.prior, cells)
+        first_rows = copula.table.with_rows(first.prior, cells)
         paired_cells = cells & (updated.pair > 0)
-        second_table = second.table.having(second.prior, paired_cells)
-        copula = replace(copula, table=first_table)
-        second = replace(second, table=second_table)
+        second_rows = second.table.with_rows(second.prior, paired_cells)
+        copula = replace(copula, table=first_rows)
+        second = replace(second, table=second_rows)
         return replace(updated, copula=copula, per_class=(first, second))
 
-    def _draw_labels(self, state: ClassesState, new: Tensor) -> ClassesState:
+    def _draw_labels(self, state: ClassesState, changed: Tensor) -> ClassesState:
         """Return the state with labels drawn near new observations, bool, [B, H, W]."""
-        members = _members_with(new & (state.pair > 0))
-        if len(members) == 0:
+        episodes = _episodes_with(changed & (state.pair > 0))
+        if len(episodes) == 0:
             return state
         strength = self._strength(state.copula.covariance)
-        evidence = evidence_of(state).select(members)
-        drawn = draw_labels(evidence, new[members], strength, self.window)
-        p_first = state.p_first.index_copy(0, members, drawn.p_first)
-        labels = state.labels.index_copy(0, members, drawn.labels)
-        sweeps = state.sweeps.index_copy(0, members, drawn.sweeps)
+        evidence = evidence_of(state).select(episodes)
+        new_evidence = draw_labels(evidence, changed[episodes], strength, self.window)
+        p_first = state.p_first.index_copy(0, episodes, new_evidence.p_first)
+        labels = state.labels.index_copy(0, episodes, new_evidence.labels)
+        sweeps = state.sweeps.index_copy(0, episodes, new_evidence.sweeps)
         return replace(state, p_first=p_first, labels=labels, sweeps=sweeps)
 
     def distribution(self, state: ClassesState) -> TraversabilityDistribution:
@@ -194,13 +196,15 @@ class Classes(Belief[ClassesState]):
             return self._copula.distribution(state.copula)
         dtype = state.copula.prior.dtype
         moments = [values.to(dtype) for values in moments_of(state)]
-        parts = []
-        for part, given_class in enumerate(state.per_class):
-            mean, std, skew = (values[:, part] for values in moments)
-            parts.append(ConditionedDistribution(given_class.prior, mean, std, skew))
+        distributions = []
+        for class_index, given_class in enumerate(state.per_class):
+            mean, std, skew = (values[:, class_index] for values in moments)
+            distributions.append(
+                ConditionedDistribution(given_class.prior, mean, std, skew)
+            )
         p_first = state.probability()
         weights = torch.stack((p_first, 1 - p_first), 1).to(dtype)
-        return PooledDistribution(tuple(parts), weights)
+        return PooledDistribution(tuple(distributions), weights)
 
     def at(self, state: ClassesState, cells: Tensor) -> TabulatedDistribution:
         """Return the belief in some cells, from tables of scores.
@@ -216,9 +220,9 @@ class Classes(Belief[ClassesState]):
         moments = [values[cells] for values in by_class]
         tables = state.copula.table, state.per_class[1].table
         under_class = []
-        for part, given_class in enumerate(state.per_class):
-            table = tables[part].having(given_class.prior, cells)
-            mean, std, skew = (values[:, part] for values in moments)
+        for class_index, given_class in enumerate(state.per_class):
+            table = tables[class_index].with_rows(given_class.prior, cells)
+            mean, std, skew = (values[:, class_index] for values in moments)
             under_class.append(table.below(cells, mean, std, skew))
         under_first, under_second = under_class
         p_first = state.probability()[cells].to(under_first)
@@ -229,17 +233,17 @@ class Classes(Belief[ClassesState]):
 
     def changed(self, before: ClassesState, after: ClassesState) -> Tensor:
         """Return a mask of cells whose score, class or prediction changed."""
-        moved = self._copula.changed(before.copula, after.copula)
+        is_changed = self._copula.changed(before.copula, after.copula)
         other_probability = before.p_first != after.p_first
-        other_odds = before.odds != after.odds
-        moved |= (other_probability | other_odds) & (after.pair > 0)
+        other_log_odds = before.log_odds != after.log_odds
+        is_changed |= (other_probability | other_log_odds) & (after.pair > 0)
         for old, new in zip(before.per_class, after.per_class, strict=True):
             other_score = old.lower != new.lower
             other_noise = old.noise_std != new.noise_std
-            moved |= new.observed & (other_score | other_noise)
+            is_changed |= new.observed & (other_score | other_noise)
             if old.prior is not new.prior:
-                moved |= old.prior.differs(new.prior)
-        return moved
+                is_changed |= old.prior.differs(new.prior)
+        return is_changed
 
     def put(
         self, state: ClassesState, members: Tensor, others: ClassesState
@@ -271,23 +275,25 @@ class Classes(Belief[ClassesState]):
         streams = [rng.stream_key(key, "labels") for key in keys]
         indices = np.arange(count)
         uniforms = [rng.uniform(stream, indices, (2,)) for stream in streams]
-        drawn = torch.from_numpy(np.stack(uniforms)).to(scores.device)
-        chains = (drawn[..., 0] * CHAINS).long()
-        tosses = drawn[..., 1]
+        uniforms_by_field = torch.from_numpy(np.stack(uniforms)).to(scores.device)
+        chain_indices = (uniforms_by_field[..., 0] * CHAINS).long()
+        switch_uniforms = uniforms_by_field[..., 1]
         fields = []
         for index, field_scores in enumerate(scores.unbind(1)):
-            chain = chains[:, index, None, None]
-            toss = tosses[:, index, None, None]
+            chain = chain_indices[:, index, None, None]
+            uniform = switch_uniforms[:, index, None, None]
             bits = state.labels >> chain & 1
             in_first = bits.bool()
-            is_first = torch.where(in_first, toss >= p_to_second, toss < p_to_first)
+            is_first = torch.where(
+                in_first, uniform >= p_to_second, uniform < p_to_first
+            )
             is_first = is_first | (state.pair == 0)
             residual = field_scores - state.copula.mean
-            parts = []
-            for part, given_class in enumerate(state.per_class):
-                score = means[:, part] + scales[:, part] * residual
-                parts.append(given_class.fields(score[:, None])[:, 0])
-            fields.append(torch.where(is_first, parts[0], parts[1]))
+            fields_by_class = []
+            for class_index, given_class in enumerate(state.per_class):
+                score = means[:, class_index] + scales[:, class_index] * residual
+                fields_by_class.append(given_class.fields(score[:, None])[:, 0])
+            fields.append(torch.where(is_first, fields_by_class[0], fields_by_class[1]))
         return torch.stack(fields, 1)
 
     def _strength(self, covariance: CovarianceModel) -> float:
@@ -296,31 +302,33 @@ class Classes(Belief[ClassesState]):
             return self.strength
         return min(statistics_of(covariance).potts_strength, _MAX_STRENGTH)
 
-    def _sweep(self, state: ClassesState, fresh: Tensor, count: int) -> ClassesState:
+    def _sweep(
+        self, state: ClassesState, unlabelled: Tensor, count: int
+    ) -> ClassesState:
         """Sweep labels of unobserved cells, bool [B, H, W], given those of all others."""
-        members = _members_with(fresh)
-        if len(members) == 0:
+        episodes = _episodes_with(unlabelled)
+        if len(episodes) == 0:
             return state
-        fresh = fresh[members]
-        labels = state.labels[members]
-        sweeps = state.sweeps[members]
+        unlabelled = unlabelled[episodes]
+        labels = state.labels[episodes]
+        sweeps = state.sweeps[episodes]
         strength = self._strength(state.copula.covariance)
-        lattice = Lattice.of(state.pair[members], strength)
-        degree = lattice.degree()
-        height, width = fresh.shape[1:]
-        rows = torch.arange(height, device=fresh.device)
-        columns = torch.arange(width, device=fresh.device)
-        row = rows[:, None].expand_as(fresh)
-        column = columns.expand_as(fresh)
-        free = -fresh.long()
+        couplings = Couplings.of(state.pair[episodes], strength)
+        degree = couplings.degree()
+        height, width = unlabelled.shape[1:]
+        rows = torch.arange(height, device=unlabelled.device)
+        columns = torch.arange(width, device=unlabelled.device)
+        row = rows[:, None].expand_as(unlabelled)
+        column = columns.expand_as(unlabelled)
+        free = -unlabelled.long()
         even = -((row + column) % 2)
-        torus = max(height, width)
+        torus_size = max(height, width)
         for _ in range(count):
-            bits = noise(sweeps, row, column, degree, strength, torus)
-            labels = sweep_labels(labels, lattice, free, even, bits)
+            bits = sweep_bits(sweeps, row, column, degree, strength, torus_size)
+            labels = sweep_labels(labels, couplings, free, even, bits)
             sweeps = sweeps + 1
-        all_labels = state.labels.index_copy(0, members, labels)
-        all_sweeps = state.sweeps.index_copy(0, members, sweeps)
+        all_labels = state.labels.index_copy(0, episodes, labels)
+        all_sweeps = state.sweeps.index_copy(0, episodes, sweeps)
         return replace(state, labels=all_labels, sweeps=all_sweeps)
 
     def _with_prior(
@@ -331,41 +339,41 @@ class Classes(Belief[ClassesState]):
         Returns:
             The state, and the mask of cells with a new prediction, bool, [B, H, W].
         """
-        first, second, pair, odds = split(prior, state.copula.covariance)
+        first, second, pair, log_odds = split_by_class(prior, state.copula.covariance)
         new_first, first_differs = copula_state.with_prior(state.per_class[0], first)
         new_second, second_differs = copula_state.with_prior(state.per_class[1], second)
-        odds_differ = (odds - state.odds).abs() > _SAME_ODDS
-        renewed = first_differs | second_differs | odds_differ
-        rescored = renewed & new_first.observed
+        log_odds_differ = (log_odds - state.log_odds).abs() > _SAME_LOG_ODDS
+        has_new_prediction = first_differs | second_differs | log_odds_differ
+        rescored = has_new_prediction & new_first.observed
         density = state.density.clone()
-        for part, given_class in enumerate((new_first, new_second)):
+        for class_index, given_class in enumerate((new_first, new_second)):
             value = given_class.value[rescored]
             log_ratio = log_density_ratio(given_class, rescored, value)
-            density[:, part][rescored] = log_ratio
-        fresh = renewed & (pair != state.pair)
-        table = state.copula.table.without(first_differs)
+            density[:, class_index][rescored] = log_ratio
+        has_new_pair = has_new_prediction & (pair != state.pair)
+        table = state.copula.table.without_rows(first_differs)
         copula = replace(state.copula, prior=new_first.prior, table=table)
         updated = replace(
             state,
             copula=copula,
             per_class=(new_first, new_second),
             density=density,
-            pair=torch.where(renewed, pair, state.pair),
-            odds=torch.where(renewed, odds, state.odds),
-            p_first=torch.where(fresh, 0.5, state.p_first),
-            labels=torch.where(fresh, _fair(pair), state.labels),
+            pair=torch.where(has_new_prediction, pair, state.pair),
+            log_odds=torch.where(has_new_prediction, log_odds, state.log_odds),
+            p_first=torch.where(has_new_pair, 0.5, state.p_first),
+            labels=torch.where(has_new_pair, _fair_labels_for(pair), state.labels),
         )
-        swept = self._sweep(updated, fresh & (pair > 0), _MORE_SWEEPS)
-        return swept, renewed
+        with_labels = self._sweep(updated, has_new_pair & (pair > 0), _MORE_SWEEPS)
+        return with_labels, has_new_prediction
 
 
-def _fair(pair: Tensor) -> Tensor:
+def _fair_labels_for(pair: Tensor) -> Tensor:
     height, width = pair.shape[1:]
-    labels = fair(height, width).to(pair.device)
+    labels = fair_labels(height, width).to(pair.device)
     return labels.expand_as(pair)
 
 
-def _members_with(cells: Tensor) -> Tensor:
+def _episodes_with(cells: Tensor) -> Tensor:
     """Return the indices of episodes with a cell of a mask, int64."""
     return cells.flatten(1).any(1).nonzero()[:, 0]
 

@@ -88,7 +88,7 @@ def with_prior(
     updated = replace(
         state,
         prior=prior,
-        table=state.table.without(differs),
+        table=state.table.without_rows(differs),
         lower=state.lower.index_put((rescored,), low),
         upper=state.upper.index_put((rescored,), high),
         precision=state.precision.index_put((rescored,), precision),
@@ -125,7 +125,9 @@ def scores_at(
     return low, high
 
 
-def note(state: CopulaState, sensed: Measurement) -> tuple[CopulaState, Tensor]:
+def add_measurement(
+    state: CopulaState, sensed: Measurement
+) -> tuple[CopulaState, Tensor]:
     """Add a measurement to the observations.
 
     Returns:
@@ -154,8 +156,8 @@ def note(state: CopulaState, sensed: Measurement) -> tuple[CopulaState, Tensor]:
     same_std = new_std > _SAME_STD * old_std
     is_repeated = was_number & same_score & same_std
     is_less_noisy = ~was_number & (std < old_std)
-    is_sharper = ~was_observed | is_less_noisy
-    is_new = torch.where(is_number, ~is_repeated, is_sharper)
+    is_first_or_less_noisy = ~was_observed | is_less_noisy
+    is_new = torch.where(is_number, ~is_repeated, is_first_or_less_noisy)
     changed = torch.zeros_like(new)
     changed[new] = is_new
 

@@ -95,13 +95,15 @@ class Field(Batch):
             rows: offset in rows between the two cells, of either sign, int64.
             columns: offset in columns.
         """
-        correlation = self.shared(member, rows, columns)
+        correlation = self.covariance_without_nugget(member, rows, columns)
         if self.nugget:
             same_cell = (rows == 0) & (columns == 0)
             correlation = torch.where(same_cell, correlation + self.nugget, correlation)
         return correlation
 
-    def shared(self, member: int | Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+    def covariance_without_nugget(
+        self, member: int | Tensor, rows: Tensor, columns: Tensor
+    ) -> Tensor:
         """Return `covariance` without the nugget, also of a cell with itself."""
         down = self.down[member, rows.abs()]
         across = self.across[member, columns.abs()]
@@ -161,7 +163,7 @@ class Posterior:
             covariance.
         """
         reduction = _reduction(self.factor, self.root, covariance)
-        mean = times(self.weights, covariance)
+        mean = product(self.weights, covariance)
         explained = np.square(reduction).sum(0)
         variance = (1 - explained).clip(0)
         return mean, variance, reduction
@@ -178,7 +180,7 @@ def posterior(covariance: ndarray, precision: ndarray, shift: ndarray) -> Poster
     root = np.sqrt(precision)
     factor = _factor(covariance, root)
     # (K⁻¹ + T)⁻¹ ν = K (ν − √T (I + √T K √T)⁻¹ √T K ν)
-    scaled = torch.from_numpy(root * times(covariance, shift))
+    scaled = torch.from_numpy(root * product(covariance, shift))
     solved = torch.cholesky_solve(scaled[:, None], factor)[:, 0].numpy()
     weights = shift - root * solved
     return Posterior(
@@ -203,14 +205,14 @@ def condition(covariance: ndarray, observed: Observed) -> Posterior:
     # numbers.
     columns = covariance[:, censored]
     centre, _, reduction = numbers.moments(columns)
-    residual_cov = columns[censored] - times(reduction.T, reduction)
+    residual_cov = columns[censored] - product(reduction.T, reduction)
     terms = Terms(observed.precision[censored], observed.shift[censored])
     lower = observed.lower[censored]
     upper = observed.upper[censored]
     std = observed.std[censored]
     for _ in range(DAMPED_ROUNDS):
         mean, variance = terms.moments(residual_cov, centre)
-        terms, converged = terms.step(mean, variance, lower, upper, std)
+        terms, converged = terms.updated(mean, variance, lower, upper, std)
         if converged:
             break
     precision = precision.copy()
@@ -219,7 +221,7 @@ def condition(covariance: ndarray, observed: Observed) -> Posterior:
     return posterior(covariance, precision, shift)
 
 
-def evidence(covariance: ndarray, observed: Observed, solved: Posterior) -> float:
+def log_evidence(covariance: ndarray, observed: Observed, solved: Posterior) -> float:
     """Return the log-likelihood of observations, up to a constant.
 
     Numbers are exact. Intervals are by expectation propagation (Rasmussen and Williams
@@ -272,13 +274,15 @@ def predict(
     censored = observed.interval
     if not censored.any():
         return mean, variance, np.zeros_like(mean)
-    own_mean, own_variance, own_reduction = solved.moments(covariance[:, censored])
-    own_variance = own_variance.clip(MIN_VARIANCE)
-    third = third_cumulants(
-        observed, solved.precision, solved.shift, own_mean, own_variance
+    censored_mean, censored_variance, censored_reduction = solved.moments(
+        covariance[:, censored]
     )
-    residual = block[censored] - times(own_reduction.T, reduction)
-    regression = residual / own_variance[:, None]
+    censored_variance = censored_variance.clip(MIN_VARIANCE)
+    third = third_cumulants(
+        observed, solved.precision, solved.shift, censored_mean, censored_variance
+    )
+    residual = block[censored] - product(censored_reduction.T, reduction)
+    regression = residual / censored_variance[:, None]
     return mean, variance, skewness(third, regression, variance)
 
 
@@ -316,7 +320,7 @@ def skewness(third: ndarray, regression: ndarray, variance: ndarray) -> ndarray:
         variance: variance of the cells, [M].
     """
     # Products and roots are far faster than powers.
-    cumulant = times(third, regression * regression * regression)
+    cumulant = product(third, regression * regression * regression)
     spread = variance.clip(MIN_VARIANCE)
     skew: ndarray = cumulant / (spread * np.sqrt(spread))
     return skew.clip(-_MAX_SKEW, _MAX_SKEW)
@@ -335,7 +339,7 @@ def _reduction(factor: Tensor, root: ndarray, covariance: ndarray) -> ndarray:
     return torch.linalg.solve_triangular(factor, scaled, upper=False).numpy()
 
 
-def times(first: ndarray, second: ndarray) -> ndarray:
+def product(first: ndarray, second: ndarray) -> ndarray:
     """Return the product of two matrices or vectors."""
     return (torch.from_numpy(first) @ torch.from_numpy(second)).numpy()
 
@@ -359,9 +363,9 @@ class Terms(NamedTuple):
         root = np.sqrt(self.precision)
         factor = _factor(covariance, root)
         reduction = _reduction(factor, root, covariance)
-        residual_cov = covariance - times(reduction.T, reduction)
+        residual_cov = covariance - product(reduction.T, reduction)
         residual_shift = self.shift - self.precision * centre
-        mean = centre + times(residual_cov, residual_shift)
+        mean = centre + product(residual_cov, residual_shift)
         variance = residual_cov.diagonal().clip(MIN_VARIANCE)
         return mean, variance
 
@@ -372,7 +376,7 @@ class Terms(NamedTuple):
         centre = cavity * (mean / variance - self.shift)
         return centre, cavity
 
-    def step(
+    def updated(
         self,
         mean: ndarray,
         variance: ndarray,
@@ -380,17 +384,17 @@ class Terms(NamedTuple):
         upper: ndarray,
         std: ndarray,
     ) -> "tuple[Terms, bool]":
-        """Return the terms of `towards`, and whether they converged.
+        """Return the terms of `matched`, and whether they converged.
 
         Terms have converged if no term moves its own cell by more than `_TOLERANCE`.
         """
-        new = self.towards(mean, variance, lower, upper, std)
+        new = self.matched(mean, variance, lower, upper, std)
         added = new.precision - self.precision
         moved = abs(new.shift - self.shift) + abs(added * mean)
         change = moved / (1 / variance + added.clip(0))
         return new, bool(change.max() <= _TOLERANCE)
 
-    def towards(
+    def matched(
         self,
         mean: ndarray,
         variance: ndarray,

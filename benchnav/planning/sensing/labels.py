@@ -35,7 +35,7 @@ _MASKS = (0x5555555555555555, 0x3333333333333333, 0x0F0F0F0F0F0F0F0F)
 
 
 @dataclass(frozen=True)
-class Lattice:
+class Couplings:
     """Couplings between neighbouring cells.
 
     Args:
@@ -50,7 +50,7 @@ class Lattice:
     strength: float
 
     @classmethod
-    def of(cls, pair: Tensor, strength: float) -> "Lattice":
+    def of(cls, pair: Tensor, strength: float) -> "Couplings":
         """Return the couplings of cells.
 
         Args:
@@ -82,29 +82,29 @@ class Lattice:
 
 
 @dataclass(frozen=True)
-class Noise:
+class SweepBits:
     """Random bits of a sweep.
 
     Args:
-        chosen: bits of the chains in which a cell takes the first class, for 0 to 4
+        first_bits: bits of the chains in which a cell takes the first class, for 0 to 4
             neighbours of that class, int64, five of shape [B, H, W].
         right: bonds to the right neighbour, effective if both have the same class.
         down: likewise for the cell below.
     """
 
-    chosen: tuple[Tensor, ...]
+    first_bits: tuple[Tensor, ...]
     right: Tensor
     down: Tensor
 
 
-def noise(
+def sweep_bits(
     sweep: Tensor,
     row: Tensor,
     column: Tensor,
     degree: Tensor,
     strength: float,
     size: int,
-) -> Noise:
+) -> SweepBits:
     """Return the random bits of each episode's next sweep.
 
     Args:
@@ -117,17 +117,17 @@ def noise(
     """
     bank = _bank(strength, size).to(row.device)
     uses = sweep[:, None, None] // _SWEEPS
-    turn = sweep[:, None, None] % _SWEEPS
+    bank_sweep = sweep[:, None, None] % _SWEEPS
     bank_row = (row + uses * _STEP[0]) % size
     bank_column = (column + uses * _STEP[1]) % size
     index = bank_row * size + bank_column
-    chosen = []
+    first_bits = []
     for n_first in range(_NEIGHBOURS + 1):
         level = (2 * n_first - degree + _NEIGHBOURS).clamp(0, _MAX_LEVEL)
-        chosen.append(bank[turn, index, level])
-    right = bank[turn, index, _MAX_LEVEL + 1]
-    down = bank[turn, index, _MAX_LEVEL + 2]
-    return Noise(tuple(chosen), right, down)
+        first_bits.append(bank[bank_sweep, index, level])
+    right = bank[bank_sweep, index, _MAX_LEVEL + 1]
+    down = bank[bank_sweep, index, _MAX_LEVEL + 2]
+    return SweepBits(tuple(first_bits), right, down)
 
 
 @lru_cache(maxsize=4)
@@ -157,7 +157,7 @@ def _packed(bits: np.ndarray) -> np.ndarray:
     return octets.view("<i8")[:, 0]
 
 
-def fair(height: int, width: int) -> Tensor:
+def fair_labels(height: int, width: int) -> Tensor:
     """Return labels of probability ½, int64, shape [H, W]."""
     key = rng.stream_key(0, "labels", "first")
     uniform = rng.uniform(key, np.arange(height * width), (CHAINS,))
@@ -166,19 +166,19 @@ def fair(height: int, width: int) -> Tensor:
 
 
 def sweep_labels(
-    labels: Tensor, lattice: Lattice, free: Tensor, even: Tensor, drawn: Noise
+    labels: Tensor, couplings: Couplings, free: Tensor, even: Tensor, bits: SweepBits
 ) -> Tensor:
     """Resample labels given their neighbours', int64, shape [B, H, W].
 
     Args:
         labels: current labels, int64, shape [B, H, W].
-        lattice: couplings of these cells.
+        couplings: couplings of these cells.
         free: all bits set where a label may change, int64.
         even: all bits set on the cells of one colour of the checkerboard, int64.
-        drawn: random bits.
+        bits: random bits.
     """
     for colour in (free & even, free & ~even):
-        right, left, below, above = lattice.neighbours(labels)
+        right, left, below, above = couplings.neighbours(labels)
         # Binary digits of the number of neighbours of the first class.
         odd_row = right ^ left
         pair_row = right & left
@@ -194,28 +194,28 @@ def sweep_labels(
         is_three = ones & twos
         counts = (is_zero, is_one, is_two, is_three, fours)
         new = torch.zeros_like(labels)
-        for has_count, chosen in zip(counts, drawn.chosen, strict=True):
-            new |= has_count & chosen
+        for has_count, first_bits in zip(counts, bits.first_bits, strict=True):
+            new |= has_count & first_bits
         labels = (labels & ~colour) | (new & colour)
     return labels
 
 
 def connected_to_evidence(
-    labels: Tensor, lattice: Lattice, evidence: Tensor, drawn: Noise
+    labels: Tensor, couplings: Couplings, evidence: Tensor, bits: SweepBits
 ) -> Tensor:
     """Return bits of chains in which bonds join a cell to evidence, int64, [B, H, W].
 
     Args:
         labels: labels of the chains, int64, shape [B, H, W].
-        lattice: couplings of these cells.
+        couplings: couplings of these cells.
         evidence: all bits set on cells with evidence of their label, int64.
-        drawn: random bits.
+        bits: random bits.
     """
     same_right = ~(labels ^ labels.roll(-1, -1))
     same_below = ~(labels ^ labels.roll(-1, -2))
-    right = lattice.right & drawn.right & same_right
-    down = lattice.down & drawn.down & same_below
-    bonds = Lattice(right, down, lattice.strength)
+    right = couplings.right & bits.right & same_right
+    down = couplings.down & bits.down & same_below
+    bonds = Couplings(right, down, couplings.strength)
     connected = evidence
     while True:
         before = connected

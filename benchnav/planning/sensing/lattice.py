@@ -26,9 +26,9 @@ from benchnav.planning.sensing.gaussian import (
     Field,
     Observed,
     Terms,
+    product,
     skewness,
     third_cumulants,
-    times,
 )
 
 # Added to a variance of 1, so that the lattice's covariance has a Cholesky factor.
@@ -83,7 +83,7 @@ class Lattice:
                 is_used[nearest_row + down, nearest_column + across] = True
         rows, columns = is_used[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN].nonzero()
         basis = basis_rows[rows], basis_columns[columns]
-        covariance = _shared(field, member, basis, basis)
+        covariance = _covariance_without_nugget(field, member, basis, basis)
         covariance.diagonal().add_(_JITTER)
         root = torch.linalg.cholesky(covariance)
         return cls(field, member, basis, root)
@@ -93,17 +93,23 @@ class Lattice:
 
         A residual is the variance of a cell that the coefficients do not explain.
         """
-        shared = _shared(self.field, self.member, self.basis, cells)
-        weights = torch.linalg.solve_triangular(self.root, shared, upper=False).numpy()
+        covariance = _covariance_without_nugget(
+            self.field, self.member, self.basis, cells
+        )
+        weights = torch.linalg.solve_triangular(
+            self.root, covariance, upper=False
+        ).numpy()
         residual = 1 - np.square(weights).sum(0)
         return weights, residual.clip(0)
 
 
-def _shared(field: Field, member: int, first: Cells, second: Cells) -> Tensor:
+def _covariance_without_nugget(
+    field: Field, member: int, first: Cells, second: Cells
+) -> Tensor:
     """Return the covariances of two sets of cells without the nugget, [N, M]."""
     rows = torch.from_numpy(first[0][:, None] - second[0])
     columns = torch.from_numpy(first[1][:, None] - second[1])
-    return field.shared(member, rows, columns)
+    return field.covariance_without_nugget(member, rows, columns)
 
 
 @dataclass(frozen=True)
@@ -153,21 +159,21 @@ def _moments(
     """
     whitened = normals.whiten(weights)
     shrink = 1 / (1 + residual * precision)
-    explained = times(whitened.T, normals.whitened_shift)
+    explained = product(whitened.T, normals.whitened_shift)
     mean = (explained + residual * shift) * shrink
     explained_variance = np.square(whitened).sum(0)
     variance = (residual + explained_variance * shrink) * shrink
     return mean, variance, whitened
 
 
-def _weighted(
+def _added_by_terms(
     weights: ndarray, residual: ndarray, precision: ndarray, shift: ndarray
 ) -> tuple[Tensor, ndarray]:
     """Return the precision [m, m] and the shift [m] that terms add to the normals."""
     shrink = 1 / (1 + residual * precision)
     scaled = torch.from_numpy(weights * (precision * shrink))
     added_precision = scaled @ torch.from_numpy(weights).T
-    return added_precision, times(weights, shift * shrink)
+    return added_precision, product(weights, shift * shrink)
 
 
 def condition_and_predict(
@@ -190,8 +196,8 @@ def condition_and_predict(
     precision = np.where(censored, 0.0, 1 / np.square(observed.std))
     shift = precision * np.where(censored, 0.0, observed.lower)
     weights, residual = lattice.coefficients(cells)
-    of_exact = weights[:, exact], residual[exact]
-    added, prior_shift = _weighted(*of_exact, precision[exact], shift[exact])
+    exact_inputs = weights[:, exact], residual[exact]
+    added, prior_shift = _added_by_terms(*exact_inputs, precision[exact], shift[exact])
     prior_precision = added + torch.eye(len(prior_shift), dtype=added.dtype)
     normals = Normals.of(prior_precision, prior_shift)
     censored_weights = weights[:, censored]
@@ -202,17 +208,17 @@ def condition_and_predict(
         lower = observed.lower[censored]
         upper = observed.upper[censored]
         std = observed.std[censored]
-        of_censored = censored_weights, censored_residual
+        censored_inputs = censored_weights, censored_residual
         for _ in range(DAMPED_ROUNDS):
-            added, added_shift = _weighted(*of_censored, *terms)
+            added, added_shift = _added_by_terms(*censored_inputs, *terms)
             normals = Normals.of(prior_precision + added, prior_shift + added_shift)
-            mean, variance, _ = _moments(normals, *of_censored, *terms)
+            mean, variance, _ = _moments(normals, *censored_inputs, *terms)
             variance = variance.clip(MIN_VARIANCE)
-            terms, converged = terms.step(mean, variance, lower, upper, std)
+            terms, converged = terms.updated(mean, variance, lower, upper, std)
             if converged:
                 break
         precision[censored], shift[censored] = terms
-        added, added_shift = _weighted(*of_censored, *terms)
+        added, added_shift = _added_by_terms(*censored_inputs, *terms)
         normals = Normals.of(prior_precision + added, prior_shift + added_shift)
     # Terms of the targets that are observed.
     field = lattice.field
@@ -228,22 +234,28 @@ def condition_and_predict(
     )
     if not censored.any():
         return precision, shift, (mean, variance, np.zeros_like(mean))
-    own_precision = precision[censored]
-    own_mean, own_variance, own_whitened = _moments(
-        normals, censored_weights, censored_residual, own_precision, shift[censored]
+    censored_precision = precision[censored]
+    censored_mean, censored_variance, censored_whitened = _moments(
+        normals,
+        censored_weights,
+        censored_residual,
+        censored_precision,
+        shift[censored],
     )
-    own_variance = own_variance.clip(MIN_VARIANCE)
-    shrink = 1 / (1 + censored_residual * own_precision)
-    gain = own_whitened * shrink / own_variance
-    unshrink = 1 + target_residual * target_precision
-    regression = times(gain.T, whitened) / unshrink
+    censored_variance = censored_variance.clip(MIN_VARIANCE)
+    shrink = 1 / (1 + censored_residual * censored_precision)
+    gain = censored_whitened * shrink / censored_variance
+    inverse_shrink = 1 + target_residual * target_precision
+    regression = product(gain.T, whitened) / inverse_shrink
     target_index = np.full(map_shape, -1)
     target_index[targets] = np.arange(len(mean))
     censored_cells = cells[0][censored], cells[1][censored]
     indices = target_index[censored_cells]
     is_target = indices >= 0
-    own_rows = is_target.nonzero()[0]
-    regression[own_rows, indices[is_target]] = 1
-    third = third_cumulants(observed, precision, shift, own_mean, own_variance)
+    target_rows = is_target.nonzero()[0]
+    regression[target_rows, indices[is_target]] = 1
+    third = third_cumulants(
+        observed, precision, shift, censored_mean, censored_variance
+    )
     skew = skewness(third, regression, variance)
     return precision, shift, (mean, variance, skew)

@@ -19,15 +19,15 @@ from benchnav.core.ground import GroundStatistics
 from benchnav.core.terrain import Observation, Terrain
 from benchnav.planning import risk
 from benchnav.planning.free_space import Rules
-from benchnav.planning.sensing.appearance import Memory, masked, remember
+from benchnav.planning.sensing.appearance import Memory, model_input, remember
 from benchnav.planning.sensing.belief import Belief, CovarianceModel
 from benchnav.planning.sensing.knowledge import (
     Knowledge,
     Truth,
-    call,
+    call_user_code,
     check_map,
-    nothing_sensed,
-    unseen_ground,
+    no_measurement,
+    prior_of_unobserved,
 )
 from benchnav.planning.sensing.sensor import (
     Appearance,
@@ -107,7 +107,7 @@ class Learner:
             noise_key = NoiseKey(truth.keys, 0)
             first = self._measurement(self.sensor, truth, robot_state, noise_key)
             assert first.appearance is not None
-            memory = remember(Memory.none(observation), first.appearance)
+            memory = remember(Memory.empty(observation), first.appearance)
             seen = memory.seen
             observation, prediction = self._predict(memory, truth)
         assert prediction is not None
@@ -118,8 +118,8 @@ class Learner:
         no_cells = torch.zeros_like(truth.field, dtype=torch.bool)
         return Knowledge(
             memory=memory,
-            has_news=no_episodes,
-            sensed=nothing_sensed(truth.field),
+            has_new_appearance=no_episodes,
+            sensed=no_measurement(truth.field),
             ever_sensed=no_cells,
             footprint=no_cells.clone(),
             observation=observation,
@@ -137,7 +137,7 @@ class Learner:
         """
         # A custom belief may modify its input.
         prior = prediction.clone()
-        return call(
+        return call_user_code(
             Outcome.BELIEF_ERROR, lambda: self.belief.init(prior, self.covariance)
         )
 
@@ -198,15 +198,15 @@ class Learner:
             KnowledgeError: If the model, the belief or the risk measure raises, or
                 returns an invalid value.
         """
-        has_news = bool(knowledge.has_news.any())
-        if not has_news and not bool(knowledge.sensed.mask.any()):
+        has_new_appearance = bool(knowledge.has_new_appearance.any())
+        if not has_new_appearance and not bool(knowledge.sensed.mask.any()):
             return knowledge, torch.zeros_like(knowledge.free)
         before = knowledge.belief_state
         observation = knowledge.observation
         prior = None
-        if has_news and knowledge.memory is not None:
+        if has_new_appearance and knowledge.memory is not None:
             observation, prior = self._predict(knowledge.memory, truth)
-        after = call(
+        after = call_user_code(
             Outcome.BELIEF_ERROR,
             lambda: self.belief.update(before, knowledge.sensed, prior),
         )
@@ -216,11 +216,11 @@ class Learner:
             check_map("cells from `changed`", cells, torch.bool, knowledge.free)
             return cells
 
-        changed = call(Outcome.BELIEF_ERROR, changed_cells)
+        changed = call_user_code(Outcome.BELIEF_ERROR, changed_cells)
         knowledge = replace(
             knowledge,
-            has_news=torch.zeros_like(knowledge.has_news),
-            sensed=nothing_sensed(knowledge.risk_map),
+            has_new_appearance=torch.zeros_like(knowledge.has_new_appearance),
+            sensed=no_measurement(knowledge.risk_map),
             observation=observation,
             belief_state=after,
         )
@@ -246,7 +246,7 @@ class Learner:
             )
             return believed
 
-        return call(Outcome.BELIEF_ERROR, believe)
+        return call_user_code(Outcome.BELIEF_ERROR, believe)
 
     def distribution(self, knowledge: Knowledge) -> TraversabilityDistribution:
         """Return the distribution of λ, shape [B, H, W].
@@ -266,7 +266,7 @@ class Learner:
             )
             return believed
 
-        return call(Outcome.BELIEF_ERROR, believe)
+        return call_user_code(Outcome.BELIEF_ERROR, believe)
 
     def select(self, knowledge: Knowledge, members: Tensor) -> Knowledge:
         """Return some episodes, by index, int64.
@@ -274,7 +274,7 @@ class Learner:
         Raises:
             KnowledgeError: If the belief raises.
         """
-        belief_state = call(
+        belief_state = call_user_code(
             Outcome.BELIEF_ERROR,
             lambda: self.belief.select(knowledge.belief_state, members),
         )
@@ -289,7 +289,7 @@ class Learner:
         Raises:
             KnowledgeError: If the belief raises.
         """
-        belief_state = call(
+        belief_state = call_user_code(
             Outcome.BELIEF_ERROR,
             lambda: self.belief.put(
                 knowledge.belief_state, members, others.belief_state
@@ -308,7 +308,7 @@ class Learner:
         seen = None
         if knowledge.memory is not None:
             seen = knowledge.memory.seen[changed][None]
-        free = call(
+        free = call_user_code(
             Outcome.BELIEF_ERROR, lambda: self.rules.free(risk_map[0], believed, seen)
         )
         new_risk = risk_map.flatten().to(knowledge.risk_map.dtype)
@@ -331,7 +331,7 @@ class Learner:
             spread = believed.spread() if self.keeps_spread else None
             return risk_map, spread
 
-        return call(Outcome.MODEL_ERROR, measure)
+        return call_user_code(Outcome.MODEL_ERROR, measure)
 
     def _predict(
         self, memory: Memory, truth: Truth
@@ -341,13 +341,15 @@ class Learner:
         In unobserved cells, `rules.unseen` determines the prediction.
         """
         statistics = self.statistics
-        observation = masked(memory, statistics.layer_means)
+        observation = model_input(memory, statistics.layer_means)
         terrain = replace(truth.terrain, traversability=truth.field)
-        predicted = call(
+        predicted = call_user_code(
             Outcome.MODEL_ERROR, lambda: self.predict(terrain, observation)
         )
         seen = memory.seen
-        unseen = unseen_ground(statistics, self.rules.unseen, seen.shape, truth.field)
+        unseen = prior_of_unobserved(
+            statistics, self.rules.unseen, seen.shape, truth.field
+        )
         return observation, choose(seen, predicted, unseen)
 
     def _measurement(
@@ -373,7 +375,7 @@ class Learner:
             )
             return measurement
 
-        return call(Outcome.SENSOR_ERROR, sense)
+        return call_user_code(Outcome.SENSOR_ERROR, sense)
 
 
 def _with_traversability(
@@ -405,7 +407,7 @@ def _with_appearance(
     return replace(
         knowledge,
         memory=new_memory,
-        has_news=knowledge.has_news | is_new,
+        has_new_appearance=knowledge.has_new_appearance | is_new,
         footprint=knowledge.footprint | seen,
     )
 

@@ -34,7 +34,7 @@ def statistics_of(covariance: CovarianceModel) -> GroundStatistics:
     return cast(GroundStatistics, covariance.statistics)
 
 
-def split(
+def split_by_class(
     prior: TraversabilityDistribution, covariance: CovarianceModel
 ) -> tuple[TraversabilityMixture, TraversabilityMixture, Tensor, Tensor]:
     """Split a prediction by the class of look-alike cells.
@@ -57,10 +57,10 @@ def split(
     pairs = statistics_of(covariance).look_alikes
     is_mixture = isinstance(prior, TraversabilityMixture)
     if not isinstance(prior, TraversabilityMixture) or prior.group is None:
-        without = " without `group`" if is_mixture else ""
+        suffix = " without `group`" if is_mixture else ""
         raise ConfigError(
             "Expected a mixture whose components belong to classes for the belief "
-            f"classes, got {type(prior).__name__}{without}. "
+            f"classes, got {type(prior).__name__}{suffix}. "
             "Take another model, or the belief copula."
         )
     paired_names = {name for pair in pairs for name in pair}
@@ -70,15 +70,15 @@ def split(
         f"look-alike classes among those of the prediction, got {', '.join(unknown)}.",
     )
     pair = torch.zeros(prior.shape, dtype=torch.int64, device=prior.device)
-    odds = torch.zeros(prior.shape, dtype=torch.float64, device=prior.device)
+    log_odds = torch.zeros(prior.shape, dtype=torch.float64, device=prior.device)
     if not pairs:
-        return prior, prior, pair, odds
+        return prior, prior, pair, log_odds
     weights = prior.weights.double()
     normalised_weights = weights / weights.sum(-3, keepdim=True)
     normalised = replace(prior, weights=normalised_weights)
     probabilities = normalised.class_probabilities(len(names))
     group = torch.tensor(prior.group, device=prior.device).view(-1, 1, 1)
-    max_weight = torch.full_like(odds, _MIN_PAIR_WEIGHT)
+    max_weight = torch.full_like(log_odds, _MIN_PAIR_WEIGHT)
     scales = [torch.ones_like(weights), torch.ones_like(weights)]
     for index, (first_name, second_name) in enumerate(pairs, 1):
         ids = names.index(first_name), names.index(second_name)
@@ -86,19 +86,21 @@ def split(
         second = probabilities[:, ids[1]]
         pair_weight = first + second
         both_likely = torch.minimum(first, second) > _MIN_CLASS_WEIGHT
-        is_of_pair = (pair_weight >= max_weight) & both_likely
-        max_weight = torch.where(is_of_pair, pair_weight, max_weight)
-        pair = torch.where(is_of_pair, index, pair)
-        odds = torch.where(is_of_pair, (first / second).log(), odds)
-        for part, probability in enumerate((first, second)):
+        is_in_pair = (pair_weight >= max_weight) & both_likely
+        max_weight = torch.where(is_in_pair, pair_weight, max_weight)
+        pair = torch.where(is_in_pair, index, pair)
+        log_odds = torch.where(is_in_pair, (first / second).log(), log_odds)
+        for class_index, probability in enumerate((first, second)):
             # The class has all of the pair's weight; the other class has no weight.
-            excluded_id = ids[1 - part]
+            excluded_id = ids[1 - class_index]
             others = torch.where(group == excluded_id, 0.0, 1.0)
-            gain = (pair_weight / probability)[:, None]
-            scale = torch.where(group == ids[part], gain, others)
-            scales[part] = torch.where(is_of_pair[:, None], scale, scales[part])
+            scale_of_class = (pair_weight / probability)[:, None]
+            scale = torch.where(group == ids[class_index], scale_of_class, others)
+            scales[class_index] = torch.where(
+                is_in_pair[:, None], scale, scales[class_index]
+            )
     first_weights = (weights * scales[0]).to(prior.dtype)
     second_weights = (weights * scales[1]).to(prior.dtype)
     under_first = replace(prior, weights=first_weights)
     under_second = replace(prior, weights=second_weights)
-    return under_first, under_second, pair, odds
+    return under_first, under_second, pair, log_odds

@@ -51,17 +51,19 @@ class TabulatedDistribution(TraversabilityDistribution):
 
     def cdf_limits(self, value: Tensor | float) -> tuple[Tensor, Tensor]:
         """Return P(λ < value) and P(λ ≤ value), each of shape [*B, H, W]."""
-        at = torch.as_tensor(value, dtype=self.dtype, device=self.device)
+        requested = torch.as_tensor(value, dtype=self.dtype, device=self.device)
         values = self._values()
-        upper = torch.searchsorted(values, at.contiguous()).clamp(1, len(VALUES) - 1)
+        upper = torch.searchsorted(values, requested.contiguous()).clamp(
+            1, len(VALUES) - 1
+        )
         lower = upper - 1
         low = values[lower]
         high = values[upper]
-        fraction = ((at - low) / (high - low)).clamp(0, 1)
+        fraction = ((requested - low) / (high - low)).clamp(0, 1)
         inside = torch.lerp(self._below_at(lower), self._below_at(upper), fraction)
-        strictly_below = torch.where(at <= 0, 0.0, inside)
-        at_most = torch.where(at < 1, inside, 1.0)
-        at_most = torch.where(at < 0, 0.0, at_most)
+        strictly_below = torch.where(requested <= 0, 0.0, inside)
+        at_most = torch.where(requested < 1, inside, 1.0)
+        at_most = torch.where(requested < 0, 0.0, at_most)
         return strictly_below, at_most
 
     def _below_at(self, index: Tensor) -> Tensor:
@@ -209,11 +211,13 @@ class ScoreTable(Batch):
         rows = torch.cat((self.rows.scores, others.rows.scores))
         return ScoreTable(row_index, _Rows(rows))
 
-    def without(self, cells: Tensor) -> "ScoreTable":
+    def without_rows(self, cells: Tensor) -> "ScoreTable":
         """Return the table without the rows of some cells, bool, [B, H, W]."""
         return replace(self, row_index=self.row_index.masked_fill(cells, -1))
 
-    def having(self, prior: TraversabilityDistribution, cells: Tensor) -> "ScoreTable":
+    def with_rows(
+        self, prior: TraversabilityDistribution, cells: Tensor
+    ) -> "ScoreTable":
         """Return the table with a row for each requested cell.
 
         Args:

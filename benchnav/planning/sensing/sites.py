@@ -15,7 +15,7 @@ from torch.nn.utils.rnn import pad_sequence
 from benchnav.core.batch import Batch
 from benchnav.planning.sensing.conditioning import bounds, nearest
 from benchnav.planning.sensing.gaussian import Field
-from benchnav.planning.sensing.labels import Lattice, Noise, noise, unpacked
+from benchnav.planning.sensing.labels import Couplings, SweepBits, sweep_bits, unpacked
 
 _REACH = 12  # cells
 # An observed cell is not drawn again if its less likely label has a lower probability.
@@ -65,28 +65,28 @@ class Block:
     """Cells of a rectangle around new observations.
 
     Args:
-        at: indices into maps, shapes [B, 1] and twice [B, RC].
+        map_index: indices into maps, shapes [B, 1] and twice [B, RC].
         row: rows, int64, shape [B, R, C].
         column: columns, int64.
         pair: index of the pair of each cell, int64.
         p_first: probability of the first class before the update.
         observed: mask of observed cells, bool.
         in_reach: mask of cells in reach; the others keep their labels, bool.
-        lattice: couplings of these cells.
+        couplings: couplings of these cells.
         degree: number of coupled neighbours of each cell.
-        torus: side of a map, by which stored random numbers are indexed.
+        torus_size: side of a map, by which stored random numbers are indexed.
     """
 
-    at: tuple[Tensor, Tensor, Tensor]
+    map_index: tuple[Tensor, Tensor, Tensor]
     row: Tensor
     column: Tensor
     pair: Tensor
     p_first: Tensor
     observed: Tensor
     in_reach: Tensor
-    lattice: Lattice
+    couplings: Couplings
     degree: Tensor
-    torus: int
+    torus_size: int
 
     @classmethod
     def around(cls, evidence: Evidence, changed: Tensor, strength: float) -> "Block":
@@ -101,12 +101,12 @@ class Block:
         n_columns = columns.shape[1]
         row = rows[:, :, None].expand(-1, -1, n_columns)
         column = columns[:, None].expand_as(row)
-        member = torch.arange(len(changed), device=device)[:, None]
-        at = member, row.flatten(1), column.flatten(1)
+        episode = torch.arange(len(changed), device=device)[:, None]
+        map_index = episode, row.flatten(1), column.flatten(1)
         is_observed = ~evidence.noise_std.isnan()
-        pair = evidence.pair[at].view_as(row)
-        p_first = evidence.p_first[at].view_as(row)
-        observed = is_observed[at].view_as(row)
+        pair = evidence.pair[map_index].view_as(row)
+        p_first = evidence.p_first[map_index].view_as(row)
+        observed = is_observed[map_index].view_as(row)
         distance = torch.zeros_like(row)
         for index, (first, last) in ((row, row_ends), (column, column_ends)):
             before = first[:, None, None] - index
@@ -117,18 +117,18 @@ class Block:
         # neighbours of cells in reach are coupled.
         pair = torch.where(distance <= _REACH + 1, pair, 0)
         in_reach = distance <= _REACH
-        lattice = Lattice.of(pair, strength)
+        couplings = Couplings.of(pair, strength)
         return cls(
-            at=at,
+            map_index=map_index,
             row=row,
             column=column,
             pair=pair,
             p_first=p_first,
             observed=observed,
             in_reach=in_reach,
-            lattice=lattice,
-            degree=lattice.degree(),
-            torus=max(height, width),
+            couplings=couplings,
+            degree=couplings.degree(),
+            torus_size=max(height, width),
         )
 
     @property
@@ -153,15 +153,15 @@ class Block:
         has_evidence = (self.pair > 0) & (self.observed | informative)
         return -has_evidence.long()
 
-    def noise(self, sweeps: Tensor) -> Noise:
+    def sweep_bits(self, sweeps: Tensor) -> SweepBits:
         """Return the random bits of the next sweep."""
-        return noise(
+        return sweep_bits(
             sweeps,
             self.row,
             self.column,
             self.degree,
-            self.lattice.strength,
-            self.torus,
+            self.couplings.strength,
+            self.torus_size,
         )
 
 
@@ -184,9 +184,9 @@ class Sites:
         noise: variance of the noise, or of the term of an interval, shape [B, N].
         factor: Cholesky factor of the covariance of noisy scores, shape [B, N, N].
         scores: noisy scores of each chain, 0 where new or padded, shape [B, S, N].
-        fresh: mask of new observations, bool, shape [B, N].
+        is_new: mask of new observations, bool, shape [B, N].
         censored: mask of intervals that have a term.
-        open: mask of cells whose labels are drawn.
+        is_open: mask of cells whose labels are drawn.
         flippable: mask of cells that may flip together with a patch.
     """
 
@@ -203,9 +203,9 @@ class Sites:
     noise: Tensor
     factor: Tensor
     scores: Tensor
-    fresh: Tensor
+    is_new: Tensor
     censored: Tensor
-    open: Tensor
+    is_open: Tensor
     flippable: Tensor
 
     @classmethod
@@ -221,49 +221,49 @@ class Sites:
             window: maximum number of cells; more if more have changed.
         """
         row, column, exists = _nearest_cells(evidence, changed, window)
-        at = block.at[0], row, column
+        map_index = block.map_index[0], row, column
         cell, inside = _cells_in_block(row, column, exists, block)
-        neighbours, couplings = _neighbours(cell, block.lattice)
+        neighbours, couplings = _neighbours(cell, block.couplings)
         coupled = torch.where(inside[..., None], couplings, 0)
 
         def by_class(values: Tensor) -> Tensor:
             class_first = values.transpose(0, 1)
-            at_sites = class_first[:, *at].transpose(0, 1)
+            at_sites = class_first[:, *map_index].transpose(0, 1)
             return torch.where(exists[:, None], at_sites, 0.0)
 
         lower = by_class(evidence.lower)
         upper = by_class(evidence.upper)
-        std = torch.where(exists, evidence.noise_std[at], 1.0)
-        fresh = changed[at] & exists
+        std = torch.where(exists, evidence.noise_std[map_index], 1.0)
+        is_new = changed[map_index] & exists
         interval = (upper > lower)[:, 0]
-        censored = interval & ~fresh
-        precision = evidence.precision[at].clamp(min=_MIN_PRECISION)
+        censored = interval & ~is_new
+        precision = evidence.precision[map_index].clamp(min=_MIN_PRECISION)
         noise = torch.where(censored, 1 / precision, std.square())
         row_offset = row[:, :, None] - row[:, None]
         column_offset = column[:, :, None] - column[:, None]
-        member = block.at[0][..., None]
-        covariance = evidence.field.covariance(member, row_offset, column_offset)
+        episode = block.map_index[0][..., None]
+        covariance = evidence.field.covariance(episode, row_offset, column_offset)
         both_exist = exists[:, :, None] & exists[:, None]
         covariance = torch.where(both_exist, covariance, 0.0)
         variance = torch.where(exists, 1 + noise, 1.0)
         covariance.diagonal(dim1=1, dim2=2).copy_(variance)
-        labels = unpacked(evidence.labels[at]).transpose(1, 2)
+        labels = unpacked(evidence.labels[map_index]).transpose(1, 2)
         first_scores = lower[:, :1]
         second_scores = lower[:, 1:]
         scores = torch.where(labels, first_scores, second_scores)
-        term_mean = evidence.shift[at] / precision
+        term_mean = evidence.shift[map_index] / precision
         scores = torch.where(censored[:, None], term_mean[:, None], scores)
-        is_old = exists & ~fresh
+        is_old = exists & ~is_new
         old_scores = torch.where(is_old[:, None], scores, 0.0)
-        may_change = inside & (evidence.pair[at] > 0)
-        unsettled = (evidence.p_first[at] - 0.5).abs() < 0.5 - _SETTLED
+        may_change = inside & (evidence.pair[map_index] > 0)
+        unsettled = (evidence.p_first[map_index] - 0.5).abs() < 0.5 - _SETTLED
         return cls(
             row=row,
             column=column,
             cell=cell,
             neighbours=neighbours,
             coupled=coupled,
-            strength=block.lattice.strength,
+            strength=block.couplings.strength,
             lower=lower,
             upper=upper,
             density=by_class(evidence.density),
@@ -271,9 +271,9 @@ class Sites:
             noise=noise,
             factor=torch.linalg.cholesky(covariance),
             scores=old_scores,
-            fresh=fresh,
+            is_new=is_new,
             censored=censored,
-            open=fresh | (may_change & unsettled),
+            is_open=is_new | (may_change & unsettled),
             flippable=may_change & ~interval,
         )
 
@@ -303,7 +303,7 @@ class Sites:
         n_first = unpacked(neighbour_labels).sum(1)
         # Coupled neighbours are −1, so that the sum is minus their number.
         minus_n_coupled = coupled.sum(1)[:, None]
-        odds = self.strength * (n_first * 2 + minus_n_coupled)
+        log_odds = self.strength * (n_first * 2 + minus_n_coupled)
         lower = self.lower[:, :, site, None]
         upper = self.upper[:, :, site, None]
         density = self.density[:, :, site, None]
@@ -324,19 +324,19 @@ class Sites:
         log_mass = log_upper + torch.log(-torch.expm1(log_ratio))
         log_evidence = torch.where(is_number, log_density, log_mass)
         first_evidence, second_evidence = log_evidence.unbind(1)
-        p_first = torch.sigmoid(odds + first_evidence - second_evidence)
-        both_odds = torch.stack((odds, -odds), 1)
-        log_prior = torch.nn.functional.logsigmoid(both_odds)
+        p_first = torch.sigmoid(log_odds + first_evidence - second_evidence)
+        both_log_odds = torch.stack((log_odds, -log_odds), 1)
+        log_prior = torch.nn.functional.logsigmoid(both_log_odds)
         log_total = (log_evidence + log_prior).logsumexp(1)
         is_first = uniforms[..., 0] < p_first
         # A score within the interval, by inversion of its CDF.
         p_low = torch.special.ndtr(lower_z)
         p_interval = torch.special.ndtr(upper_z) - p_low
         rank = p_low + p_interval * uniforms[:, None, :, 1]
-        z = torch.special.ndtri(rank.clamp(min=1e-300))
-        inner = mean + std * torch.where(mirrored, -z, z)
-        inner = torch.maximum(torch.minimum(inner, upper), lower)
-        score = torch.where(is_number, lower, inner)
+        quantile = torch.special.ndtri(rank.clamp(min=1e-300))
+        within = mean + std * torch.where(mirrored, -quantile, quantile)
+        within = torch.maximum(torch.minimum(within, upper), lower)
+        score = torch.where(is_number, lower, within)
         score = torch.where(is_first, score[:, 0], score[:, 1])
         return is_first, p_first, log_total, score
 
@@ -400,18 +400,18 @@ def _cells_in_block(
     return cell, inside
 
 
-def _neighbours(cell: Tensor, lattice: Lattice) -> tuple[Tensor, Tensor]:
+def _neighbours(cell: Tensor, couplings: Couplings) -> tuple[Tensor, Tensor]:
     """Return the four neighbours of some cells of a block, and their couplings.
 
     A coupling has either all bits set or no bit. Both have the shape [B, N, 4].
     """
-    width = lattice.right.shape[2]
-    last = lattice.right[0].numel() - 1
-    all_bits = torch.full_like(lattice.right, -1)
-    words = [word.flatten(1) for word in lattice.neighbours(all_bits)]
-    couplings = torch.stack(words, 2)
+    width = couplings.right.shape[2]
+    last = couplings.right[0].numel() - 1
+    all_bits = torch.full_like(couplings.right, -1)
+    words = [word.flatten(1) for word in couplings.neighbours(all_bits)]
+    coupled_bits = torch.stack(words, 2)
     steps = torch.tensor((1, -1, width, -width), device=cell.device)
     index = cell[..., None]
     neighbours = (index + steps).clamp(0, last)
-    coupled = couplings.gather(1, index.expand(-1, -1, 4))
+    coupled = coupled_bits.gather(1, index.expand(-1, -1, 4))
     return neighbours, coupled
