@@ -1,13 +1,13 @@
 """Labels of look-alike cells given λ: 64 chains, resampled near new observations.
 
 Chains are weighted by the likelihood of new observations and resampled (a particle
-filter). Three kinds of moves follow. Sweeps draw unobserved cells given their
-neighbours. One proposal changes the label of a whole patch of cells. Observed cells
-that are new or open are drawn given all others, by the joint density of scores. An
-older observation of λ = 0 or 1, whose score is an interval, is represented by a
-Gaussian term of expectation propagation at the more probable label of its cell. Only
-cells near new observations are drawn (`sites`). A labelling that no chain contains can
-return only by these moves.
+filter). Then three kinds of moves change their labels. Sweeps draw unobserved cells
+given their neighbours. One proposal changes the label of a whole patch of cells. Open
+cells (newly observed, or observed with both labels still likely) are drawn given all
+other cells, by the joint density of scores. An earlier observation of λ = 0 or 1, whose
+score is an interval, is represented by a Gaussian term of expectation propagation under
+the more probable label of its cell. Only cells near new observations are drawn
+(`sites`). After resampling, a labelling that no chain has can return only by the moves.
 Letters in shapes: B episodes, H×W cells, R×C cells of a block, N observed cells, S
 chains.
 """
@@ -31,13 +31,11 @@ from benchnav.planning.sensing.labels import (
 )
 from benchnav.planning.sensing.sites import MIN_CHANGE, Block, Evidence, Sites
 
-_ROUNDS = 6  # sweeps in an update
-_COUNTED = 3  # final sweeps, from which probabilities are estimated
+_ROUNDS = 6  # number of sweeps in an update
+_COUNTED = 3  # number of final sweeps from which probabilities are estimated
 _FIRST_COUNTED = _ROUNDS - _COUNTED
-# Passes over observed cells with stored random numbers. Later passes use those of other
-# cells.
-_PASSES = 8
-_STEP = 13, 31  # offset of these cells in rows and columns, on the torus
+_PASSES = 8  # number of passes over observed cells with stored random numbers
+_STEP = 13, 31  # rows and columns by which the stored numbers then shift, on the torus
 _N_OFFSETS = 4096  # stored random numbers of resamplings
 
 
@@ -47,12 +45,13 @@ def draw_labels(
     """Draw labels near changed cells, and estimate probabilities of classes there.
 
     Args:
-        evidence: scores include new observations; terms and probabilities do not.
+        evidence: evidence whose scores, but not terms and probabilities, include the
+            new observations.
         changed: mask of cells with new observations, one or more in each episode, bool,
             shape [B, H, W].
-        strength: β of the Potts field.
-        window: maximum number of observed cells that are used, those nearest to the
-            changed ones; more if more have changed.
+        strength: β of the Potts field, ≥ 0.
+        window: maximum number of observed cells in use, those nearest to the changed
+            cells; all changed cells are used even if there are more.
 
     Returns:
         The evidence with new `p_first`, `labels` and `sweeps`.
@@ -87,7 +86,7 @@ def draw_labels(
             )
             n_bonded_first = count_bits(labels & bonded)
             n_unbonded = CHAINS - count_bits(bonded)
-            # Cells that no bonds join to evidence have either label with probability ½.
+            # If no bonds join a cell to evidence, either label has probability ½.
             n_first = n_first + n_bonded_first + 0.5 * n_unbonded
         sweeps = sweeps + 1
     labels = labels.flatten(1)
@@ -96,8 +95,8 @@ def draw_labels(
     is_replaced = (block.free != 0) & has_moved
     p_block = torch.where(is_replaced, p_block, block.p_first)
     p_first = evidence.p_first.index_put(block.map_index, p_block.flatten(1))
-    # A settled cell whose label was changed by a patch or by resampling has the
-    # fraction of its chains with the first label.
+    # If a patch or the resampling changed the labels of a cell that is not open, its
+    # probability is the fraction of chains with the first label.
     site_labels = labels.gather(1, sites.cell)
     p_chains = count_bits(site_labels) / CHAINS
     p_before = block.p_first.flatten(1).gather(1, sites.cell)
@@ -115,10 +114,10 @@ def draw_labels(
 def _weigh_and_resample(
     labels: Tensor, sites: Sites, sweeps: Tensor, torus_size: int
 ) -> tuple[Tensor, Tensor]:
-    """Weigh and resample chains by new observations, one by one.
+    """Weight chains by the new observations, one after another, and resample them.
 
     Returns:
-        Labels of a block, [B, RC], and scores, [B, S, N].
+        Words of the labels, shape [B, RC], and scores, shape [B, S, N].
     """
     new_sites = sites.is_new
     factor = sites.factor
@@ -172,9 +171,12 @@ def _flip_patch(
 ) -> tuple[Tensor, Tensor]:
     """Propose the other label for the patch of the last new cell (Metropolis).
 
-    Moves of single labels cannot leave a wrong class, since neighbouring scores are
+    Moves of single labels can hardly leave a wrong class, since neighbouring scores are
     correlated. A patch is not flipped if any of its cells is out of reach or observed
     as an interval.
+
+    Returns:
+        Words of the labels, shape [B, R, C], and scores, shape [B, S, N].
     """
     flippable = sites.flippable
     cell = sites.cell
@@ -225,10 +227,11 @@ def _draw_observed(
     sweeps: Tensor,
     torus_size: int,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Draw the labels of open cells given all others.
+    """Draw the labels of open cells, each given all other cells.
 
     Returns:
-        Labels [B, RC], scores [B, S, N], and probabilities of the first class [B, N].
+        Words of the labels [B, RC], scores [B, S, N], and probabilities of the first
+        class [B, N].
     """
     scores = scores.clone()
     p_first = torch.zeros_like(sites.std)
@@ -244,7 +247,7 @@ def _draw_observed(
         residual = product[..., 0] / precision
         old_score = scores[:, :, site]
         mean = old_score - residual
-        # The noise of an interval widens its bounds, whatever term represents it.
+        # For an interval, `sites.noise` may be the variance of its Gaussian term.
         exact_noise = sites.std[:, site].square()
         noise = exact_noise - sites.noise[:, site]
         variance = (1 / precision + noise[:, None]).clamp(min=1e-12)
@@ -261,7 +264,14 @@ def _draw_observed(
 
 
 def _put_labels(labels: Tensor, cell: Tensor, first: Tensor, is_new: Tensor) -> Tensor:
-    """Replace the labels of one cell of each episode where they are new, [B, RC]."""
+    """Return words in which the labels of one cell per episode are replaced, [B, RC].
+
+    Args:
+        labels: words of the labels, int64, shape [B, RC].
+        cell: index of the cell of each episode, int64, shape [B].
+        first: mask of chains with the first label in that cell, bool, shape [B, S].
+        is_new: mask of episodes whose labels are replaced, bool, shape [B, 1].
+    """
     index = cell[:, None]
     old_word = labels.gather(1, index)
     new_word = packed(first)[:, None]
@@ -270,9 +280,16 @@ def _put_labels(labels: Tensor, cell: Tensor, first: Tensor, is_new: Tensor) -> 
 
 
 def _uniforms(passes: Tensor, sites: Sites, torus_size: int, begin: int) -> Tensor:
-    """Return two random numbers for each chain and each site from `begin` on.
+    """Return two random numbers in [0, 1) for each chain and each site from `begin` on.
 
-    Float64, shape [B, N, S, 2].
+    Args:
+        passes: number of passes of each episode so far, int64, shape [B].
+        sites: the observed cells.
+        torus_size: number of rows and of columns of the stored random numbers.
+        begin: index of the first site.
+
+    Returns:
+        Float64, shape [B, number of these sites, S, 2].
     """
     count = passes[:, None]
     uses = count // _PASSES

@@ -1,29 +1,29 @@
-"""The belief of look-alike classes: observed λ determines the class of cells, and
-conditions λ within the class.
+"""The belief `classes`: observed λ updates the class of look-alike cells, and λ.
 
 Some classes look exactly alike, so that a prediction splits a cell's weight between the
-two classes of a pair. Such a cell has a label, the first class or the second. Under
+two classes of a pair. Such a cell has a label: the first class or the second. Under
 either label, that class has all of the pair's weight in the cell's prediction; the
-weights of other classes are unchanged. A cell that may belong to two pairs belongs to
-the heavier one. Given labels c and normal scores z_i = Φ⁻¹(F_i(y_i | c_i)) of observed
-λ y, the joint density of all observations is
+weights of other classes are unchanged. A cell that may belong to two pairs is assigned
+to the heavier pair. Given labels c_i and normal scores z_i = Φ⁻¹(F_i(y_i | c_i)) of
+observed λ y_i, the joint density of all observations is
 
     p(y | c) = N(z; 0, K + noise) · Π_i f_i(y_i | c_i) / φ(z_i),
 
-where K is the correlation matrix of the scores. For λ of 0 or 1, the probability of an
+where F_i and f_i are the predicted CDF and density, φ is the standard normal density
+and K is the correlation matrix of the scores. For λ of 0 or 1, the probability of an
 interval replaces the density. The labels are a Potts field without an outer field
-(`labels`), of which 64 chains are drawn given y (`chains`).
+(`labels`). It is sampled given y by 64 chains (`chains`).
 
-The prediction's odds of the two classes enter a cell's own posterior once,
-P(first | y) ∝ odds · P(first | y, even odds). They are not an outer field of the
-chains: the model has already used the neighbours of a cell, and an outer field would
-count this evidence once more for each of them. Without measurements a cell has the model's
-probabilities.
+The predicted odds of the two classes of a cell enter its posterior odds as a factor,
+once. They are not an outer field of the chains: a model has already used the cell's
+neighbours, and an outer field would count this evidence again for each of them. Without
+measurements, P(class) is the model's.
 
-λ is then the average of its distributions under either label, each conditioned as in
-`copula`: with scores of the field at the more probable label of each observed cell, and
-for an observed cell also at the other label. Cells without a pair, such as unobserved
-ones, are as under `copula`.
+The belief is the average of two distributions of λ, one under either label, weighted by
+P(class). Each is conditioned as in `copula`, with the scores of observed cells under
+their more probable labels. The distribution of an observed cell under its less probable
+label uses the cell's own score under that label. Cells without a pair are updated as in
+`copula`.
 Letters in shapes: B episodes, H×W cells.
 """
 
@@ -67,11 +67,11 @@ from benchnav.planning.sensing.pairs import split_by_class, statistics_of
 from benchnav.planning.sensing.score_table import TabulatedDistribution
 from benchnav.planning.sensing.sensor import Measurement
 
-_MAX_STRENGTH = 0.88  # ln(1 + √2) is critical
-_FIRST_SWEEPS = 40  # of cells without measurements, on whole maps
-_MORE_SWEEPS = 10  # of cells whose appearance is observed later
+_MAX_STRENGTH = 0.88  # below the critical strength ln(1 + √2) of a Potts field
+_FIRST_SWEEPS = 40  # at the start, over whole maps
+_MORE_SWEEPS = 10  # over cells that are assigned to a pair later
 _MIN_STD = 1e-9  # of a score, as a divisor
-_SAME_LOG_ODDS = 0.01  # maximum difference of log odds that counts as none
+_SAME_LOG_ODDS = 0.01  # smaller differences of predicted log odds are ignored
 
 
 @dataclass(frozen=True)
@@ -85,14 +85,14 @@ class Classes(Belief[ClassesState]):
     Args:
         correlation_m: assumed ℓ, as in `Copula`.
         window: maximum number of observations in an update, as in `Copula`.
-        strength: β, the log odds that a neighbour adds for its own class; None for the
-            strength on the training maps, but at most 0.88. Above 0.881 = ln(1 + √2) a
-            Potts field tends to a single class, so that few observations would decide
-            the class of all look-alike cells. A strength fitted to neighbouring cells
-            is far higher, 2.3 on stakes-v1. On these maps the mean log loss of P(class)
-            in cells up to 6 m from a path with measurements is 0.693 without evidence,
-            0.665 with β = 0.5, 0.617 with 0.8, 0.603 with 0.88, 0.624 with 1.0, 0.774
-            with 1.4 and 1.070 with 2.15.
+        strength: β ≥ 0, the log odds that a neighbour adds for its own class; None for
+            the strength fitted to the training maps, but at most 0.88. Above
+            ln(1 + √2) ≈ 0.881, a Potts field tends to a single class, so that few
+            observations would decide the class of all look-alike cells. The fitted
+            strength is far higher, 2.3 on stakes-v1. On these maps, in cells up to 6 m
+            from a path with measurements, the mean log loss of P(class) is 0.693
+            without evidence, 0.665 with β = 0.5, 0.617 with 0.8, 0.603 with 0.88, 0.624
+            with 1.0, 0.774 with 1.4 and 1.070 with 2.15.
     """
 
     needs_statistics: ClassVar[bool] = True
@@ -142,11 +142,11 @@ class Classes(Belief[ClassesState]):
         sensed: Measurement,
         prior: TraversabilityDistribution | None = None,
     ) -> ClassesState:
-        """Draw labels near new observations, and condition cells there.
+        """Draw labels near new observations, and condition cells near them.
 
-        A new prediction replaces the old one in the same cells as in `Copula`. Scores
-        of observed λ there are computed again; several measurements of a cell count as
-        one.
+        A new prediction replaces the old one where it differs, as in `Copula`. The
+        scores of observed λ are computed again there, and repeated measurements of a
+        cell then count as one.
         """
         updated = state
         has_new_prediction = torch.zeros_like(sensed.mask)
@@ -164,7 +164,7 @@ class Classes(Belief[ClassesState]):
         )
         copula = self._copula.learn(copula, to_condition)
         updated = replace(updated, copula=copula)
-        # Rows of the tables for `at`.
+        # The tables need rows for the cells that `at` will be called with.
         cells = self.changed(state, updated)
         first, second = updated.per_class
         first_rows = copula.table.with_rows(first.prior, cells)
@@ -175,7 +175,12 @@ class Classes(Belief[ClassesState]):
         return replace(updated, copula=copula, per_class=(first, second))
 
     def _draw_labels(self, state: ClassesState, changed: Tensor) -> ClassesState:
-        """Return the state with labels drawn near new observations, bool, [B, H, W]."""
+        """Return the state with labels drawn near changed observations.
+
+        Args:
+            state: state with the observations; it is not changed.
+            changed: mask of changed observations, bool, shape [B, H, W].
+        """
         episodes = _episodes_with(changed & (state.pair > 0))
         if len(episodes) == 0:
             return state
@@ -190,7 +195,7 @@ class Classes(Belief[ClassesState]):
     def distribution(self, state: ClassesState) -> TraversabilityDistribution:
         """Return the average of the distributions under either class.
 
-        Each is conditioned on all observations.
+        Each of the two distributions is conditioned on all observations.
         """
         if not statistics_of(state.copula.covariance).look_alikes:
             return self._copula.distribution(state.copula)
@@ -248,7 +253,7 @@ class Classes(Belief[ClassesState]):
     def put(
         self, state: ClassesState, members: Tensor, others: ClassesState
     ) -> ClassesState:
-        """Replace episodes; see `Belief`."""
+        """Return the belief state with some episodes replaced; see `Belief`."""
         put = self._copula.put
         copula = put(state.copula, members, others.copula)
         first, second = state.per_class
@@ -261,11 +266,11 @@ class Classes(Belief[ClassesState]):
     def sample_fields(
         self, state: ClassesState, count: int, keys: Sequence[int]
     ) -> Tensor:
-        """Draw a chain's labels, then scores given all observations, and λ of both.
+        """Draw fields of λ from the labels of a random chain and from drawn scores.
 
-        Prior odds can make the probability of a label differ from its fraction among
-        the chains. Labels of the less likely class are then changed to the other class,
-        by one random number per field, so that patches remain whole.
+        Predicted odds can make P(class) differ from the fraction of the chains with
+        that class. Then some labels are switched to the more probable class. All cells
+        of a field are switched by the same random number, so that patches stay whole.
         """
         scores = self._copula.sample_scores(state.copula, count, keys)
         means, stds, _ = moments_of(state)
@@ -297,7 +302,7 @@ class Classes(Belief[ClassesState]):
         return torch.stack(fields, 1)
 
     def _strength(self, covariance: CovarianceModel) -> float:
-        """Return β: the option, or the fitted strength up to the maximum."""
+        """Return β: the option `strength`, or the fitted strength up to the maximum."""
         if self.strength is not None:
             return self.strength
         return min(statistics_of(covariance).potts_strength, _MAX_STRENGTH)
@@ -305,7 +310,14 @@ class Classes(Belief[ClassesState]):
     def _sweep(
         self, state: ClassesState, unlabelled: Tensor, count: int
     ) -> ClassesState:
-        """Sweep labels of unobserved cells, bool [B, H, W], given those of all others."""
+        """Draw labels of some cells by sweeps, given the labels of all other cells.
+
+        Args:
+            state: current state; it is not changed.
+            unlabelled: mask of cells without measurements whose labels are drawn, bool,
+                shape [B, H, W].
+            count: number of sweeps.
+        """
         episodes = _episodes_with(unlabelled)
         if len(episodes) == 0:
             return state
@@ -334,10 +346,11 @@ class Classes(Belief[ClassesState]):
     def _with_prior(
         self, state: ClassesState, prior: TraversabilityDistribution
     ) -> tuple[ClassesState, Tensor]:
-        """Replace the prediction where it differs, and score the observed λ again.
+        """Replace the prediction where it differs, and recompute observed scores there.
 
         Returns:
-            The state, and the mask of cells with a new prediction, bool, [B, H, W].
+            The new state, and a mask of cells with a new prediction, bool, shape
+            [B, H, W].
         """
         first, second, pair, log_odds = split_by_class(prior, state.copula.covariance)
         new_first, first_differs = copula_state.with_prior(state.per_class[0], first)
@@ -381,8 +394,8 @@ def _episodes_with(cells: Tensor) -> Tensor:
 def _switch_probabilities(state: ClassesState) -> tuple[Tensor, Tensor]:
     """Return probabilities of switching a label to the first class and to the second.
 
-    They make up for the difference between the posterior probability of the first class
-    and its fraction among the chains. Each has the shape [B, H, W].
+    With these, drawn labels have the posterior probability of the first class instead
+    of its fraction among the chains. Each result has the shape [B, H, W].
     """
     p_first = state.probability()
     of_chains = count_bits(state.labels) / CHAINS

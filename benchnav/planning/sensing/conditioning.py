@@ -1,8 +1,8 @@
 """Conditioning of the maps of one episode on its observations, and the estimate of ℓ.
 
-Only cells within `_UPDATE_RADIUS` ℓ of changed observations are updated, from all observations
-up to `_EXTRA_RADIUS` ℓ farther away. A cell changes only if the mean or the standard
-deviation of its score moves by `_MIN_CHANGE` or more.
+Only cells within `_UPDATE_RADIUS` of changed observations are updated, from all
+observations up to `_EXTRA_RADIUS` farther away. A cell changes only if the mean, the
+standard deviation or the median of its score changes by `_MIN_CHANGE` or more.
 Letters in shapes: N observations, H×W map.
 """
 
@@ -29,18 +29,18 @@ from benchnav.planning.sensing.lattice import (
 )
 
 _UPDATE_RADIUS = 4.0  # in ℓ; the correlation is 3e-4 at this distance
-# In ℓ. Observations farther away change no cell within `_UPDATE_RADIUS` by `_MIN_CHANGE`.
+# In ℓ. Observations beyond it change no cell within `_UPDATE_RADIUS` by `_MIN_CHANGE`.
 _EXTRA_RADIUS = 2.0
 # Maximum number of observations without a lattice, so that an update takes at most half
-# a second. Those nearest to changed ones are used, and other observed cells are not
-# updated.
+# a second. The observations nearest to changed ones are used. Observed cells beyond the
+# limit are not updated.
 _MAX_EXACT = 2048
-_MIN_CHANGE = 0.005  # of a score
+_MIN_CHANGE = 0.005  # in normal scores
 _MEDIAN_PER_SKEW = 1 / 6  # change of the median of a score per change of its skewness
 _MOMENTS = ("mean", "std", "skew")
 MEDIAN_M = 1.5
 """Median of the prior of ℓ, in metres."""
-_LOG_STD = math.log(2)  # of the prior of ℓ
+_LOG_STD = math.log(2)  # standard deviation of the prior of log ℓ
 _OCTAVES = [step / 4 for step in range(-8, 9)]
 _LENGTHS_M = tuple(MEDIAN_M * 2**octaves for octaves in _OCTAVES)
 MIN_OBSERVATIONS = 8
@@ -50,16 +50,17 @@ MIN_OBSERVATIONS = 8
 def condition_maps(
     field: Field, member: int, maps: dict[str, ndarray], changed: ndarray, window: int
 ) -> None:
-    """Condition terms and scores near changed observations of one episode, in place.
+    """Condition scores near changed observations of one episode, in place.
 
-    Cells within `_UPDATE_RADIUS` ℓ of changed observations are computed from all observations
-    up to `_EXTRA_RADIUS` ℓ farther away. Hence no observation that affects them is omitted.
+    Cells within `_UPDATE_RADIUS` of changed observations are computed from all
+    observations up to `_EXTRA_RADIUS` farther away, so that no observation that affects
+    them is omitted.
 
     Args:
         field: correlations of the scores.
-        member: index of the episode in the field.
-        maps: maps of `CopulaState` by name, float64, shape [H, W].
-        new: mask of changed observations, bool, shape [H, W].
+        member: index of the episode in `field`.
+        maps: maps of `CopulaState` by name, float64, shape [H, W]; they are changed.
+        changed: mask of changed observations, bool, shape [H, W].
         window: number of observations above which a lattice is used.
     """
     length = float(field.length[member])
@@ -90,8 +91,8 @@ def condition_maps(
     std = np.sqrt(variance.clip(0))
     old_moments = np.stack([maps[name][block] for name in _MOMENTS])
     new_moments = np.stack((mean, std, skew)).reshape(old_moments.shape)
-    # Observed cells beyond the limit keep their posterior, which includes more
-    # observations than this update.
+    # Observed cells beyond the limit keep their posterior: it includes observations
+    # that this update omits.
     unchanged = is_unused[block]
     if not observed.interval.any():
         # Conditioning on numbers never increases a standard deviation.
@@ -118,7 +119,15 @@ def _condition_exactly(
 ) -> tuple[ndarray, ndarray, tuple[ndarray, ndarray, ndarray]]:
     """Condition on observations and predict a block of cells, without a lattice.
 
-    The result is that of `condition_and_predict`.
+    Args:
+        field: correlations of the scores.
+        member: index of the episode in `field`.
+        observed: observations of N cells.
+        cells: rows and columns of the N observed cells.
+        block: rows and columns of the block.
+
+    Returns:
+        As in `condition_and_predict`, with the cells of the block as targets.
     """
     row = torch.from_numpy(cells[0])[:, None]
     column = torch.from_numpy(cells[1])[:, None]
@@ -138,7 +147,15 @@ def _condition_exactly(
 
 
 def _slices_around(changed: ndarray, margin: int) -> tuple[slice, slice]:
-    """Return the rows and columns of a map within some cells of changed ones."""
+    """Return the smallest rectangle around the changed cells, widened by a margin.
+
+    Args:
+        changed: mask of changed cells, bool, shape [H, W].
+        margin: margin in cells; the rectangle ends at the map's borders.
+
+    Returns:
+        Slices of rows and of columns.
+    """
     slices = []
     for ends, size in zip(bounds(changed), changed.shape, strict=True):
         first, last = ends
@@ -150,7 +167,7 @@ def _slices_around(changed: ndarray, margin: int) -> tuple[slice, slice]:
 
 
 def _observed(maps: dict[str, ndarray], row: ndarray, column: ndarray) -> Observed:
-    """Return the observations of some cells of one episode."""
+    """Return the observations of the cells at these rows and columns."""
     names = ("lower", "upper", "noise_std", "precision", "shift")
     return Observed(*(maps[name][row, column] for name in names))
 
@@ -161,10 +178,10 @@ def estimate_length(
     row: ndarray,
     column: ndarray,
 ) -> float:
-    """Return ℓ of one episode in cells: the mode of its posterior among `_LENGTHS_M`.
+    """Return an episode's ℓ in cells: the mode of its posterior among `_LENGTHS_M`.
 
     Args:
-        covariance_model: covariance model, whose ℓ is ignored.
+        covariance_model: covariance model; its ℓ is ignored.
         maps: maps of `CopulaState` by name, float64, shape [H, W].
         row: rows of the observed cells, shape [N].
         column: columns of the observed cells, shape [N].
@@ -204,12 +221,17 @@ def bounds(mask: ndarray) -> list[tuple[int, int]]:
 def nearest(
     observed: ndarray, changed: ndarray, max_cells: int
 ) -> tuple[ndarray, ndarray]:
-    """Return rows and columns of new cells and of the observed cells nearest to them.
+    """Return rows and columns of the changed cells and of the observed cells nearby.
+
+    Observed cells are ordered by their distance to the rectangle around the changed
+    cells.
 
     Args:
-        observed: mask of observed cells, new ones included, bool, shape [H, W].
-        new: mask of new cells, bool, shape [H, W].
-        window: maximum number of cells; more if more are new.
+        observed: mask of observed cells, which include the changed cells, bool, shape
+            [H, W].
+        changed: mask of changed cells, bool, shape [H, W].
+        max_cells: maximum number of returned cells; all changed cells are returned even
+            if there are more.
     """
     row, column = observed.nonzero()
     (top, bottom), (first_column, last_column) = bounds(changed)

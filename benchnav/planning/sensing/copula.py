@@ -1,13 +1,13 @@
 """The copula belief: observed λ conditions the Gaussian field behind the world's λ.
 
-A cell's λ has a rank in its own predicted distribution. The normal score of the rank is
-a number, or an interval where the distribution has an atom, as at 0 and 1. The scores
-of all cells are a correlated Gaussian field (`benchnav.core.copula`), which is
-conditioned on the observed scores (`gaussian`). With the true distribution of each cell
-this is the posterior under the covariance model, up to four approximations: expectation
-propagation for intervals, limited distances (`conditioning`), the lattice that replaces
-many observations (`lattice`), and the rejection of draws without a feasible path. With
-a model's prediction the marginals are approximate too.
+The normal score of a cell's λ is Φ⁻¹(F(λ)), where F is the cell's predicted CDF. It is
+a number, or an interval if λ is at an atom, such as 0 or 1. The scores of all cells are
+a correlated Gaussian field (`benchnav.core.copula`), which is conditioned on the
+observed scores (`gaussian`). If the prediction is the true distribution of each cell,
+the result is the posterior under the covariance model, up to four approximations:
+expectation propagation for intervals; limited distances (`conditioning`); a lattice of
+cells if there are many observations (`lattice`); and no correction for fields without a
+feasible path, which worlds reject. A model's prediction also approximates the marginals.
 
 Letters in shapes: B episodes, H×W cells, N observations, R×C cells of a block, K values
 of λ.
@@ -68,16 +68,18 @@ class Copula(Belief[CopulaState]):
     """Belief that updates cells near measurements of λ, by spatial correlation.
 
     Args:
-        correlation_m: assumed ℓ in metres; `world` for the ℓ of the world, which is
-            privileged; or `estimated` for an estimate from each episode's observations.
-            The estimate is the mode of the posterior of log ℓ under a log-normal prior
-            of median 1.5 m and standard deviation ln 2. It is computed at 8, 16, 32, …
-            observations until the window is full; before, ℓ is the median.
-        window: maximum number of observations in an estimate of ℓ, those nearest to
-            changed ones. If an update has more observations, and ℓ is four cells or
-            more, it solves for a lattice of cells (`lattice`).
+        correlation_m: assumed ℓ in metres, ≥ 0; `world` for the ℓ of the world, which
+            is privileged; or `estimated` for an estimate from each episode's
+            observations. The estimate is the mode of the posterior of log ℓ. The prior
+            of log ℓ is normal, with median ln 1.5 m and standard deviation ln 2. ℓ is
+            1.5 m at first, and is estimated at 8, 16, 32, … observations until the
+            window is full.
+        window: maximum number of observations in an estimate of ℓ, ≥ 1; the
+            observations nearest to changed ones are used. If an update has more
+            observations and ℓ is four cells or more, the field is approximated by a
+            lattice of cells (`lattice`).
         nugget: fraction of the variance of a cell's score that is independent of all
-            other cells; None for that of the covariance model.
+            other cells, in [0, 1); None for the nugget of the covariance model.
     """
 
     correlation_m: float | Literal["world", "estimated"] = "world"
@@ -92,9 +94,10 @@ class Copula(Belief[CopulaState]):
             is_valid = 0 <= length < math.inf
         expect(
             is_valid,
-            f"`correlation_m` ≥ 0 and finite, 'world' or 'estimated', got {length!r}.",
+            "`correlation_m` as a finite number ≥ 0, 'world' or 'estimated', got "
+            f"{length!r}.",
         )
-        expect(self.window >= 1, f"`window` of at least 1, got {self.window}.")
+        expect(self.window >= 1, f"`window` ≥ 1, got {self.window}.")
         expect(
             self.nugget is None or 0 <= self.nugget < 1,
             f"`nugget` in [0, 1), got {self.nugget}.",
@@ -143,9 +146,9 @@ class Copula(Belief[CopulaState]):
     ) -> CopulaState:
         """Condition cells near new observations.
 
-        Repeated measurements of a number are averaged. If a measurement is an interval,
-        the least noisy one is used. A new prediction replaces the old one in cells
-        whose parameters differ by more than 10⁻³.
+        Repeated measurements of a cell are averaged if their scores are numbers. Of
+        intervals, the least noisy one is used. A new prediction replaces the old one in
+        cells where its parameters differ by more than 10⁻³.
         """
         updated = state
         new_prior = torch.zeros_like(state.observed)
@@ -160,17 +163,18 @@ class Copula(Belief[CopulaState]):
         )
 
     def learn(self, state: CopulaState, changed: Tensor) -> CopulaState:
-        """Condition cells near changed observations.
+        """Return the state with cells near changed observations conditioned.
 
         Args:
-            noted: state with the observations; it is not changed.
-            changed: mask of observations not yet conditioned on, bool, shape [B, H, W].
+            state: state with the observations; it is not changed.
+            changed: mask of observations on which the state is not yet conditioned,
+                bool, shape [B, H, W].
         """
         has_changed = changed.flatten(1).any(1)
         episodes = has_changed.nonzero()[:, 0].tolist()
         if not episodes:
             return state
-        # On the host, where such small systems are solved quickest.
+        # Such small systems are solved quickest on the CPU.
         maps = {name: getattr(state, name).to("cpu") for name in _MAPS}
         host = replace(state, **maps)
         copies = {name: getattr(host, name).clone().to("cpu") for name in _CONDITIONED}
@@ -188,8 +192,13 @@ class Copula(Belief[CopulaState]):
     ) -> None:
         """Condition one episode on its observations, in place.
 
-        Episodes are conditioned one by one, since their numbers of observations differ,
-        and no episode may depend on the others.
+        Episodes are conditioned one by one, since their numbers of observations differ
+        and no episode may depend on another.
+
+        Args:
+            state: state of all episodes, on the CPU; it is changed.
+            episode: index of the episode.
+            changed: mask of its changed observations, bool, shape [H, W].
         """
         maps = {name: getattr(state, name)[episode].numpy() for name in _MAPS}
         observed = ~np.isnan(maps["value"])
@@ -208,7 +217,7 @@ class Copula(Belief[CopulaState]):
                 shape = covariance.grid.shape
                 field = Field.of(shape, [length], "cpu", covariance.nugget)
                 state.field.write(episode, field)
-                # All observations are conditioned on again, from the prior.
+                # Under the new ℓ, the prior is conditioned on all observations again.
                 maps["mean"][:] = 0
                 maps["std"][:] = 1
                 maps["skew"][:] = 0
@@ -223,10 +232,9 @@ class Copula(Belief[CopulaState]):
         return ConditionedDistribution(state.prior, mean, std, state.skew.to(dtype))
 
     def at(self, state: CopulaState, cells: Tensor) -> TabulatedDistribution:
-        """Return the belief in some cells; see `Belief`.
+        """Return the belief in some cells, from a table of scores; see `Belief`.
 
-        A table of scores makes it far faster than `distribution`; λ̂ differs by less
-        than 0.01.
+        This is far faster than `distribution`. λ̂ differs from it by less than 0.01.
         """
         table = state.table.with_rows(state.prior, cells)
         mean = state.mean[cells]
@@ -253,7 +261,8 @@ class Copula(Belief[CopulaState]):
     ) -> Tensor:
         """Draw fields given all observations, by Matheron's rule.
 
-        A field drawn from the covariance model is shifted towards the observations.
+        Fields are drawn from the covariance model and then corrected by the
+        observations.
         """
         return state.fields(self.sample_scores(state, count, keys))
 
@@ -273,7 +282,7 @@ class Copula(Belief[CopulaState]):
     def _sample_episode(
         self, state: CopulaState, episode: int, count: int, key: int
     ) -> Tensor:
-        """Return Gaussian scores of one episode by Matheron's rule, [M, H, W]."""
+        """Return Gaussian scores of one episode by Matheron's rule, shape [M, H, W]."""
         grid = state.covariance.grid
         device = state.mean.device
         length_m = float(state.field.length[episode]) * grid.resolution_m

@@ -1,16 +1,16 @@
 """Sparse conditioning of a correlated field on many observations, by a lattice of cells.
 
-If ℓ is several cells long, the field is smooth from cell to cell. Its values on a
-coarse lattice of cells, the basis, then determine it. The remaining variance of a cell
-counts as independent of all other cells. All observations are used. For N observations
-and m basis cells the cost is N m² instead of N³.
+If ℓ is several cells long, the field is smooth from cell to cell. Its values in a
+coarse lattice of cells, the basis, then almost determine the field. The remaining
+variance of a cell is assumed to be independent of all other cells. For N observations
+and m basis cells, the computation takes N m² operations instead of N³.
 
 Sources: Snelson and Ghahramani (2006), "Sparse Gaussian processes using pseudo-inputs"
 (FITC), for point observations; Naish-Guzman and Holden (2008), "The generalized FITC
 approximation", for intervals, by expectation propagation as in `gaussian`.
 
-One field at a time, in NumPy and float64, as in `gaussian`. Letters in shapes: N
-observations, M cells, m cells of the basis, H×W map.
+Fields are conditioned one at a time, in NumPy and float64, as in `gaussian`.
+Letters in shapes: N observations, M cells, m cells of the basis, H×W map.
 """
 
 from dataclasses import dataclass
@@ -31,32 +31,36 @@ from benchnav.planning.sensing.gaussian import (
     third_cumulants,
 )
 
-# Added to a variance of 1, so that the lattice's covariance has a Cholesky factor.
+# Added to each basis cell's variance, so that their covariance has a Cholesky factor.
 _JITTER = 1e-8
-# Steps of the lattice by which the basis extends beyond the observed cells. With 1,
-# some variances have an error of 0.02.
+# Number of basis cells by which the basis extends beyond the observed cells. With a
+# margin of 1, some variances have an error of 0.02.
 _MARGIN = 2
 
-Cells = tuple[ndarray, ndarray]  # rows and columns
+Cells = tuple[ndarray, ndarray]
+"""Rows and columns of cells."""
 
 
 def spacing_of(length: float) -> int:
-    """Return the spacing of the basis in cells: ℓ/2.
+    """Return the spacing of the basis in cells, ℓ/2 rounded down.
 
-    Errors of standard deviations are then below 0.003.
+    With this spacing, errors of standard deviations are below 0.003.
+
+    Args:
+        length: ℓ in cells.
     """
     return int(length // 2)
 
 
 @dataclass(frozen=True)
 class Lattice:
-    """A basis of some cells of a field.
+    """Cells whose scores determine those of all cells nearby: the basis.
 
     Args:
         field: correlations of the scores.
         member: index of the field.
-        basis: the basis cells.
-        root: Cholesky factor of their covariance, shape [m, m].
+        basis: rows and columns of the basis cells.
+        root: Cholesky factor of the covariance of the basis cells, shape [m, m].
     """
 
     field: Field
@@ -66,7 +70,7 @@ class Lattice:
 
     @classmethod
     def around(cls, field: Field, member: int, cells: Cells) -> "Lattice":
-        """Return the basis for some observed cells."""
+        """Return the lattice around observed cells."""
         spacing = spacing_of(float(field.length[member]))
         height = field.down.shape[1]
         width = field.across.shape[1]
@@ -74,7 +78,7 @@ class Lattice:
         basis_columns = np.arange(spacing // 2, width, spacing)
         nearest_row = (cells[0] // spacing).clip(0, len(basis_rows) - 1)
         nearest_column = (cells[1] // spacing).clip(0, len(basis_columns) - 1)
-        # Padded by the margin on all sides.
+        # The mask of used basis cells is padded by the margin on all sides.
         n_rows = len(basis_rows) + 2 * _MARGIN
         n_columns = len(basis_columns) + 2 * _MARGIN
         is_used = np.zeros((n_rows, n_columns), bool)
@@ -89,9 +93,14 @@ class Lattice:
         return cls(field, member, basis, root)
 
     def coefficients(self, cells: Cells) -> tuple[ndarray, ndarray]:
-        """Return coefficients [m, M] of cells in independent normals, and residuals [M].
+        """Return cells as linear functions of m independent standard normals.
 
-        A residual is the variance of a cell that the coefficients do not explain.
+        Args:
+            cells: rows and columns of M cells.
+
+        Returns:
+            Coefficients of the cells, shape [m, M], and the residual variance of each
+            cell, which the normals do not explain, shape [M].
         """
         covariance = _covariance_without_nugget(
             self.field, self.member, self.basis, cells
@@ -114,11 +123,12 @@ def _covariance_without_nugget(
 
 @dataclass(frozen=True)
 class Normals:
-    """The independent normals of a lattice, given Gaussian terms of some cells.
+    """Posterior of a lattice's m normals, given Gaussian terms of some cells.
 
     Args:
-        factor: Cholesky factor of their precision, shape [m, m].
-        whitened_shift: shift of the terms, solved by the factor, shape [m].
+        factor: L, the Cholesky factor of the normals' posterior precision, shape
+            [m, m].
+        whitened_shift: L⁻¹ times the posterior shift (precision times mean), shape [m].
     """
 
     factor: Tensor
@@ -126,16 +136,16 @@ class Normals:
 
     @classmethod
     def of(cls, precision: Tensor, shift: ndarray) -> "Normals":
-        """Return the normals of precision [m, m] and shift [m]."""
+        """Return the posterior of precision [m, m] and shift [m]."""
         factor = torch.linalg.cholesky(precision)
         column = torch.from_numpy(shift)[:, None]
         whitened = torch.linalg.solve_triangular(factor, column, upper=False)
         return cls(factor, whitened[:, 0].numpy())
 
     def whiten(self, weights: ndarray) -> ndarray:
-        """Solve coefficients of cells by the factor, [m, M].
+        """Return L⁻¹ times coefficients of cells, shape [m, M].
 
-        The squares of a column add up to the variance of a cell.
+        The squares in a column add up to the variance that the normals give to a cell.
         """
         columns = torch.from_numpy(weights)
         return torch.linalg.solve_triangular(self.factor, columns, upper=False).numpy()
@@ -151,11 +161,11 @@ def _moments(
     """Return mean [M], variance [M] and whitened coefficients [m, M] of cells with terms.
 
     Args:
-        normals: normals of the lattice.
+        normals: posterior of the lattice's normals.
         weights: coefficients of the cells, shape [m, M].
         residual: residual variance of the cells, shape [M].
-        precision: precision of their terms, shape [M].
-        shift: precision times mean of their terms, shape [M].
+        precision: precision of the cells' own terms, 0 without a term, shape [M].
+        shift: precision times mean of these terms, shape [M].
     """
     whitened = normals.whiten(weights)
     shrink = 1 / (1 + residual * precision)
@@ -179,13 +189,14 @@ def _added_by_terms(
 def condition_and_predict(
     lattice: Lattice, observed: Observed, cells: Cells, targets: Cells
 ) -> tuple[ndarray, ndarray, tuple[ndarray, ndarray, ndarray]]:
-    """Condition a field on observations of some cells, and predict others.
+    """Condition a field on observations, and predict target cells.
 
     Args:
-        lattice: the basis around the observed cells.
+        lattice: the lattice around the observed cells.
         observed: observations; the terms of intervals are start values.
-        cells: the observed cells, N.
-        targets: the cells to predict, M; observed ones may be among them.
+        cells: rows and columns of the N observed cells.
+        targets: rows and columns of the M cells to predict, which may include observed
+            cells.
 
     Returns:
         Precision and shift of the terms that represent the observations, each of shape
@@ -203,7 +214,7 @@ def condition_and_predict(
     censored_weights = weights[:, censored]
     censored_residual = residual[censored]
     if censored.any():
-        # One term for each interval, all updated at once and damped.
+        # Expectation propagation, as in `gaussian.condition`.
         terms = Terms(observed.precision[censored], observed.shift[censored])
         lower = observed.lower[censored]
         upper = observed.upper[censored]
@@ -220,7 +231,7 @@ def condition_and_predict(
         precision[censored], shift[censored] = terms
         added, added_shift = _added_by_terms(*censored_inputs, *terms)
         normals = Normals.of(prior_precision + added, prior_shift + added_shift)
-    # Terms of the targets that are observed.
+    # Targets that are observed have terms of their own.
     field = lattice.field
     map_shape = field.down.shape[1], field.across.shape[1]
     precision_map = np.zeros(map_shape)
