@@ -43,10 +43,10 @@ class Near(Sensor):
             metres.
         fov_deg: field of view in degrees, centred on the robot's heading, in (0, 360].
         height_m: height of the mast above the terrain under the robot, in metres.
-        colour_noise: standard deviation of the noise of each colour channel (0–255) per
-            metre of distance.
-        elevation_noise: standard deviation of the noise of elevation, in metres per
-            metre of distance.
+        colour_noise: standard deviation of the noise of each colour channel, on the
+            scale 0–255, per metre of distance.
+        elevation_noise: standard deviation of the noise of elevation in metres, per
+            metre of distance to the cell.
     """
 
     range_m: float = 8.0
