@@ -172,7 +172,7 @@ class _BeliefCheck:
         )
 
     def check_state(self, state: Any) -> bool:
-        """Note faults of a state's distribution; return whether there are none."""
+        """Note faults of a state's distribution; return whether it is valid."""
         belief = self.breaches.watch(
             "distribution", lambda: self.belief.distribution(state), state=state
         )
