@@ -13,7 +13,7 @@ from benchnav.metrics import Episode, Metric
 
 
 class Detour(Metric):
-    """Driven length over that of the straight line to the goal's edge; NaN if failed."""
+    """Driven length divided by the straight distance to the goal's edge; NaN if failed."""
 
     name = "detour"
     column = "detour"
@@ -21,7 +21,7 @@ class Detour(Metric):
     better = "lower"
 
     def compute(self, episode: Episode) -> float:
-        """Return the ratio of the two lengths, about 1 for a straight drive."""
+        """Return the ratio of the lengths, about 1 for a straight drive."""
         if not episode.success:
             return math.nan
         driven_m = np.linalg.norm(np.diff(episode.positions_m, axis=0), axis=1).sum()

@@ -1,4 +1,4 @@
-"""A custom traversability model: a small network and its loss, trained like ours.
+"""A custom traversability model: a small network and its loss, trained by a command.
 
     benchnav-train fit examples/own_model.py:CellModel --data DATASET --out checkpoints/mine --members 3
     benchnav-train evaluate examples/own_model.py:CellModel@checkpoints/mine --data DATASET

@@ -2,9 +2,9 @@
 
     benchnav-eval run --planners '[straight,examples/own_planner.py:Fan]' --risks '[mean,cvar:0.9]' --out runs/fan
 
-Commands find it by its file. The parameters of its constructor are its options, as in
-`{part: examples/own_planner.py:Fan, label: wide fan, options: {arcs: 31}}`. One line
-tests it: `check_planner("examples/own_planner.py:Fan")` of `benchnav.testing`.
+Commands find the planner by its file. The parameters of its constructor are its
+options, as in `{part: examples/own_planner.py:Fan, label: wide fan, options: {arcs:
+31}}`. To test it, call `benchnav.testing.check_planner("examples/own_planner.py:Fan")`.
 """
 
 import torch
@@ -13,7 +13,7 @@ from benchnav.planning import Plan, Planner, Problem, Step
 
 
 class Fan(Planner[Problem]):
-    """Planner that rolls out every arc under λ̂ and follows that of minimum cost.
+    """Planner that rolls out arcs under λ̂ and follows the arc of minimum cost.
 
     Args:
         arcs: number of arcs.

@@ -4,7 +4,7 @@ benchnav-eval run --planners '[straight,astar_dwa]' --risks
   '[mean,examples/own_risk.py:worst, {part: examples/own_risk.py:cautious, label: mean -
   2 std, options: {deviations: 2.0}}]' --out runs/risks
 
-One line tests each: `check_risk("examples/own_risk.py:worst")` of `benchnav.testing`.
+To test one, call `benchnav.testing.check_risk("examples/own_risk.py:worst")`.
 """
 
 import torch
@@ -38,7 +38,7 @@ def cautious(
 ) -> torch.Tensor:
     """Return the mean minus some standard deviations, shape [B, H, W].
 
-    A standard deviation is half the distance between the quantiles 0.16 and 0.84.
+    A standard deviation is half the distance between the 16 % and the 84 % quantile.
 
     Args:
         distribution: predicted λ.

@@ -1,4 +1,4 @@
-"""A custom robot and objective; `check_robot` and `check_objective` of `benchnav.testing` test them.
+"""A custom robot and objective; `benchnav.testing` has `check_robot` and `check_objective` to test them.
 
 benchnav-eval run --robots '[examples/own_robot.py:Tracked]' --objectives '[examples/own_robot.py:Energy]' \
   --planners '[straight,astar_dwa,mppi]' --risks '[mean]' --out runs/tracked

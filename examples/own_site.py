@@ -25,7 +25,7 @@ from benchnav import Terrain, planning
 from benchnav.datagen import TerrainDataset, create_dataset, load_recipe
 
 WEST, SOUTH, CELL = 500_000.0, 4_000_000.0, 0.5
-HEIGHT, WIDTH = 96, 640  # cells: 48 m × 320 m
+HEIGHT, WIDTH = 96, 640  # in cells; 48 m × 320 m
 DRIVES, LEGS, LEG_S, REACH_M = 24, 4, 30.0, 15.0
 GENERATOR = torch.Generator().manual_seed(0)
 SIZE = (f"height={HEIGHT}", f"width={WIDTH}", "splits={site: {scenario: std, maps: 1}}")
@@ -33,7 +33,7 @@ MAPS = ("height=48", "width=48", "places={least_distance_m: 10, margin_m: 2}")
 
 
 def command(line: str, folder: Path, *more: str) -> None:
-    """Run a command in the folder, as a user would."""
+    """Run a command in the folder."""
     name, *words = line.split()
     print(f"\n$ {line} {' '.join(more)}", flush=True)
     # For networks and suites this small, one thread without compiling is fastest.
@@ -47,9 +47,12 @@ def command(line: str, folder: Path, *more: str) -> None:
 
 
 def survey(folder: Path) -> Terrain:
-    """Generate terrain and write the rasters of a survey; return it for all drives.
+    """Generate terrain and write it as the rasters of a survey.
 
-    The rows of rasters run from north to south, those of maps from south to north.
+    Rows of rasters run from north to south, and rows of maps from south to north.
+
+    Returns:
+        The terrain, once per drive.
     """
     recipe = load_recipe("stakes-v1", ["id=ground", *SIZE])
     for _ in create_dataset(recipe, folder / "ground.h5"):
@@ -85,7 +88,8 @@ def drive(terrain: Terrain) -> pd.DataFrame:
     )
     extent = torch.tensor(terrain.grid.extent_m)
     fraction = torch.rand(DRIVES, 2, generator=GENERATOR)
-    fraction[:, 0] = (torch.arange(DRIVES) + 0.5) / DRIVES  # all along the site
+    # Drives start at equal distances along the site.
+    fraction[:, 0] = (torch.arange(DRIVES) + 0.5) / DRIVES
     position = 2 + fraction * (extent - 4)
     logs, steps = [], round(LEG_S / task.robot.dt_s)
     for leg in range(LEGS):

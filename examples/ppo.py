@@ -4,8 +4,8 @@
     python examples/ppo.py datasets/stakes-train.h5 ppo.zip --steps 100000
     benchnav-eval run --data stakes-v1 --model stakes-v1 --planners '[straight,examples/ppo.py:Policy]' --out runs/ppo
 
-`Batched` passes all sub-environments to stable-baselines3 as one batch: 16 of them take
-a tenth of the time that they take in sequence.
+`Batched` passes all sub-environments to stable-baselines3 as one batch. A step of 16
+sub-environments then takes a tenth of the time that it takes one after another.
 """
 
 import argparse
@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 import benchnav  # noqa: F401 - registers the environment
 from benchnav.env import PolicyPlanner
 
-# Model and risk setting of the robot, which training and evaluation should share.
+# Model and risk setting of the robot; evaluate the policy with the same ones.
 KNOWS = {"model": "stakes-v1", "risk": "expected-time"}
 
 
@@ -73,14 +73,14 @@ class Batched(VecEnv):
 
     def set_attr(self, attr_name, value, indices=None):
         raise NotImplementedError(
-            "Expected no attribute of a sub-environment, got `set_attr`. All of them "
-            "are one batch."
+            "Expected no call of `set_attr`, since the sub-environments are one batch. "
+            "Pass settings to `Batched`."
         )
 
     def env_method(self, method_name, *method_args, indices=None, **method_kwargs):
         raise NotImplementedError(
-            "Expected no method of a sub-environment, got `env_method`. All of them "
-            "are one batch."
+            "Expected no call of `env_method`, since the sub-environments are one "
+            "batch. Call methods of `Batched.envs`."
         )
 
     def env_is_wrapped(self, wrapper_class, indices=None):

@@ -7,12 +7,12 @@
 A bag is a .bag, .mcap or .db3 file, or a folder with metadata.yaml. Each bag is one
 drive.
 
-Odometry (`nav_msgs/Odometry`) must measure the speed over ground, for example fused
-with GNSS, vision or lidar. Odometry of the wheels only does not see slip, so λ would be
-1 everywhere. The speed is along the robot's axis. The position is in the odometry's
+Odometry (`nav_msgs/Odometry`) must measure the speed over ground, for example by GNSS,
+vision or lidar. Odometry from wheels only does not measure slip, so λ would be 1
+everywhere. The speed is along the robot's axis. The position is in the odometry's
 frame, which `--origin EAST NORTH HEADING_DEG` places in the coordinate reference system
 of the elevation model. A command (`geometry_msgs/Twist` or `TwistStamped`) is valid
-until the next one, but for half a second at most.
+until the next command, but for half a second at most.
 """
 
 import argparse
@@ -22,7 +22,7 @@ from pathlib import Path
 
 import pandas as pd
 
-HOLDS_S = 0.5
+MAX_COMMAND_AGE_S = 0.5
 ODOMETRY = ("nav_msgs/msg/Odometry",)
 COMMANDS = ("geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped")
 
@@ -42,8 +42,8 @@ def read(path: Path, odometry: str, command: str) -> pd.DataFrame:
             "it: pip install rosbags"
         )
     odometry_rows, commanded = [], []
-    # Message definitions are read from the bag. Old bags of ROS 2 have none: they get
-    # those of Humble.
+    # Message definitions are read from the bag. Old bags of ROS 2 contain no
+    # definitions; those of ROS 2 Humble are used for them.
     if not path.exists():
         sys.exit(f"Expected an existing bag, got {path}.")
     with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bag:
@@ -90,7 +90,7 @@ def read(path: Path, odometry: str, command: str) -> pd.DataFrame:
     commands = pd.DataFrame(
         commanded, columns=["time_s", "commanded_m_s"], dtype=float
     ).sort_values("time_s")
-    rows = pd.merge_asof(rows, commands, on="time_s", tolerance=HOLDS_S)
+    rows = pd.merge_asof(rows, commands, on="time_s", tolerance=MAX_COMMAND_AGE_S)
     return rows.assign(
         time_s=(rows["time_s"] - rows["time_s"].min()).round(3), drive=str(path)
     )

@@ -44,8 +44,8 @@ class EnvBatch:
     Args:
         size: B.
         data: path or id of a dataset.
-        split: split of the dataset. If empty, `train`, or the first split if there is
-            no `train`.
+        split: split of the dataset. If empty, `train`; without a split `train`, the
+            first split, with a warning.
         robot: name or mapping of a registered robot, or a robot.
         objective: name or mapping of an objective, or an objective. If empty, the
             shaped reward.
@@ -67,8 +67,8 @@ class EnvBatch:
         """Load the maps of the split.
 
         Raises:
-            ConfigError: If a layer of the dataset has the name of another observation,
-                or `world` needs a time budget or stored λ that the maps do not have.
+            ConfigError: If a layer of the dataset is named `state` or `goal`, or
+                `world` needs a time budget or stored λ that the maps do not have.
         """
         guard.limit_threads()
         guard.warn_of_default_world(world)
@@ -99,13 +99,13 @@ class EnvBatch:
         clashes = {"state", "goal"} & set(self._maps.layers)
         expect(
             not clashes,
-            f"layers that are not named 'state' or 'goal', got {sorted(clashes)} in "
-            f"{dataset.path}.",
+            "layers with other names than the observations 'state' and 'goal', got "
+            f"{sorted(clashes)} in {dataset.path}. Rename these layers.",
         )
         stored = dataset.read(split, fields=["start_m", "goal_m", "reference_time_s"])
         places = {name: torch.from_numpy(values) for name, values in stored.items()}
         self._places = Endpoints(**places)
-        # Both raise here rather than in the first reset.
+        # Both calls raise for an unsuitable world here instead of in the first reset.
         self._world.budget_s(self._places.reference_time_s, robot_model.top_speed_mps)
         check_traversability(self._maps, self._world)
         self._map = np.zeros(size, dtype=np.int64)
@@ -132,20 +132,20 @@ class EnvBatch:
 
         Args:
             generators: random generators of the sub-environments, length B.
-            chosen: sub-environments that start, bool, shape [B].
-            map_index: map of all sub-environments that start; if None, each map is
-                drawn.
+            chosen: mask of sub-environments that start, bool, shape [B].
+            map_index: index of the map of all these sub-environments; if None, a map is
+                drawn for each.
         """
         guard.limit_threads()
         members = np.flatnonzero(chosen)
         for i in members.tolist():
             generator = generators[i]
-            # A map is drawn even if it is given, so that the noise seed is the same.
+            # A map is drawn even if one is given, so that the noise seed is the same.
             drawn = generator.integers(len(self._maps))
             self._map[i] = drawn if map_index is None else map_index
             self._noise_seed[i] = generator.integers(2**48)
         maps = torch.from_numpy(self._map[members])
-        # Tensors of inference mode cannot be changed in place outside of it.
+        # Tensors created in inference mode could not be changed in place later.
         with torch.inference_mode(False):
             places = self._places.select(maps)
             new_simulation = Simulation(
@@ -164,7 +164,7 @@ class EnvBatch:
             self._simulation = new_simulation
             self._now = start
             return
-        # Only new episodes are built: the others keep their maps and noise.
+        # Only the new episodes are replaced; all others keep their maps and noise.
         indices = torch.from_numpy(members)
         self._simulation.exchange_(indices, new_simulation)
 
@@ -180,11 +180,12 @@ class EnvBatch:
 
         Args:
             actions: actions of the sub-environments, shape [B, A].
-            hold: sub-environments whose actions are not used, bool, shape [B]; by
-                default, all actions are used.
+            hold: mask of sub-environments whose actions are ignored, bool, shape [B];
+                by default, all actions are used.
 
         Raises:
-            ConfigError: If the actions are of another type or shape, or not finite.
+            ConfigError: If the actions are not real numbers, have a wrong shape, or are
+                not finite.
             ResetNeeded: If no episode has begun.
         """
         self._current()
@@ -206,14 +207,15 @@ class EnvBatch:
 
         Args:
             actions: actions of the sub-environments, shape [B, A]; see `read_actions`.
-            hold: sub-environments that wait, bool, shape [B]; by default, none waits.
+            hold: mask of sub-environments that take no step, bool, shape [B]; by
+                default, all take a step.
 
         Returns:
             Reward (float64), terminated (bool), truncated (bool), and observed λ
             (float32), each of shape [B].
 
         Raises:
-            ConfigError: If the actions are of another shape, or not finite.
+            ConfigError: If the actions have a wrong shape, or are not finite.
             ResetNeeded: If an episode has ended, or none has begun.
         """
         guard.limit_threads()
@@ -249,7 +251,7 @@ class EnvBatch:
         """Return observations and diagnostics of all sub-environments.
 
         Args:
-            traversability: λ observed in the last step, shape [B]; 1 if not given.
+            traversability: λ observed in the last step, shape [B]; if None, it is 1.
 
         Returns:
             Two dictionaries of arrays, whose first dimension is B.
@@ -268,7 +270,7 @@ class EnvBatch:
         return observations, self._diagnose(traversability)
 
     def _diagnose(self, traversability: np.ndarray | None) -> Observations:
-        """Return diagnostics with the observed λ, 1 if not given."""
+        """Return diagnostics of all sub-environments; see `observe`."""
         _, now = self._current()
         if traversability is None:
             traversability = np.ones(len(self._map), np.float32)
@@ -303,8 +305,8 @@ class EnvBatch:
         cost: Tensor = self._objective.stage(
             before.state, action, traversability, self._goal_m()
         )
-        # Without the remaining steps, losing the robot would be the cheapest end of a
-        # costly episode.
+        # The cost of the remaining steps is added, since otherwise losing the robot
+        # would be the cheapest end of a costly episode.
         remaining_steps = (simulation.steps - now.step) * is_lost
         return -cost * (1 + remaining_steps)
 
@@ -340,7 +342,7 @@ def _unbounded(shape: tuple[int, ...]) -> spaces.Box:
 
 
 def _is_lost(outcome: Tensor) -> Tensor:
-    """Return whether robots left the map or are immobilised for good."""
+    """Return a mask of robots that left the map or are immobilised for good."""
     is_off_map = outcome == Outcome.OUT_OF_BOUNDS
     is_immobilised = outcome == Outcome.IMMOBILISED
     return is_off_map | is_immobilised

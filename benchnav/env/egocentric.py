@@ -1,8 +1,8 @@
 """Gymnasium environment `benchnav/OffRoad-v1`, single and vectorised.
 
 The robot updates its knowledge during the episode. Observations contain its current
-knowledge, in its own frame; they never contain the truth. Letters in shapes: N×N cells
-of the crop, S state and A action dimensions.
+knowledge, in its own frame; they never contain the truth.
+Letters in shapes: B sub-environments, N×N cells of the crop, S state dimensions.
 """
 
 from typing import Any
@@ -39,9 +39,9 @@ class EgocentricEnv(OffRoadEnv):
     | `normalised_actions` | `False`     | whether actions are in [−1, 1], scaled to the robot's bounds       |
     | `render_mode`        | `None`      | `"rgb_array"`, or `"human"` for a window                           |
 
-    `oracle` is privileged: it knows the true distribution of λ in each cell, and fits
-    every dataset. For results that a robot can reach, pass a checkpoint that was
-    trained on such maps, such as `model="stakes-v1"`.
+    `oracle` is privileged: it is given the true distribution of λ in each cell. It
+    works on every dataset. For results that a robot can reach, pass a checkpoint that
+    was trained on maps of the same kind, such as `model="stakes-v1"`.
 
     ## Action space
     A `Box` of the robot's bounds, float32, as in v0. With `normalised_actions`, a `Box`
@@ -76,8 +76,8 @@ class EgocentricEnv(OffRoadEnv):
     The following are hidden: λ of all cells that the sensors did not measure; the true
     distribution of λ, unless the model is privileged; the dwell time on immobilising
     terrain, after which the episode ends; T, except for its remaining fraction; the
-    position and heading on the map; knowledge of terrain beyond the crop; and the time
-    until the next update.
+    robot's position and heading on the map; knowledge of terrain beyond the crop; and
+    the time until the next update.
 
     ## Knowledge
     Knowledge is updated as in `benchnav-eval`. With a belief that learns, λ is sensed
@@ -86,11 +86,11 @@ class EgocentricEnv(OffRoadEnv):
     conditioned on the measured λ, and λ̂ and spread change. Each episode has its own
     sensor noise, which follows from the seed. A belief that learns from λ, such as
     `"copula"`, needs a world of fixed λ, such as `"stakes"`. The belief of unobserved
-    terrain comes from the checkpoint's training maps, or for privileged models, from
-    the dataset or its recipe.
+    terrain comes from the checkpoint's training maps. For privileged models, it comes
+    from the dataset or its recipe.
 
     ## Reward, world, start, end and info
-    All are as in `benchnav/OffRoad-v0`, see `OffRoadEnv`.
+    These are as in `benchnav/OffRoad-v0`, see `OffRoadEnv`.
 
     ## Rendering
     `render()` returns an image of 640×480 pixels, uint8, shape (480, 640, 3). It shows
@@ -144,7 +144,8 @@ class EgocentricEnv(OffRoadEnv):
         """Return the image of the last step in mode `"rgb_array"`, else None."""
         if self.render_mode is None:
             guard.warn(
-                'render() draws nothing without `render_mode="rgb_array"` or "human".'
+                "render() draws no image, since `render_mode` is None. Create the "
+                'environment with `render_mode="rgb_array"` or "human".'
             )
         if self.render_mode != "rgb_array":
             return None

@@ -55,8 +55,8 @@ class Perception:
         belief: update of the prediction by measured λ.
         unseen: belief of unobserved terrain.
         replan_every_s: time between two updates of the knowledge, in seconds.
-        crop_cells: N, rows and columns of the crop.
-        crop_behind: fraction of the crop's length that is behind the robot.
+        crop_cells: N, number of rows and of columns of the crop, ≥ 2.
+        crop_behind: fraction of the crop's length that is behind the robot, in [0, 1).
         normalised_actions: whether actions are in [−1, 1].
     """
 
@@ -85,8 +85,8 @@ class EgocentricBatch(EnvBatch):
         """Load the maps of the split, and the model.
 
         Raises:
-            ConfigError: If an argument is invalid, or the world resamples λ for a
-                belief that learns.
+            ConfigError: If an argument is invalid, or the world resamples λ at each
+                step but the belief learns or the model is `clairvoyant`.
         """
         options = {}
         for field in fields(Perception):
@@ -118,8 +118,8 @@ class EgocentricBatch(EnvBatch):
         has_fixed_field = self._world.noise != "resampled"
         expect(
             has_fixed_field or not needs_fixed_field,
-            "a world of fixed λ for `clairvoyant` or a belief that learns, got `noise` "
-            "'resampled'. Pass world='stakes'.",
+            "a world of fixed λ, which the model 'clairvoyant' and beliefs that learn "
+            "need, got `noise` 'resampled'. Pass world='stakes'.",
         )
         statistics = None
         if not sensor.sees_all or belief.needs_statistics:
@@ -265,9 +265,10 @@ class EgocentricBatch(EnvBatch):
         )
 
     def _field(self) -> Tensor:
-        """Return λ of every cell, for sensors.
+        """Return the λ field that sensors receive, shape [B, H, W].
 
-        If λ is resampled at each step, sensors do not read the field.
+        If λ is resampled at each step, sensors of λ are not used, and the stored λ of
+        the maps is returned.
         """
         simulation, _ = self._current()
         if simulation.field is None:
@@ -281,7 +282,7 @@ class EgocentricBatch(EnvBatch):
         return low + (action + 1) / 2 * (high - low)
 
     def _extend_tracks(self, chosen: np.ndarray) -> None:
-        """Append the positions of the chosen robots, bool, shape [B], to their tracks."""
+        """Append the positions of the chosen robots (mask, bool, [B]) to their tracks."""
         if self._picture is None:
             return
         _, now = self._current()

@@ -1,8 +1,8 @@
 """Gymnasium environment `benchnav/OffRoad-v0`, single and vectorised.
 
 It is the base of all later versions. Observations contain the robot's state, its goal
-and the paper's Observation of the map; they never contain the truth. Letters in shapes:
-B sub-environments, H×W cells, S state and A action dimensions.
+and all layers of the map; they never contain the truth.
+Letters in shapes: B sub-environments, H×W cells, S state and A action dimensions.
 """
 
 from typing import Any
@@ -68,9 +68,9 @@ class OffRoadEnv(gymnasium.Env[Any, np.ndarray]):
     ## Reward
     Without `objective`: the progress toward the goal in metres, −0.1 per second, +10 at
     the goal, and −10 if the robot leaves the map or is immobilised for good. With
-    `objective`: minus its stage cost at the state before the step and the λ observed
-    there. A step that loses the robot costs the same again for each remaining step, as
-    if the robot stood there until T.
+    `objective`: minus the stage cost at the state before the step and the λ observed
+    there. If the robot leaves the map or is immobilised for good, the step's cost is
+    added once more for each step that remains until T.
 
     ## World
     `"paper"`: λ is resampled at each step, low λ ends no episode, T = 100 s.
@@ -84,8 +84,8 @@ class OffRoadEnv(gymnasium.Env[Any, np.ndarray]):
     An episode begins at the start of a map of the split, facing the goal. The map is
     drawn at random, or given by `options={"map": i}`. The episode terminates when the
     robot reaches the goal, leaves the map or is immobilised for good; it is truncated
-    after T. A step after the end raises `gymnasium.error.ResetNeeded`. Other options
-    and other types of `map` raise `ConfigError`.
+    after T. A step after the end raises `gymnasium.error.ResetNeeded`. Unknown options,
+    and a `map` that is not the index of a map, raise `ConfigError`.
 
     ## Info
 
@@ -183,9 +183,10 @@ class OffRoadVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         """Start an episode in all sub-environments, or in some.
 
         Args:
-            seed: seed of all sub-environments; if None, their generators continue.
-            options: `map`, and `reset_mask`: the sub-environments that start, bool,
-                shape [B].
+            seed: seed of the sub-environments that start; if None, their generators
+                continue.
+            options: `map`, the index of a map; and `reset_mask`, a mask of the
+                sub-environments that start, bool, shape [B]. By default, all start.
 
         Raises:
             ConfigError: If an option is unknown or invalid.
@@ -197,8 +198,8 @@ class OffRoadVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         is_mask = chosen.shape == default.shape and chosen.dtype == bool
         expect(
             is_mask and chosen.any(),
-            f"option `reset_mask` as bool of shape [{self.num_envs}], at least one "
-            f"true, got {chosen}.",
+            f"option `reset_mask` as bool of shape [{self.num_envs}] with at least one "
+            f"True, got {chosen}.",
         )
         if not self._generators and not chosen.all():
             raise gymnasium.error.ResetNeeded(
@@ -223,7 +224,7 @@ class OffRoadVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         """Take one time step; sub-environments whose episode has ended reset instead.
 
         Raises:
-            ConfigError: If the actions are invalid. Then nothing is reset.
+            ConfigError: If the actions are invalid. Then no episode is reset.
             ResetNeeded: If no episode has begun.
         """
         ended = self._ended
@@ -241,7 +242,7 @@ class OffRoadVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
 def _only(
     observations: Observations, info: Observations
 ) -> tuple[Observations, dict[str, Any]]:
-    """Return observation and info of a batch of one; the outcome by its name."""
+    """Return observation and info of a batch of one, with the outcome's name."""
     observation = {name: values[0] for name, values in observations.items()}
     diagnostics = {name: values[0].item() for name, values in info.items()}
     outcome = Outcome(diagnostics["outcome"])

@@ -1,9 +1,10 @@
 """Knowledge of the robots of an environment, updated during their episodes.
 
-It is a stateful shell over `benchnav.planning.sensing.learner`, which evaluations use
-too. λ is sensed at each step; the knowledge is updated every `replan_every_s` of an
-episode. Unlike in an evaluation, episodes begin at different times. Letters in shapes:
-B episodes, M selected episodes, S state dimensions, H×W cells.
+`Experience` is a stateful shell over `benchnav.planning.sensing.learner`, which
+evaluations use too. λ is measured at each step; the knowledge is updated every
+`replan_every_s` of an episode. Unlike in an evaluation, episodes begin at different
+times.
+Letters in shapes: B episodes, M selected episodes, S state dimensions, H×W cells.
 """
 
 from collections import OrderedDict
@@ -20,16 +21,16 @@ from benchnav.planning.sensing.knowledge import Knowledge, Truth
 from benchnav.planning.sensing.learner import Learner
 from benchnav.planning.sensing.sensor import Measurement
 
-_MAX_CACHED = 256  # maps, of up to a megabyte each
+_MAX_CACHED = 256  # number of maps, each of up to a megabyte
 
 
 @dataclass(frozen=True, kw_only=True)
-class _First(Batch):
+class _Start(Batch):
     """Knowledge of whole maps at the start of an episode.
 
     Args:
         prior: predicted distribution of λ.
-        knowledge: everything except the belief state, which follows from `prior`.
+        knowledge: the knowledge without the belief state, which follows from `prior`.
     """
 
     prior: TraversabilityDistribution
@@ -40,19 +41,19 @@ class Experience:
     """Knowledge of the robots of B sub-environments during their episodes.
 
     Args:
-        learner: senses, predicts and updates the belief.
-        update_steps: steps between two updates of the knowledge.
-        is_cacheable: whether the prediction of a whole map is the same in each of its
-            episodes.
+        learner: parts that sense, predict and update the belief.
+        update_steps: number of steps between two updates of the knowledge.
+        is_cacheable: whether the prediction of a whole map is the same in all episodes
+            on the map.
     """
 
     def __init__(self, learner: Learner, update_steps: int, is_cacheable: bool) -> None:
-        """Start without any episode."""
+        """Create the knowledge before the first episode."""
         self._learner = learner
         self._update_steps = update_steps
         self._senses = learner.belief.learns or not learner.sensor.sees_all
         self._is_cacheable = is_cacheable and learner.sensor.sees_all
-        self._cache: OrderedDict[int, _First] = OrderedDict()
+        self._cache: OrderedDict[int, _Start] = OrderedDict()
         self._knowledge: Knowledge | None = None
         self._truth: Truth | None = None
 
@@ -76,7 +77,7 @@ class Experience:
         Args:
             members: indices of the sub-environments, int64, shape [M].
             maps: index of the map of each of these sub-environments, length M.
-            truth: terrain, λ and sensor keys of these episodes.
+            truth: true state of the new episodes.
             state: initial states of the robots, shape [M, S].
         """
         knowledge = (
@@ -98,10 +99,10 @@ class Experience:
         """Sense in some sub-environments, and update their knowledge if it is due.
 
         Args:
-            step: steps that each episode has taken, int64, shape [B].
+            step: number of steps that each episode has taken, int64, shape [B].
             state: states of the robots, shape [B, S].
-            field: λ of every cell, shape [B, H, W].
-            is_sensing: sub-environments that sense, bool, shape [B].
+            field: current λ of all cells, shape [B, H, W].
+            is_sensing: mask of sub-environments that sense, bool, shape [B].
         """
         if not self._senses or self._truth is None:
             return
@@ -114,32 +115,41 @@ class Experience:
             self._update(due, truth)
 
     def _update(self, due: Tensor, truth: Truth) -> None:
-        """Update the knowledge of the episodes that are due, bool, shape [B]."""
+        """Update the knowledge in the episodes whose update is due.
+
+        Args:
+            due: mask of these episodes, bool, shape [B].
+            truth: true state in this step.
+        """
         learner = self._learner
         now = self._current()
-        needs_prediction = now.has_news & due
+        needs_prediction = now.has_new_appearance & due
         if bool(needs_prediction.any()):
-            # Only some episodes are updated: a prediction costs more than selecting.
+            # Episodes are selected, since predictions for all would take longer.
             members = needs_prediction.nonzero()[:, 0]
             selected = learner.select(now, members)
             updated, _ = learner.update(selected, truth.select(members))
             now = learner.put(now, members, updated)
         needs_update = (due & ~needs_prediction)[:, None, None]
         sensed = now.sensed
-        news = now.has_news
+        news = now.has_new_appearance
         has_measurements = sensed.mask & needs_update
         if bool(has_measurements.any()):
-            # The whole batch is updated: selecting costs more than the update.
+            # All episodes are updated, since selecting some would take longer.
             no_news = torch.zeros_like(news)
-            now = replace(now, sensed=_only(sensed, needs_update), has_news=no_news)
+            now = replace(
+                now, sensed=_only(sensed, needs_update), has_new_appearance=no_news
+            )
             now, _ = learner.update(now, truth)
-            now = replace(now, sensed=_only(sensed, ~needs_update), has_news=news)
+            now = replace(
+                now, sensed=_only(sensed, ~needs_update), has_new_appearance=news
+            )
         self._knowledge = now
 
     def _cached_start(
         self, maps: Sequence[int], truth: Truth, state: Tensor
     ) -> Knowledge:
-        """Return the initial knowledge of fully observed maps, through a cache."""
+        """Return the initial knowledge of fully observed maps, from a cache."""
         starts = []
         for index, map_index in enumerate(maps):
             if map_index not in self._cache:
@@ -147,7 +157,7 @@ class Experience:
                 knowledge = self._start(truth.select(member), state[member])
                 prior = self._learner.distribution(knowledge)
                 knowledge = replace(knowledge, belief_state=None)
-                self._cache[map_index] = _First(prior=prior, knowledge=knowledge)
+                self._cache[map_index] = _Start(prior=prior, knowledge=knowledge)
             self._cache.move_to_end(map_index)
             starts.append(self._cache[map_index])
         while len(self._cache) > _MAX_CACHED:
@@ -157,7 +167,7 @@ class Experience:
         return replace(joined.knowledge, belief_state=belief_state)
 
     def _start(self, truth: Truth, state: Tensor) -> Knowledge:
-        """Return the initial knowledge of some episodes."""
+        """Return the initial knowledge in new episodes."""
         learner = self._learner
         prediction = None
         if learner.sensor.sees_all:
@@ -171,6 +181,6 @@ class Experience:
 
 
 def _only(sensed: Measurement, is_selected: Tensor) -> Measurement:
-    """Return measurements of the selected episodes only, bool, shape [B, 1, 1]."""
+    """Return the measurements of the selected episodes (mask, bool, [B, 1, 1])."""
     traversability = sensed.traversability.masked_fill(~is_selected, torch.nan)
     return replace(sensed, traversability=traversability)

@@ -15,7 +15,7 @@ from benchnav.core.errors import ConfigError, expect
 from benchnav.core.settings import check_known
 from benchnav.planning.world.world import World
 
-# The process in which PyTorch may use threads; 0 in workers, which share the
+# Id of the process in which PyTorch may use threads; 0 in workers, which share the
 # processors.
 _MAIN_PROCESS = 0 if multiprocessing.parent_process() else os.getpid()
 
@@ -23,9 +23,9 @@ _MAIN_PROCESS = 0 if multiprocessing.parent_process() else os.getpid()
 def limit_threads() -> None:
     """Limit PyTorch to one thread in a worker process.
 
-    The limit is set once, so a program may set another number afterwards. It is needed
-    since threads do not survive a fork: an operation that waits for threads of the
-    parent never ends.
+    Threads do not survive a fork: an operation that waits for threads of the parent
+    process never ends. The limit is set once per process, so that a program may set
+    another number afterwards.
     """
     _limit_threads(os.getpid())
 
@@ -37,16 +37,16 @@ def _limit_threads(process: int) -> None:
 
 
 def warn(text: str) -> None:
-    """Warn as Gymnasium does, once for each text unless filters say otherwise."""
+    """Warn by Gymnasium's logger; by default, Python shows each text once."""
     gymnasium.logger.warn("%s", text)
 
 
 def check_render_mode(render_mode: str | None, modes: Collection[str]) -> None:
-    """Check that an environment has a render mode.
+    """Check that an environment supports a render mode.
 
     Args:
         render_mode: mode that the user passed.
-        modes: render modes of the environment; empty for version 0.
+        modes: render modes of the environment; empty for benchnav/OffRoad-v0.
 
     Raises:
         ConfigError: If the mode is not in `modes`.
@@ -63,7 +63,7 @@ def check_render_mode(render_mode: str | None, modes: Collection[str]) -> None:
 
 
 def has_display() -> bool:
-    """Return whether Matplotlib can draw: to a display, or as `MPLBACKEND` says."""
+    """Return whether Matplotlib has a display, or a backend named by `MPLBACKEND`."""
     if sys.platform != "linux":
         return True
     names = ("MPLBACKEND", "DISPLAY", "WAYLAND_DISPLAY")
@@ -94,7 +94,8 @@ def read_options(options: Any, names: Collection[str], maps: int) -> dict[str, A
         is_integer = isinstance(index, int | np.integer)
         is_index = is_integer and not isinstance(index, bool) and 0 <= index < maps
         expect(
-            is_index, f"option `map` as a whole number in 0–{maps - 1}, got {index!r}."
+            is_index,
+            f"option `map` as an integer from 0 to {maps - 1}, got {index!r}.",
         )
         checked["map"] = int(index)
     return checked
@@ -107,8 +108,8 @@ def read_numbers(
 
     Args:
         actions: actions of a policy.
-        single_shape: expected shape of the action of a single environment; None for
-            several environments, whose shape is not checked here.
+        single_shape: expected shape of the action of a single environment; if None, the
+            shape is not checked.
 
     Raises:
         ConfigError: If the actions are not real numbers, or have another shape.
@@ -120,7 +121,7 @@ def read_numbers(
         numbers = None
     if numbers is None:
         raise ConfigError(
-            f"Expected actions of real numbers, got {actions!r:.80}. Pass an array of "
+            f"Expected actions as real numbers, got {actions!r:.80}. Pass an array of "
             "floats."
         )
     if single_shape is not None and numbers.shape != single_shape:
@@ -136,7 +137,7 @@ def check_actions(actions: np.ndarray, acting: np.ndarray) -> None:
 
     Args:
         actions: actions of B sub-environments, shape [B, A].
-        acting: sub-environments that use their action, bool, shape [B].
+        acting: mask of sub-environments that use their action, bool, shape [B].
 
     Raises:
         ConfigError: If an action that is used is not finite.
@@ -153,24 +154,23 @@ def check_actions(actions: np.ndarray, acting: np.ndarray) -> None:
 
 
 def warn_of_default_world(world: str | Mapping[str, Any] | World) -> None:
-    """Warn if a user did not choose a world: by default, no terrain immobilises robots.
+    """Warn if a user did not choose whether terrain immobilises robots.
 
-    A preset, the key `immobile` and a `World` are choices. A mapping with other keys
-    only leaves the preset open.
+    A preset, the key `immobile` and a `World` make this choice.
     """
     is_default = world == ""
     if isinstance(world, Mapping):
         is_default = {"preset", "immobile"}.isdisjoint(world)
     if is_default:
         warn(
-            "`world` is 'paper' by default, where low λ ends no episode. Pass "
+            "`world` is 'paper' by default, in which low λ ends no episode. Pass "
             "world='stakes' for a world in which terrain immobilises the robot, or "
-            "pass preset 'paper' to choose it."
+            "choose the preset 'paper' explicitly to suppress this warning."
         )
 
 
 def warn_of_default_model() -> None:
-    """Warn that the model is privileged by default."""
+    """Warn that the default model is privileged."""
     warn(
         "`model` is 'oracle' by default, a privileged model: it is given the true "
         "distribution of λ. Pass a checkpoint, such as model='stakes-v1', for results "

@@ -34,7 +34,7 @@ _PANELS = {
     "top": 440 / 480,
 }
 _UNSEEN = 0.35  # brightness of unobserved terrain, relative to observed terrain
-_TEXT = 8.5  # points
+_TEXT = 8.5  # font size in points
 _MARKS = 1.3  # scale of the markers
 
 
@@ -47,12 +47,12 @@ class Scene:
         seen: mask of observed cells, bool, shape [H, W].
         crop: crop that the policy observes, shape [4, N, N].
         corners_m: corners of the crop on the map, in metres, shape [4, 2].
-        behind: fraction of the crop's length that is behind the robot.
+        behind: fraction of the crop's length that is behind the robot, in [0, 1).
         state: state of the robot, beginning with (x, y, θ), shape [S].
-        goal_m: (x, y) in metres, shape [2].
-        track: positions of the robot up to now, in metres, shape [P, 2].
+        goal_m: position (x, y) of the goal in metres, shape [2].
+        track: positions (x, y) of the robot so far, in metres, shape [P, 2].
         time_s: time since the start of the episode, in seconds.
-        observed: λ of the last step.
+        observed: λ observed in the last step.
         outcome: `running`, or the outcome of the episode.
     """
 
@@ -134,7 +134,7 @@ class Picture:
         is_off_map = (seen <= 0) & (spread == 0) & (scene.crop[0] == 0)
         image[is_off_map] = to_rgb(maps.MISSING)
         cells = len(values)
-        # In the image, ahead is up, and the robot's left is left.
+        # In the image, the robot faces up, and its left is on the left.
         image = image.transpose(1, 0, 2)[:, ::-1]
         maps.show_map(panel, image, (cells, cells))
         ahead = drives.robot_marker(np.pi / 2)
@@ -157,7 +157,7 @@ class Window:
 
         Raises:
             ConfigError: If there is no display, and `MPLBACKEND` does not name a
-                backend that works without a display.
+                backend that works without one.
         """
         # pyplot is imported here, since the import searches for a display.
         from matplotlib import pyplot

@@ -38,19 +38,21 @@ class PolicyState(Batch):
 class PolicyPlanner(Planner[PolicyState]):
     """Planner that follows a policy of `benchnav/OffRoad-v1`.
 
-    On the command line, name a policy in a file through a subclass. The parameters of
-    its constructor are its options:
+    To use a policy on the command line, write a subclass in a file. The parameters of
+    its constructor are the planner's options:
 
         class Mine(PolicyPlanner):
             def __init__(self, path: str = "policy.zip"):
                 super().__init__(load(path), normalised_actions=True)
 
     Args:
-        policy: returns actions, shape [B, A], for a batch of observations; each action
-            depends only on its own observation.
-        crop_cells: rows and columns of the crop, as in training.
-        crop_behind: fraction of the crop behind the robot, as in training.
-        normalised_actions: whether actions are in [−1, 1], as in training.
+        policy: function from a batch of observations to actions, shape [B, A]. The
+            action of an episode may depend only on the episode's observation.
+        crop_cells: number of rows and of columns of the crop, ≥ 2, as in training.
+        crop_behind: fraction of the crop's length that is behind the robot, in [0, 1),
+            as in training.
+        normalised_actions: whether actions are in [−1, 1], scaled to the robot's
+            bounds, as in training.
     """
 
     def __init__(
@@ -60,17 +62,17 @@ class PolicyPlanner(Planner[PolicyState]):
         crop_behind: float = 1 / 3,
         normalised_actions: bool = False,
     ) -> None:
-        """Create the planner of a policy, without a call of the policy."""
+        """Create the planner; the policy is not called."""
         self.policy = policy
         self.normalised_actions = normalised_actions
         self.view = View(cells=crop_cells, behind=crop_behind)
 
     def follows(self, task: Task) -> str:
-        """Return a description instead of an objective; see `Planner`."""
+        """Return a text which says that no objective is minimised; see `Planner`."""
         return "none (a policy, which does what it was trained for)"
 
     def init(self, problem: Problem, generator: torch.Generator) -> PolicyState:
-        """Return the plan state of the predicted λ, without draws; see `Planner`."""
+        """Return the plan state, with the predicted λ; see `Planner`."""
         knowledge = _knowledge_of(problem)
         return PolicyState(problem=problem, knowledge=knowledge)
 
@@ -103,8 +105,8 @@ class PolicyPlanner(Planner[PolicyState]):
         """Return the observations of `benchnav/OffRoad-v1` for B episodes.
 
         Args:
-            step: states of the robots, and the λ that they observed.
-            plan_state: problems, and knowledge of the terrain.
+            step: states of the robots, and λ that they observed in the last step.
+            plan_state: plan state of B episodes.
 
         Returns:
             `crop`, shape [B, 4, N, N], and `state`, shape [B, 5 + S − 3], both float32;
@@ -123,7 +125,7 @@ class PolicyPlanner(Planner[PolicyState]):
         return {name: values.cpu().numpy() for name, values in observations.items()}
 
     def revise(self, plan_state: PolicyState, problem: Problem) -> PolicyState:
-        """Return the plan state of the updated λ; see `Planner`."""
+        """Return the plan state with the updated λ; see `Planner`."""
         knowledge = _knowledge_of(problem)
         return PolicyState(problem=problem, knowledge=knowledge)
 

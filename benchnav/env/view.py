@@ -1,7 +1,7 @@
 """Observations of a policy: a crop that turns with the robot, and a state vector.
 
 `benchnav/OffRoad-v1` and `PolicyPlanner` compute observations by the same function, so
-a policy observes the same in an evaluation as in training. In the robot's frame, x
+that a policy observes the same in an evaluation as in training. In the robot's frame, x
 points ahead and y to the left. A crop is indexed as maps are, [row = y, column = x].
 Letters in shapes: B episodes, H×W cells of the map, N×N cells of the crop, S state
 dimensions.
@@ -26,7 +26,7 @@ NUMBERS = (
     "observed_traversability",
     "time_left",
 )
-_POSE = 3  # dimensions of a state that every robot has: x, y, θ
+_POSE = 3  # number of state dimensions that every robot has: x, y, θ
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +37,7 @@ class MapKnowledge(Batch):
         risk_map: λ̂ under the risk setting, in [0, 1], shape [B, H, W].
         spread: half of the range from the 16 % to the 84 % quantile of λ, in [0, 0.5],
             shape [B, H, W].
-        elevation_m: elevation in metres, used in observed cells only, shape [B, H, W].
+        elevation_m: elevation in metres; ignored in unobserved cells, shape [B, H, W].
         seen: mask of observed cells, bool, shape [B, H, W].
     """
 
@@ -52,8 +52,8 @@ class View:
     """Part of the map that a policy observes.
 
     Args:
-        cells: N, number of rows and columns of the crop, at least 2; a cell of the crop
-            has the size of a cell of the map.
+        cells: N, number of rows and of columns of the crop, ≥ 2; a cell of the crop has
+            the size of a cell of the map.
         behind: fraction of the crop's length that is behind the robot, in [0, 1); at
             0.5 the robot is in the middle.
     """
@@ -62,17 +62,17 @@ class View:
     behind: float = 1 / 3
 
     def __post_init__(self) -> None:
-        """Reject crops that are too small, or do not contain the robot."""
+        """Validate the size of the crop and the robot's position in it."""
         is_integer = isinstance(self.cells, int | np.integer)
         is_count = is_integer and not isinstance(self.cells, bool)
         expect(
             is_count and self.cells >= 2,
-            f"`crop_cells` as a whole number of at least 2, got {self.cells!r}.",
+            f"`crop_cells` as an integer ≥ 2, got {self.cells!r}.",
         )
         expect(0 <= self.behind < 1, f"`crop_behind` in [0, 1), got {self.behind}.")
 
     def reach_m(self, grid: Grid) -> float:
-        """Return half of the crop's length in metres, the unit of observed lengths."""
+        """Return half of the crop's length in metres, which scales observed lengths."""
         return self.cells * grid.resolution_m / 2
 
     def corners_m(self, grid: Grid, state: Tensor) -> Tensor:
@@ -94,7 +94,7 @@ class View:
         return torch.stack(positions, dim=-1)
 
     def crop(self, grid: Grid, knowledge: MapKnowledge, state: Tensor) -> Tensor:
-        """Return the map cell at the centre of each cell of the crop, in all channels.
+        """Return all channels of the crop, each cell from the map cell at its centre.
 
         Args:
             grid: grid of the maps.
@@ -151,8 +151,8 @@ class View:
             knowledge: knowledge of the terrain.
             state: states of the robots, beginning with (x, y, θ), shape [B, S].
             goal_m: (x, y) of the goals in metres, shape [B, 2].
-            observed: λ under each robot in the last step, NaN before the first step,
-                shape [B].
+            observed: λ observed under each robot in the last step; NaN before the first
+                step, shape [B].
             time_left: remaining fraction of the time budget, shape [B].
 
         Returns:
@@ -181,7 +181,7 @@ def bounds(states: int) -> tuple[list[float], list[float]]:
     """Return minimum and maximum of the observed state vector.
 
     Args:
-        states: S, dimensions of the robot's state.
+        states: S, number of dimensions of the robot's state.
 
     Returns:
         Two lists of length 5 + S − 3.
@@ -194,12 +194,12 @@ def bounds(states: int) -> tuple[list[float], list[float]]:
 
 
 def _to_map(state: Tensor, ahead: Tensor, to_left: Tensor) -> tuple[Tensor, Tensor]:
-    """Return positions (x, y) on the map of positions in the robots' frames.
+    """Convert positions from the robots' frames to (x, y) on the map, in metres.
 
     Args:
         state: states of the robots, shape [B, …, S].
-        ahead: distance ahead of the robot in metres; broadcasts to [B, *K].
-        to_left: distance to the left of the robot in metres; broadcasts to [B, *K].
+        ahead: distance ahead of the robot in metres, of a shape that broadcasts to [B, …].
+        to_left: distance to the left of the robot in metres, of such a shape.
     """
     x = state[..., 0, None]
     y = state[..., 1, None]

@@ -20,17 +20,17 @@ from benchnav.testing.belief_fields import VALUES, check_fields
 from benchnav.testing.belief_inputs import (
     KEYS,
     UNOBSERVED,
+    create_predictions,
     measure,
     measurements,
     no_measurement,
-    pose,
 )
 from benchnav.testing.breaches import NOTHING, Breaches, same
 from benchnav.testing.distribution import check_functions
 
-_DRAWS = 8  # joint samples of all measurements
-_SAMPLING_ERROR = 0.01  # tolerated rise of the mean variance, for `_DRAWS` samples
-_AT_TOLERANCE = 0.01  # between λ̂ of `at` and of `distribution`
+_DRAWS = 8  # number of joint samples of all measurements
+_SAMPLING_ERROR = 0.01  # tolerance of the rise of the mean variance over the samples
+_AT_TOLERANCE = 0.01  # tolerance between λ̂ of `at` and λ̂ of `distribution`
 
 
 def check_belief(
@@ -41,23 +41,23 @@ def check_belief(
 ) -> None:
     """Check that a belief fulfils its contract.
 
-    It receives measurements of λ along a path in three of four episodes. The
-    predictions are quantiles, and a mixture of three classes, two of them look-alike.
-    A belief that requires a mixture must reject quantiles with a ConfigError that names
-    their class.
+    The belief receives measurements of λ along a path, in three of four episodes. The
+    predictions are a mixture of three classes, two of which are look-alike, and
+    quantiles. A belief that requires a mixture must reject quantiles with a ConfigError
+    that names their Python class.
 
     The contract:
 
     - the distribution is a TraversabilityDistribution of shape [B, H, W] on the
       prediction's device, with consistent functions;
-    - it equals the prediction, or a new prediction, until λ is measured;
-    - three updates change nothing: one without measurements, a repeated measurement
-      without noise, and any measurement if the belief does not learn;
+    - the distribution equals the last prediction until λ is measured;
+    - three updates do not change it: an update without measurements, a repeated
+      measurement without noise, and any measurement if the belief does not learn;
     - measurements sampled from the prediction reduce the variance on average;
-    - `changed` marks all cells whose belief changed;
-    - `at` returns λ̂ of selected cells, within 0.01 of the distribution's;
-    - `sample_fields` returns λ in [0, 1] of shape [B, M, H, W]; it depends only on the
-      keys, and its marginals are those of the distribution;
+    - `changed` returns a mask that includes all cells whose belief changed;
+    - mean and CVaR of `at` differ from those of the distribution by at most 0.01;
+    - `sample_fields` returns λ in [0, 1] of shape [B, M, H, W]; the fields depend only
+      on state and keys, and their marginals are those of the distribution;
     - arguments and global generators are unchanged;
     - results are the same when repeated, after `init` on other maps, and for episodes
       in any order, selected by `select` or replaced by `put`.
@@ -66,7 +66,7 @@ def check_belief(
         belief: a belief, or its name, file or mapping as in suites.
         shapes: (H, W) of the maps.
         device: device of the predictions.
-        tolerance: tolerance between probabilities of λ that should be equal.
+        tolerance: tolerance between probabilities that should be equal.
 
     Raises:
         ConfigError: If the belief breaks the contract; the message lists all breaches.
@@ -82,7 +82,7 @@ def check_belief(
         for kind in kinds:
             breaches.location = f"{height}×{width}, {kind}"
             by_quantiles = kind == "quantiles"
-            covariance, prior, new_prior = pose(
+            covariance, prior, new_prior = create_predictions(
                 height, width, by_quantiles, torch.device(device)
             )
             if by_quantiles and _rejects_by_name(new_belief, prior, covariance):
@@ -106,48 +106,49 @@ class _BeliefCheck:
     breaches: Breaches
 
     def run(self) -> None:
-        """Update step by step, then again in ways that should change nothing."""
-        looks = list(measurements(self.prior, self.covariance))
-        first = self.begin(self.prior)
-        if first is NOTHING or not self.is_sound(first):
+        """Update step by step, then in ways that should have equal results."""
+        measured = list(measurements(self.prior, self.covariance))
+        first = self.init(self.prior)
+        if first is NOTHING or not self.check_state(first):
             return
-        breach = "Expected the initial belief to equal the prediction, got another."
-        self.expect_of(first, self.prior, breach)
+        breach = "Expected the initial belief to equal the prediction, got differences."
+        self.expect_prediction(first, self.prior, breach)
         state = first
-        for sensed in looks:
+        for sensed in measured:
             before = state
             state = self.update(before, sensed)
-            if state is NOTHING or not self.is_sound(state):
+            if state is NOTHING or not self.check_state(state):
                 return
-            again = self.belief.update(before, sensed)
+            repeated = self.belief.update(before, sensed)
             self.expect(
-                self.alike(again, state, 0),
-                "Expected the same result from `update` when called again, got another.",
+                self.are_equal(repeated, state, 0),
+                "Expected the same result from `update` when called again, got changes.",
             )
             self.try_changed(before, state)
-        shown = _cdf(self.belief.distribution(state))
-        self.begin(self.new_prior)
-        again = _cdf(self.belief.distribution(state))
+        cdf_before = _cdf(self.belief.distribution(state))
+        self.init(self.new_prior)
+        repeated = _cdf(self.belief.distribution(state))
         self.expect(
-            same(again, shown),
-            "Expected the same belief after `init` on other maps, got another.",
+            same(repeated, cdf_before),
+            "Expected the same belief after `init` on other maps, got a different "
+            "belief. Keep changing values in the state, not on the belief.",
         )
         distribution = self.belief.distribution(state)
         check_functions(distribution, self.tolerance, self.breaches)
         self.try_nothing(first, state)
-        self.try_repeated(state, looks[-1])
-        self.try_drawn(first, looks)
+        self.try_repeated(state, measured[-1])
+        self.try_sampled(first, measured)
         self.try_prior(state)
         self.try_at(state)
         self.try_fields(state)
-        self.try_members(looks, state)
+        self.try_members(measured, state)
         self.try_put(state)
 
     def expect(self, is_fulfilled: bool, breach: str) -> bool:
         """Note a breach unless the expectation is fulfilled."""
         return self.breaches.expect(is_fulfilled, breach)
 
-    def begin(self, prior: TraversabilityDistribution) -> Any:
+    def init(self, prior: TraversabilityDistribution) -> Any:
         """Return the initial state, or `NOTHING`."""
         return self.breaches.watch(
             "init",
@@ -162,7 +163,7 @@ class _BeliefCheck:
         sensed: Measurement,
         prior: TraversabilityDistribution | None = None,
     ) -> Any:
-        """Return the next state, or `NOTHING`."""
+        """Return the updated state, or `NOTHING`."""
         arguments = {"state": state, "sensed": sensed}
         if prior is not None:
             arguments["prior"] = prior
@@ -170,8 +171,8 @@ class _BeliefCheck:
             "update", lambda: self.belief.update(*arguments.values()), **arguments
         )
 
-    def is_sound(self, state: Any) -> bool:
-        """Return whether the distribution of a state can be checked further."""
+    def check_state(self, state: Any) -> bool:
+        """Note faults of a state's distribution; return whether it is valid."""
         belief = self.breaches.watch(
             "distribution", lambda: self.belief.distribution(state), state=state
         )
@@ -187,9 +188,9 @@ class _BeliefCheck:
         shape = list(self.prior.shape)
         device = self.prior.device
         got = list(belief.shape)
-        is_in_place = got == shape and belief.device == device
+        has_shape_and_device = got == shape and belief.device == device
         fits = self.expect(
-            is_in_place and belief.dtype.is_floating_point,
+            has_shape_and_device and belief.dtype.is_floating_point,
             f"Expected a distribution of shape {shape} on {device}, got one of "
             f"shape {got} in {belief.dtype} on {belief.device}.",
         )
@@ -199,19 +200,20 @@ class _BeliefCheck:
         in_range = (probabilities >= 0) & (probabilities <= 1)
         return self.expect(
             bool(in_range.all()),
-            "Expected probabilities of the belief in [0, 1], got others.",
+            "Expected probabilities of the belief in [0, 1], got values outside it.",
         )
 
-    def alike(
+    def are_equal(
         self, first: Any, second: Any, tolerance: float, members: Tensor | None = None
     ) -> bool:
         """Return whether two states have equal distributions.
 
         Args:
             first: a state.
-            second: a state.
+            second: another state.
             tolerance: tolerance between probabilities.
-            members: indices of episodes of the second state; if None, all.
+            members: episodes of the second state that the first state contains,
+                indices; if None, all episodes in their order.
         """
         a = _cdf(self.belief.distribution(first))
         b = _cdf(self.belief.distribution(second))
@@ -219,10 +221,10 @@ class _BeliefCheck:
             b = b[:, members]
         return same(a, b, tolerance)
 
-    def expect_of(
+    def expect_prediction(
         self, state: Any, prior: TraversabilityDistribution, breach: str, first: int = 0
     ) -> None:
-        """Expect a state to equal a prediction, in the episodes from an index on."""
+        """Check that the belief equals a prediction in the episodes `first` and later."""
         distribution = self.belief.distribution(state)
         probabilities = _cdf(distribution)[:, first:]
         expected = _cdf(prior)[:, first:]
@@ -230,23 +232,22 @@ class _BeliefCheck:
         self.expect(is_same, breach)
 
     def try_changed(self, before: Any, after: Any, has_measured: bool = True) -> None:
-        """Expect `changed` to mark the cells whose belief changed."""
-        changed = partial(self.belief.changed, before, after)
-        marked = self.breaches.watch("changed", changed, before=before, after=after)
+        """Check that `changed` includes the cells whose belief changed."""
+        mark = partial(self.belief.changed, before, after)
+        changed = self.breaches.watch("changed", mark, before=before, after=after)
         shape = tuple(self.prior.shape)
-        is_bool = isinstance(marked, Tensor) and marked.dtype == torch.bool
-        is_map = is_bool and tuple(marked.shape) == shape
+        is_bool = isinstance(changed, Tensor) and changed.dtype == torch.bool
+        is_map = is_bool and tuple(changed.shape) == shape
         breach = f"Expected a bool map of shape {list(shape)} from `changed`."
-        if marked is NOTHING or not self.expect(is_map, breach):
+        if changed is NOTHING or not self.expect(is_map, breach):
             return
         old = _cdf(self.belief.distribution(before))
         new = _cdf(self.belief.distribution(after))
         is_changed = ((old - new).abs() > self.tolerance).any(0)
-        is_missed = is_changed & ~marked
+        is_missed = is_changed & ~changed
         self.expect(
             not bool(is_missed.any()),
-            "Expected `changed` to mark all cells whose belief changed, got some "
-            "left out.",
+            "Expected `changed` to mark all cells whose belief changed, got omissions.",
         )
         if has_measured and not self.belief.learns:
             self.expect(
@@ -256,46 +257,46 @@ class _BeliefCheck:
             )
 
     def try_nothing(self, first: Any, last: Any) -> None:
-        """Expect an update without measurements to change nothing."""
+        """Check that an update without measurements changes nothing."""
         nothing = no_measurement(self.prior)
         for state in (first, last):
             after = self.update(state, nothing)
-            is_same = after is NOTHING or self.alike(after, state, self.tolerance)
+            is_same = after is NOTHING or self.are_equal(after, state, self.tolerance)
             self.expect(
                 is_same,
                 "Expected an update without measurements to change nothing, got a change.",
             )
         breach = (
-            "Expected the prediction of an episode in which nothing was sensed, "
-            "got another."
+            "Expected the belief of an episode without measurements to equal the "
+            "prediction, got differences."
         )
-        self.expect_of(last, self.prior, breach, UNOBSERVED)
+        self.expect_prediction(last, self.prior, breach, UNOBSERVED)
 
     def try_repeated(self, last: Any, sensed: Measurement) -> None:
-        """Expect λ that is measured again without noise to change nothing."""
+        """Check that a repeated measurement without noise changes nothing."""
         std = torch.full_like(sensed.traversability, MIN_STD)
         exact = replace(sensed, std=std)
         once = self.update(last, exact)
         if once is NOTHING:
             return
         twice = self.update(once, exact)
-        if twice is not NOTHING and self.is_sound(twice):
+        if twice is not NOTHING and self.check_state(twice):
             self.expect(
-                self.alike(twice, once, self.tolerance),
-                "Expected λ that is sensed again without noise to change nothing, "
-                "got a change.",
+                self.are_equal(twice, once, self.tolerance),
+                "Expected a repeated measurement without noise to change nothing, got a "
+                "change.",
             )
 
-    def try_drawn(self, first: Any, looks: Sequence[Measurement]) -> None:
-        """Expect measurements sampled from the prediction to reduce the variance.
+    def try_sampled(self, first: Any, measured: Sequence[Measurement]) -> None:
+        """Check that measurements sampled from the prediction reduce the variance.
 
-        With p = P(λ ≤ value), the variance of the event is p (1 − p). A single update
-        may increase it, but its mean over possible measurements cannot rise (law of
-        total variance).
+        With p = P(λ ≤ value), the variance of the event λ ≤ value is p (1 − p). A
+        single update may increase it, but its mean over possible measurements cannot
+        rise (law of total variance).
         """
         if not self.belief.learns:
             return
-        masks = torch.stack([sensed.mask for sensed in looks])
+        masks = torch.stack([sensed.mask for sensed in measured])
         observed = masks.any(0)
         scores = draw_scores(self.covariance, _DRAWS, KEYS)
         scores = scores.to(self.prior.device, self.prior.dtype)
@@ -306,7 +307,7 @@ class _BeliefCheck:
             values = torch.where(observed, field, torch.nan)
             sensed = measure(values, self.prior)
             state = self.update(first, sensed)
-            if state is NOTHING or not self.is_sound(state):
+            if state is NOTHING or not self.check_state(state):
                 return
             posterior = _cdf(self.belief.distribution(state))
             variances.append(posterior * (1 - posterior))
@@ -315,24 +316,24 @@ class _BeliefCheck:
         mean_rise = float(rise[:, ~observed].mean())
         self.expect(
             mean_rise <= _SAMPLING_ERROR,
-            "Expected measurements sampled from the prediction to reduce the "
-            "variance on average, got a rise.",
+            "Expected measurements sampled from the prediction to reduce the variance "
+            "of λ ≤ value on average, got an increase.",
         )
 
     def try_prior(self, last: Any) -> None:
-        """Expect a new prediction to replace the old one."""
+        """Check that a new prediction replaces the old one."""
         after = self.update(last, no_measurement(self.prior), self.new_prior)
-        if after is NOTHING or not self.is_sound(after):
+        if after is NOTHING or not self.check_state(after):
             return
         breach = (
-            "Expected a new prediction to replace the old one where nothing was "
-            "sensed, got another."
+            "Expected a new prediction to replace the old one in an episode without "
+            "measurements, got differences."
         )
-        self.expect_of(after, self.new_prior, breach, UNOBSERVED)
+        self.expect_prediction(after, self.new_prior, breach, UNOBSERVED)
         self.try_changed(last, after, has_measured=False)
 
     def try_at(self, state: Any) -> None:
-        """Expect `at` to agree with the distribution in selected cells."""
+        """Check that `at` agrees with the distribution in selected cells."""
         cells = torch.zeros(
             self.prior.shape, dtype=torch.bool, device=self.prior.device
         )
@@ -358,57 +359,58 @@ class _BeliefCheck:
         has_cvar = same(selected.cvar(0.8), cvar, _AT_TOLERANCE)
         self.expect(
             has_mean and has_cvar,
-            f"Expected mean and CVaR of `at` within {_AT_TOLERANCE} of the "
-            "distribution's, got others.",
+            f"Expected mean and CVaR of `at` to differ by at most {_AT_TOLERANCE} from "
+            "those of `distribution`, got larger differences.",
         )
 
     def try_fields(self, state: Any) -> None:
-        """Expect valid joint samples of the whole batch and of selected episodes."""
+        """Check joint samples of the whole batch and of selected episodes."""
         members = torch.tensor([2, 0], device=self.prior.device)
         selected = self.select(state, members)
         check_fields(self.belief, state, selected, self.tolerance, self.breaches)
 
-    def try_members(self, looks: Sequence[Measurement], last: Any) -> None:
-        """Expect equal beliefs for episodes in another batch, order or selection."""
+    def try_members(self, measured: Sequence[Measurement], last: Any) -> None:
+        """Check that beliefs of episodes do not depend on the batch or its order."""
         for indices in ([3], [1], [2, 0]):
             members = torch.tensor(indices, device=self.prior.device)
-            separate = self.begin(self.prior.select(members))
-            selected = self.begin(self.prior)
-            for step, sensed in enumerate(looks):
+            separate = self.init(self.prior.select(members))
+            selected = self.init(self.prior)
+            for step, sensed in enumerate(measured):
                 if step == 1:
                     selected = self.select(selected, members)
                 if separate is NOTHING or selected is NOTHING:
                     return
-                of_members = sensed.select(members)
-                separate = self.update(separate, of_members)
-                selected = self.update(selected, of_members if step else sensed)
+                sensed_part = sensed.select(members)
+                separate = self.update(separate, sensed_part)
+                selected = self.update(selected, sensed_part if step else sensed)
             if separate is NOTHING or selected is NOTHING:
                 return
             self.expect(
-                self.alike(separate, last, self.tolerance, members),
+                self.are_equal(separate, last, self.tolerance, members),
                 "Expected the same results for single episodes and in another order as "
-                "in the batch, got others.",
+                "in the batch, got different results.",
             )
             self.expect(
-                self.alike(selected, last, self.tolerance, members),
-                "Expected the same beliefs for episodes that `select` keeps as in the "
-                "batch, got others.",
+                self.are_equal(selected, last, self.tolerance, members),
+                "Expected the same beliefs for episodes that `select` returns as in the "
+                "batch, got different beliefs.",
             )
 
     def try_put(self, state: Any) -> None:
-        """Expect episodes that replace others by `put` to be unchanged."""
-        replaced = torch.tensor([1, UNOBSERVED], device=self.prior.device)
+        """Check that `put` inserts episodes unchanged."""
+        replaced_episodes = torch.tensor([1, UNOBSERVED], device=self.prior.device)
         members = torch.tensor([2, 0], device=self.prior.device)
         others = self.select(state, members)
         if others is NOTHING:
             return
-        put = partial(self.belief.put, state, replaced, others)
-        combined = self.breaches.watch("put", put, state=state, others=others)
+        put_others = partial(self.belief.put, state, replaced_episodes, others)
+        combined = self.breaches.watch("put", put_others, state=state, others=others)
         order = torch.tensor([0, 2, 2, 0], device=self.prior.device)
-        if combined is not NOTHING and self.is_sound(combined):
+        if combined is not NOTHING and self.check_state(combined):
             self.expect(
-                self.alike(combined, state, self.tolerance, order),
-                "Expected episodes that `put` inserts to be unchanged, got others.",
+                self.are_equal(combined, state, self.tolerance, order),
+                "Expected `put` to insert episodes unchanged and to leave the others "
+                "unchanged, got different beliefs.",
             )
 
     def select(self, state: Any, members: Tensor) -> Any:
@@ -423,14 +425,14 @@ class _BeliefCheck:
         shape = [len(members), *self.prior.shape[1:]]
         got = list(self.belief.distribution(selected).shape)
         breach = (
-            f"Expected a distribution of shape {shape} of episodes that `select` "
-            f"keeps, got {got}."
+            f"Expected a distribution of shape {shape} for episodes that `select` "
+            f"returns, got {got}."
         )
         return selected if self.expect(got == shape, breach) else NOTHING
 
 
 def _cdf(distribution: TraversabilityDistribution) -> Tensor:
-    """Return P(λ ≤ value) for several values, shape [V, B, H, W]."""
+    """Return P(λ ≤ value) for the V values of `VALUES`, shape [V, B, H, W]."""
     probabilities = [distribution.cdf(value).double() for value in VALUES]
     return torch.stack(probabilities)
 
@@ -443,5 +445,5 @@ def _rejects_by_name(
     except ConfigError as error:
         return type(prior).__name__ in str(error)
     except Exception:
-        return False  # noted by `_BeliefCheck`
+        return False  # `_BeliefCheck` notes it
     return False

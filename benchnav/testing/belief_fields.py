@@ -13,22 +13,23 @@ from benchnav.planning.sensing.belief import Belief
 from benchnav.testing.belief_inputs import KEYS
 from benchnav.testing.breaches import NOTHING, Breaches, same
 
-VALUES = (0.0, 0.1, 0.4, 0.8)  # of λ, at which distributions are compared
+VALUES = (0.0, 0.1, 0.4, 0.8)
+"""Values of λ at which CDFs are compared."""
 _OTHER_KEYS = (65, 35, 89, 79)
 _FIELDS = 200
-_MAX_ERRORS = 6  # tolerated standard errors
+_MAX_ERRORS = 6  # tolerance of frequencies in standard errors
 
 
 def check_fields(
     belief: Belief[Any], state: Any, selected: Any, tolerance: float, breaches: Breaches
 ) -> None:
-    """Expect joint samples to depend on keys, and to have the right marginals.
+    """Check that joint samples depend only on keys, and have the belief's marginals.
 
     Args:
         belief: the belief.
-        state: state of four episodes.
-        selected: state of the episodes 2 and 0, or `NOTHING`.
-        tolerance: tolerance between fields that should be equal.
+        state: belief state of four episodes.
+        selected: belief state of episodes 2 and 0, or `NOTHING`.
+        tolerance: tolerance between λ of fields that should be equal.
         breaches: collection of breaches.
     """
     expect = breaches.expect
@@ -50,26 +51,33 @@ def check_fields(
     if fields is NOTHING or not expect(got == shape, breach):
         return
     in_range = (fields >= 0) & (fields <= 1)
-    expect(bool(in_range.all()), "Expected fields of λ in [0, 1], got others.")
-    fewer = draw(state, 2, KEYS)
-    others = draw(state, 2, _OTHER_KEYS)
     expect(
-        same(draw(state, 2, KEYS), fewer),
-        "Expected the same fields when called again, got others.",
+        bool(in_range.all()), "Expected fields of λ in [0, 1], got values outside it."
     )
-    differ = others is NOTHING or not any(map(same, fewer, others))
+    two_fields = draw(state, 2, KEYS)
+    fields_of_other_keys = draw(state, 2, _OTHER_KEYS)
     expect(
-        differ,
-        "Expected other fields under other keys, got the same.",
+        same(draw(state, 2, KEYS), two_fields),
+        "Expected the same fields from the same keys, got different fields.",
+    )
+    is_different = fields_of_other_keys is NOTHING or not any(
+        map(same, two_fields, fields_of_other_keys)
+    )
+    expect(
+        is_different,
+        "Expected different fields from different keys, got equal fields.",
     )
     if selected is not NOTHING:
-        of_selected = draw(selected, 2, [KEYS[2], KEYS[0]])
+        selected_fields = draw(selected, 2, [KEYS[2], KEYS[0]])
         members = torch.tensor([2, 0], device=fields.device)
-        expected = fewer[members]
-        is_same = of_selected is NOTHING or same(of_selected, expected, tolerance)
+        expected = two_fields[members]
+        is_same = selected_fields is NOTHING or same(
+            selected_fields, expected, tolerance
+        )
         expect(
             is_same,
-            "Expected an episode's fields to depend only on its key, got others.",
+            "Expected an episode's fields to depend only on its state and key, got "
+            "different fields after `select`.",
         )
     for value in VALUES[1:]:
         probability = distribution.cdf(value).double()
@@ -79,5 +87,6 @@ def check_fields(
         is_close = deviation <= _MAX_ERRORS * error + 0.03
         expect(
             bool(is_close.all()),
-            "Expected fields whose cells have the belief's distribution, got others.",
+            "Expected λ of each cell over the fields to have the belief's distribution, "
+            "got other frequencies.",
         )

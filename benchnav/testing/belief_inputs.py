@@ -17,18 +17,20 @@ from benchnav.planning.sensing.belief import CovarianceModel, draw_scores
 from benchnav.planning.sensing.sensor import Measurement
 from benchnav.testing.breaches import SEED
 
-KEYS = (3, 14, 15, 92)  # of the four episodes
-UNOBSERVED = 3  # index of the episode without measurements
+KEYS = (3, 14, 15, 92)
+"""Stream keys of the four episodes."""
+UNOBSERVED = 3
+"""Index of the episode without measurements."""
 _STEPS = 3
-_STD = 0.1  # of measurement noise
+_STD = 0.1  # standard deviation of measurement noise, in normal scores
 
 
 def measure(values: Tensor, prior: TraversabilityDistribution) -> Measurement:
     """Return a measurement of λ with noise.
 
     Args:
-        values: λ, NaN in cells without a measurement, shape [B, H, W].
-        prior: prediction, whose dtype and device the measurement has.
+        values: λ; NaN in cells without a measurement, shape [B, H, W].
+        prior: prediction; the measurement takes its dtype and device.
     """
     values = values.to(dtype=prior.dtype, device=prior.device)
     std = torch.full_like(values, _STD)
@@ -36,7 +38,7 @@ def measure(values: Tensor, prior: TraversabilityDistribution) -> Measurement:
 
 
 def no_measurement(prior: TraversabilityDistribution) -> Measurement:
-    """Return a measurement without any measured cell."""
+    """Return a measurement of no cell."""
     return measure(torch.full(prior.shape, torch.nan), prior)
 
 
@@ -45,7 +47,8 @@ def measurements(
 ) -> Iterator[Measurement]:
     """Yield measurements of λ along a path from left to right, with λ of 0 and 1.
 
-    The second episode has no measurement in the first step; the last never has one.
+    The second episode has no measurement in the first step. The last episode has none
+    in any step.
 
     Args:
         prior: prediction from which λ is sampled.
@@ -69,10 +72,10 @@ def measurements(
         yield measure(values, prior)
 
 
-def pose(
+def create_predictions(
     height: int, width: int, by_quantiles: bool, device: torch.device
 ) -> tuple[CovarianceModel, TraversabilityDistribution, TraversabilityDistribution]:
-    """Return a covariance model and two predictions of λ of four maps.
+    """Return a covariance model and two different predictions of λ of four maps.
 
     Args:
         height: number of rows.

@@ -1,4 +1,4 @@
-"""Tools of all checks: calls with checks of side effects, comparisons, breaches."""
+"""Tools of all checks: calls that find side effects, comparisons, lists of breaches."""
 
 import pickle
 import random
@@ -17,7 +17,8 @@ from benchnav.core.batch import find_tensor_fault
 from benchnav.core.errors import BenchnavError, ConfigError
 
 SEED = 20240229
-NOTHING = object()  # replaces the answer of a call that raised
+NOTHING = object()
+"""Placeholder for the result of a call that raised, or whose result is unusable."""
 
 
 class Breaches:
@@ -28,7 +29,7 @@ class Breaches:
         name: name of the part in messages.
 
     Attributes:
-        location: location of the next breaches, such as a size of maps.
+        location: case in which the next breaches are found, such as a size of maps.
     """
 
     def __init__(self, kind: str, name: str) -> None:
@@ -49,27 +50,34 @@ class Breaches:
         return is_fulfilled
 
     def is_tensor(
-        self, what: str, like: Tensor, shape: tuple[int, ...]
+        self, description: str, like: Tensor, shape: tuple[int, ...]
     ) -> Callable[[Any], bool]:
-        """Return a function that expects finite numbers of a shape.
+        """Return a function that checks for a tensor of finite numbers.
+
+        The function returns whether its argument is such a tensor, and notes a breach
+        if it is not.
 
         Args:
-            what: description of the values, for messages.
+            description: description of the values in messages.
             like: tensor of the expected dtype and device.
             shape: expected shape.
         """
 
         def fits(values: Any) -> bool:
-            fault = find_tensor_fault(what, values, like.dtype, shape, like.device)
+            fault = find_tensor_fault(
+                description, values, like.dtype, shape, like.device
+            )
             if not self.expect(not fault, fault):
                 return False
             is_finite = bool(values.isfinite().all())
-            return self.expect(is_finite, f"Expected finite {what}, got others.")
+            return self.expect(
+                is_finite, f"Expected finite {description}, got NaN or infinite values."
+            )
 
         return fits
 
     def batches(self, device: torch.device | str) -> Iterator["Draws"]:
-        """Yield each dtype and leading shape to check, after setting `location`."""
+        """Yield sources of arguments of each dtype and leading shape; set `location`."""
         for dtype in (torch.float32, torch.float64):
             for leading in ((6,), (6, 5), (6, 5, 2)):
                 self.location = f"*B = {list(leading)}, {dtype}"
@@ -79,8 +87,8 @@ class Breaches:
 
     def try_function(
         self,
-        what: str,
-        act: Callable[..., Any],
+        name: str,
+        function: Callable[..., Any],
         arguments: Mapping[str, Any],
         is_usable: Callable[[Any], bool],
         tolerance: float = 1e-5,
@@ -88,54 +96,57 @@ class Breaches:
         """Call a pure function of a batch twice, and for its last element only.
 
         Args:
-            what: name of the function in messages.
-            act: the function.
+            name: name of the function in messages.
+            function: the function.
             arguments: arguments of the function by name: tensors whose first dimension
                 is the batch, or values with a method `select`.
-            is_usable: function that returns whether an answer can be checked further.
-            tolerance: tolerance between answers for a single element and a batch.
+            is_usable: function that returns whether a result can be checked further.
+            tolerance: tolerance between results for a single element and for a batch.
 
         Returns:
-            The answer; `NOTHING` if it is not usable.
+            The result; `NOTHING` if it cannot be checked further.
         """
-        answer = self.watch(what, lambda: act(**arguments), **arguments)
+        answer = self.watch(name, lambda: function(**arguments), **arguments)
         if answer is NOTHING or not is_usable(answer):
             return NOTHING
-        again = act(**arguments)
+        repeated = function(**arguments)
         self.expect(
-            same(again, answer),
-            f"Expected the same result from `{what}` when called again, got another.",
+            same(repeated, answer),
+            f"Expected the same result from `{name}` when called again, got a different "
+            "result.",
         )
-        last_only = {name: _last(value) for name, value in arguments.items()}
-        single = self.watch(what, lambda: act(**last_only))
+        last_only = {key: _last(value) for key, value in arguments.items()}
+        single = self.watch(name, lambda: function(**last_only))
         expected = _last(answer)
         self.expect(
             same(single, expected, tolerance),
-            f"Expected the same result from `{what}` for a single element as in a batch, "
-            "got another.",
+            f"Expected the same result from `{name}` for a single element as in a batch, "
+            "got a different result.",
         )
         return answer
 
-    def watch(self, what: str, act: Callable[[], Any], **arguments: Any) -> Any:
+    def watch(
+        self, function_name: str, function: Callable[[], Any], **arguments: Any
+    ) -> Any:
         """Call a function, and note an exception or a side effect.
 
         Args:
-            what: name of the function in messages.
-            act: the call.
+            function_name: name of the function in messages.
+            function: function without arguments that makes the call.
             arguments: arguments of the call by name; all tensors, arrays, generators
                 and numbers nested in them are compared before and after the call.
 
         Returns:
-            The answer; `NOTHING` if the call raised.
+            The result; `NOTHING` if the call raised.
         """
         before = dict(_leaves(arguments))
-        states = _generators()
+        states_before = _generators()
         answer = NOTHING
         try:
-            answer = act()
+            answer = function()
         except Exception as error:
             got = f"{_text_of(error)} {_origin_of(error)}"
-            self.expect(False, f"Expected an answer from `{what}`, got {got}")
+            self.expect(False, f"Expected a result from `{function_name}`, got {got}")
         after = dict(_leaves(arguments))
         changed = []
         for name, leaf in before.items():
@@ -144,15 +155,15 @@ class Breaches:
         listed = ", ".join(changed[:3])
         self.expect(
             not changed,
-            f"Expected `{what}` to leave its arguments unchanged, got another "
-            f"{listed}.",
+            f"Expected `{function_name}` to leave its arguments unchanged, got changes "
+            f"in {listed}.",
         )
-        for whose, state in _generators().items():
-            previous = states.get(whose, state)
+        for owner, state in _generators().items():
+            previous = states_before.get(owner, state)
             self.expect(
                 previous == state,
-                f"Expected {whose} global generator to be unchanged, got a change. "
-                "Draw from a generator of your own, or from the one that is passed.",
+                f"Expected {owner} global generator to be unchanged, got a change. "
+                "Draw from a generator of your own, or from one that is passed.",
             )
         return answer
 
@@ -167,16 +178,16 @@ class Breaches:
         n_locations = sum(bool(location) for location in self._locations)
         listed = ""
         for number, (breach, locations) in enumerate(self._breaches.items(), start=1):
-            where = ", ".join(locations)
+            shown_locations = ", ".join(locations)
             if 1 < len(locations) == n_locations:
-                where = "wherever it was tried"
+                shown_locations = "in all cases"
             listed += f"\n({number}) {breach}"
-            if where:
-                listed += f" [{where}]"
+            if shown_locations:
+                listed += f" [{shown_locations}]"
         raise ConfigError(
             f"Expected a {self._kind} that fulfils the contract of "
-            f"`benchnav.testing.check_{self._kind}`, got "
-            f"{self._name}, which breaks it:{listed}"
+            f"`benchnav.testing.check_{self._kind}`, got {self._name}, which breaks "
+            f"it:{listed}"
         )
 
 
@@ -185,9 +196,9 @@ class Draws:
     """A source of random arguments for functions of a batch.
 
     Args:
-        leading: leading dimensions *B.
-        like: tensor of the dtype and device.
-        generator: source of randomness.
+        leading: leading dimensions *B of the arguments.
+        like: tensor of the arguments' dtype and device.
+        generator: random generator.
     """
 
     leading: tuple[int, ...]
@@ -195,7 +206,7 @@ class Draws:
     generator: torch.Generator
 
     def uniform(self, low: Sequence[float], high: Sequence[float]) -> Tensor:
-        """Draw uniform numbers between bounds of length N, shape [*B, N]."""
+        """Draw uniform numbers between N lower and N upper bounds, shape [*B, N]."""
         lower = self.like.new_tensor(low)
         upper = self.like.new_tensor(high)
         uniform = torch.rand(*self.leading, len(lower), generator=self.generator)
@@ -237,7 +248,10 @@ def _text_of(error: Exception) -> str:
 
 
 def _origin_of(error: Exception) -> str:
-    """Return file and line of the innermost frame outside installed packages."""
+    """Return file and line of the innermost frame that is not in an installed package.
+
+    If all frames are in installed packages, it is the innermost frame.
+    """
     frames = traceback.extract_tb(error.__traceback__)
     local = [frame for frame in frames if "site-packages" not in frame.filename]
     frame = (local or frames)[-1]
@@ -251,16 +265,22 @@ def _last(value: Any) -> Any:
 
 
 def _leaves(
-    value: Any, name: str = "", seen: set[int] | None = None
+    value: Any, name: str = "", visited: set[int] | None = None
 ) -> Iterator[tuple[str, Any]]:
-    """Yield path and copy of each tensor, array, generator and number in a value."""
-    seen = set() if seen is None else seen
+    """Yield path and copy of each tensor, array, generator, number and text in a value.
+
+    Args:
+        value: any value.
+        name: path of the value.
+        visited: ids of the objects visited so far.
+    """
+    visited = set() if visited is None else visited
     if isinstance(value, bool | int | float | str | None):
         yield name, repr(value)
         return
-    if id(value) in seen or isinstance(value, type):
+    if id(value) in visited or isinstance(value, type):
         return
-    seen.add(id(value))
+    visited.add(id(value))
     if isinstance(value, Tensor):
         yield name, value.detach().clone()
     elif isinstance(value, torch.Generator):
@@ -275,7 +295,7 @@ def _leaves(
             parts = dict(enumerate(value))
         for key, part in list(parts.items()):
             path = f"{name}.{key}".lstrip(".")
-            yield from _leaves(part, path, seen)
+            yield from _leaves(part, path, visited)
 
 
 def _generators() -> dict[str, bytes]:

@@ -1,4 +1,4 @@
-"""The check of distributions of traversability, on predictions of a model.
+"""The check of the functions of a distribution of traversability.
 
 Letters in shapes: B maps, H×W cells.
 """
@@ -16,16 +16,16 @@ from benchnav.testing.breaches import NOTHING, Breaches
 _TENTHS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 _VALUES = (0.0, 0.01, 0.05, *_TENTHS, 0.95, 0.99, 1.0)
 _PROBABILITIES = (0.0, 0.01, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.99, 1.0)
-_LEVEL = 0.9  # of the compared CVaR
-_FLOOR = 0.05  # of λ in the compared expected time
-# Factor of the tolerance between closed forms and the base's quadrature.
-_QUADRATURE = 10
+_LEVEL = 0.9  # level of the compared CVaR
+_FLOOR = 0.05  # floor of λ in the compared times
+# The tolerance between closed forms and the base class's quadrature is larger.
+_QUADRATURE_FACTOR = 10
 
 
 def check_functions(
     distribution: TraversabilityDistribution, tolerance: float, breaches: Breaches
 ) -> None:
-    """Note where a distribution's functions are invalid on [0, 1] or inconsistent.
+    """Note where a distribution's functions are invalid or contradict one another.
 
     Args:
         distribution: distribution of shape [B, H, W].
@@ -37,18 +37,18 @@ def check_functions(
     distribution = distribution.select(first_map)
     like = torch.zeros(1, dtype=distribution.dtype, device=distribution.device)
 
-    def call(name: str, *arguments: Any) -> Any:
-        """Return a method's answer, or `NOTHING` if it is not usable."""
+    def evaluate(name: str, *arguments: Any) -> Any:
+        """Return a method's result, or `NOTHING` if it is not a map of numbers."""
         method = getattr(distribution, name)
         answer = breaches.watch(name, lambda: method(*arguments))
         if answer is NOTHING:
             return NOTHING
-        what = f"results of `{name}` of the distribution"
-        is_map = breaches.is_tensor(what, like, distribution.shape)
+        description = f"results of `{name}` of the distribution"
+        is_map = breaches.is_tensor(description, like, distribution.shape)
         return answer if is_map(answer) else NOTHING
 
-    probabilities = [call("cdf", value) for value in (-tolerance, *_VALUES)]
-    values = [call("quantile", probability) for probability in _PROBABILITIES]
+    probabilities = [evaluate("cdf", value) for value in (-tolerance, *_VALUES)]
+    values = [evaluate("quantile", probability) for probability in _PROBABILITIES]
     if any(answer is NOTHING for answer in (*probabilities, *values)):
         return
     starts_at_0 = bool((probabilities[0] == 0).all())
@@ -56,13 +56,15 @@ def check_functions(
     ascends = _ascend(probabilities, tolerance)
     expect(
         ascends and starts_at_0 and ends_at_1,
-        "Expected `cdf` to ascend from 0 below λ = 0 to 1 at λ = 1, got another.",
+        "Expected `cdf` to ascend from 0 below λ = 0 to 1 at λ = 1, got one that does "
+        "not.",
     )
     starts_inside = bool((values[0] >= 0).all())
     ends_inside = bool((values[-1] <= 1).all())
     expect(
         _ascend(values, 0) and starts_inside and ends_inside,
-        "Expected `quantile` to ascend within [0, 1], got another.",
+        "Expected `quantile` to ascend with the probability and to stay in [0, 1], got "
+        "one that does not.",
     )
     for value, probability in zip(values, _PROBABILITIES, strict=True):
         below = distribution.cdf(value - tolerance).double()
@@ -71,7 +73,7 @@ def check_functions(
         is_inverse &= above >= probability - tolerance
         expect(
             bool(is_inverse.all()),
-            "Expected `quantile` to be the inverse of `cdf`, got another.",
+            "Expected `quantile` to be the inverse of `cdf`, got different values.",
         )
     base = TraversabilityDistribution
     if type(distribution).cdf_limits is not base.cdf_limits:
@@ -82,18 +84,19 @@ def check_functions(
             is_limit &= (upper - probability).abs() <= tolerance
             expect(
                 bool(is_limit.all()),
-                "Expected `cdf_limits` to be P(λ < value) and `cdf`, got others.",
+                "Expected `cdf_limits` to return P(λ < value) and P(λ ≤ value), the "
+                "second equal to `cdf`, got other values.",
             )
-    _check_integrals(distribution, call, _QUADRATURE * tolerance, breaches)
+    _check_integrals(distribution, evaluate, _QUADRATURE_FACTOR * tolerance, breaches)
 
 
 def _check_integrals(
     distribution: TraversabilityDistribution,
-    call: Callable[..., Any],
+    evaluate: Callable[..., Any],
     tolerance: float,
     breaches: Breaches,
 ) -> None:
-    """Note where an overridden integral differs from the base's quadrature."""
+    """Note where an overridden integral differs from the base class's quadrature."""
     base = TraversabilityDistribution
     integrals: dict[str, tuple[float, ...]] = {
         "mean": (),
@@ -102,7 +105,7 @@ def _check_integrals(
         "time_cvar": (_LEVEL, _FLOOR),
     }
     for name, arguments in integrals.items():
-        integral = call(name, *arguments)
+        integral = evaluate(name, *arguments)
         by_quadrature = getattr(base, name)
         is_inherited = getattr(type(distribution), name) is by_quadrature
         if integral is NOTHING or is_inherited:
@@ -112,7 +115,8 @@ def _check_integrals(
         error = (integral - expected).abs() / scale
         breaches.expect(
             bool(error.max() <= tolerance),
-            f"Expected `{name}` to follow from `cdf` and `quantile`, got another.",
+            f"Expected `{name}` to agree with `cdf` and `quantile`, got different "
+            "values.",
         )
 
 

@@ -1,7 +1,8 @@
 """Checks of robots, objectives and risk measures on random arguments.
 
-All three are pure functions of a batch. Letters in shapes: *B leading, S state and A
-action dimensions; for distributions B maps, H×W cells, K components, Q quantiles.
+All three are pure functions of a batch. Letters in shapes: *B leading dimensions, S
+state and A action dimensions; of distributions, B maps, H×W cells, K components and Q
+quantiles.
 """
 
 import itertools
@@ -24,7 +25,7 @@ from benchnav.planning.free_space import Rules
 from benchnav.planning.robots import Robot, Unicycle
 from benchnav.testing.breaches import NOTHING, Breaches, Draws, same
 
-_CONSTANT_STEPS = 60  # after which accelerating robots are close to their top speed
+_CONSTANT_STEPS = 60  # steps in which accelerating robots come close to top speed
 
 
 def check_robot(
@@ -35,20 +36,21 @@ def check_robot(
     The contract:
 
     - `dt_s` and `top_speed_mps` are above 0;
-    - each action has a name, finite bounds and, if there are rates, a rate above 0;
+    - each action dimension has a name, finite bounds and, if there are rates, a rate
+      above 0;
     - states of shape [*B, S] begin with the pose, and are finite, in the dtype and on
-      the device of their arguments;
+      the device of the arguments;
     - a step is the same when repeated, and for a single robot as in a batch, for any
       leading dimensions;
     - arguments and global generators are unchanged;
-    - no step is longer than `top_speed_mps` allows;
+    - in each step the robot moves at most `top_speed_mps` · `dt_s`;
     - the robot does not move on terrain of λ = 0.
 
     Args:
         robot: a robot, or its name, file or mapping as in suites.
         device: device of the states.
-        stands_at_zero: whether the robot must not move at λ = 0; False for a robot
-            whose docstring explains why it does.
+        stands_at_zero: whether the robot must stand still at λ = 0. Pass False for a
+            robot whose docstring explains why it moves.
 
     Raises:
         ConfigError: If the robot breaks the contract; the message lists all breaches.
@@ -68,13 +70,13 @@ def check_robot(
     is_complete = len(low) == len(high) == n_actions
     breaches.expect(
         is_ordered and is_complete,
-        f"Expected finite bounds, low below high, of {n_actions} actions, got {low} "
-        f"and {high}.",
+        f"Expected finite `action_low` below finite `action_high`, for {n_actions} "
+        f"actions, got {low} and {high}.",
     )
     are_rates = rates is None or (len(rates) == n_actions and min(rates) > 0)
     breaches.expect(
         are_rates,
-        f"Expected `action_rates` > 0 of {n_actions} actions, got {rates}.",
+        f"Expected `action_rates` > 0 for {n_actions} actions, or None, got {rates}.",
     )
     breaches.raise_any()
     for draws in breaches.batches(device):
@@ -92,14 +94,16 @@ def _try_robot(
     )
     has_pose = expect(
         isinstance(state, Tensor) and same(state[..., :3], pose),
-        f"Expected initial states in {pose.dtype} that begin with the pose (x, y, θ), "
-        "got others.",
+        f"Expected `initial_state` to return states in {pose.dtype} that begin with the "
+        "pose (x, y, θ), got other values.",
     )
     if not has_pose:
         return
     state = state.reshape(*draws.leading, -1)
     max_length = 1.001 * robot.top_speed_mps * robot.dt_s
-    too_long = "Expected no step longer than `top_speed_mps` allows, got one."
+    too_long_breach = (
+        "Expected steps of at most `top_speed_mps` · `dt_s`, got a longer step."
+    )
     for _ in range(3):
         action = draws.uniform(robot.action_low, robot.action_high)
         traversability = draws.uniform([0], [1])[..., 0]
@@ -109,16 +113,18 @@ def _try_robot(
         if next_state is NOTHING:
             return
         is_short = _lengths(state, next_state) <= max_length
-        expect(bool(is_short.all()), too_long)
-        at_zero = robot(state, action, torch.zeros_like(traversability))
-        stands = not stands_at_zero or same(at_zero[..., :2], state[..., :2], 1e-6)
+        expect(bool(is_short.all()), too_long_breach)
+        state_at_zero = robot(state, action, torch.zeros_like(traversability))
+        stands_still = not stands_at_zero or same(
+            state_at_zero[..., :2], state[..., :2], 1e-6
+        )
         expect(
-            stands,
-            "Expected no motion on terrain of λ = 0, got some. Pass "
+            stands_still,
+            "Expected no motion on terrain of λ = 0, got a change of position. Pass "
             "`stands_at_zero=False` to allow it.",
         )
         state = next_state
-    # An accelerating robot reaches its top speed only after several steps, with its
+    # A robot that accelerates reaches its top speed only after several steps with
     # actions at their bounds.
     bounds = zip(robot.action_low, robot.action_high, strict=True)
     for corner in itertools.product(*bounds):
@@ -129,7 +135,7 @@ def _try_robot(
             previous = state
             state = robot(state, action, full)
         is_short = _lengths(previous, state) <= max_length
-        expect(bool(is_short.all()), too_long)
+        expect(bool(is_short.all()), too_long_breach)
 
 
 def _lengths(state: Tensor, next_state: Tensor) -> Tensor:
@@ -146,10 +152,10 @@ def check_objective(
 
     - `stage` and `terminal` return finite costs of shape [*B] for any leading
       dimensions and λ̂ from 0 to 1;
-    - `path_cost` returns costs above 0 for λ̂ of motion and positive and negative
-      grades;
-    - all are in the dtype and on the device of the states, the same when repeated, and
-      for a single episode as in a batch;
+    - `path_cost` returns finite costs above 0 for λ̂ of at least
+      `Rules.min_traversability`, and for positive and negative grades;
+    - costs are in the dtype and on the device of the states, the same when repeated,
+      and the same for a single episode as in a batch;
     - arguments and global generators are unchanged.
 
     Args:
@@ -179,23 +185,23 @@ def check_objective(
         target = target_draws.uniform((0, 0), (9, 9))
         action = draws.uniform(new_robot.action_low, new_robot.action_high)
         grade = draws.uniform([-1], [1])[..., 0]
-        at = {"traversability": traversability, "target": target}
-        of_motion = traversability.clamp(min=rules.min_traversability)
+        other_arguments = {"traversability": traversability, "target": target}
+        motion_traversability = traversability.clamp(min=rules.min_traversability)
         calls = {
-            "stage": {"state": state, "action": action, **at},
-            "terminal": {"state": state, **at},
-            "path_cost": {"traversability": of_motion, "grade": grade},
+            "stage": {"state": state, "action": action, **other_arguments},
+            "terminal": {"state": state, **other_arguments},
+            "path_cost": {"traversability": motion_traversability, "grade": grade},
         }
         for method, arguments in calls.items():
-            what = f"results of `{method}`"
-            is_cost = breaches.is_tensor(what, draws.like, draws.leading)
+            description = f"results of `{method}`"
+            is_cost = breaches.is_tensor(description, draws.like, draws.leading)
             function = getattr(new_objective, method)
             cost = breaches.try_function(method, function, arguments, is_cost)
         is_positive = cost is NOTHING or bool((cost > 0).all())
         breaches.expect(
             is_positive,
-            "Expected costs above 0 from `path_cost`, got others. Return a cost > 0 "
-            "per metre.",
+            "Expected costs above 0 from `path_cost`, got costs of 0 or below. Return a "
+            "cost > 0 per metre.",
         )
     breaches.raise_any()
 
@@ -205,13 +211,13 @@ def check_risk(
 ) -> None:
     """Check that a risk measure fulfils its contract.
 
-    It is applied to mixtures of one and of three components, and to quantiles.
+    The measure is applied to mixtures of one and of three components, and to quantiles.
     The contract:
 
     - λ̂ is in [0, 1], of shape [B, H, W], floating-point, and on the distribution's
       device;
-    - it is the same when repeated, and for a single map as in a batch;
-    - it is the same for selected cells as on the map, since a robot that learns updates
+    - λ̂ is the same when repeated, and for a single map as in a batch;
+    - λ̂ is the same for selected cells as on the map, since a robot that learns updates
       only the cells whose belief changed;
     - the distribution and the global generators are unchanged.
 
@@ -252,24 +258,26 @@ def _try_measure(
     like = torch.zeros(1, dtype=distribution.dtype, device=distribution.device)
     is_map = breaches.is_tensor("λ̂", like, distribution.shape)
     arguments = {"distribution": distribution}
-    apply = partial(risk.apply, measure)
-    breaches.try_function("risk", apply, arguments, is_map, tolerance)
+    apply_risk = partial(risk.apply, measure)
+    breaches.try_function("risk", apply_risk, arguments, is_map, tolerance)
     cells = torch.zeros(
         distribution.shape, dtype=torch.bool, device=distribution.device
     )
     cells[0, ::2] = True
     cells[2, 1] = True
-    on_map = breaches.watch("risk", lambda: measure(distribution))
-    is_map_of_shape = isinstance(on_map, Tensor) and on_map.shape == distribution.shape
+    whole_map = breaches.watch("risk", lambda: measure(distribution))
+    is_map_of_shape = (
+        isinstance(whole_map, Tensor) and whole_map.shape == distribution.shape
+    )
     if not is_map_of_shape:
-        return  # noted above
+        return  # `try_function` has noted it
     selected = map_tensors(distribution.at(cells), lambda values: values[None])
-    of_selected = breaches.watch("risk", lambda: measure(selected))
-    expected = on_map[cells][None, None]
-    is_same = of_selected is NOTHING or same(of_selected, expected, tolerance)
+    selected_map = breaches.watch("risk", lambda: measure(selected))
+    expected = whole_map[cells][None, None]
+    is_same = selected_map is NOTHING or same(selected_map, expected, tolerance)
     breaches.expect(
         is_same,
-        "Expected the same λ̂ of selected cells as on the map, got another.",
+        "Expected the same λ̂ for selected cells as on the map, got a different λ̂.",
     )
 
 
@@ -286,7 +294,7 @@ def _rejects_by_name(measure: Any, distribution: TraversabilityDistribution) -> 
 def _create_mixture(
     group: tuple[int, ...], device: torch.device
 ) -> TraversabilityMixture:
-    """Return mixtures with means beyond [0, 1] and some stds of 0, [3, K, 8, 11]."""
+    """Return mixtures of shape [3, K, 8, 11], some with std 0 or means beyond [0, 1]."""
     generator = torch.Generator().manual_seed(0)
     uniform = torch.rand(3, 3, len(group), 8, 11, generator=generator).to(device)
     weights = uniform[0] / uniform[0].sum(1, keepdim=True)
@@ -297,7 +305,7 @@ def _create_mixture(
 
 
 def _create_quantiles(device: torch.device) -> QuantileDistribution:
-    """Return quantiles with atoms at 0, at 1 and in between, shape [3, Q, 8, 11]."""
+    """Return quantiles of shape [3, Q, 8, 11] with atoms at 0, at 1 and in between."""
     generator = torch.Generator().manual_seed(0)
     a, b = torch.rand(2, 3, 1, 8, 11, generator=generator)
     levels = torch.tensor(LEVELS).view(-1, 1, 1)

@@ -14,9 +14,9 @@ def check_metric(metric: Any, robot: Any = "unicycle") -> None:
 
     The contract:
 
-    - its attributes are those of `benchnav.metrics.Metric`;
-    - `compute` returns a finite number or NaN for a success, a failure without motion
-      and a failure of one step;
+    - its attributes are valid, see `benchnav.metrics.Metric`;
+    - `compute` returns a finite number or NaN for three sample episodes: a success, a
+      failure without motion, and a failure after one step;
     - the number is the same when repeated;
     - arguments and global generators are unchanged.
 
@@ -36,10 +36,10 @@ def check_metric(metric: Any, robot: Any = "unicycle") -> None:
         breaches.location = f"{episode}"
         compute = partial(measure, new_metric, episode)
         value = breaches.watch("compute", compute, metric=new_metric)
-        again = breaches.watch("compute", compute, metric=new_metric)
-        is_same = NOTHING in (value, again) or repr(value) == repr(again)
+        repeated = breaches.watch("compute", compute, metric=new_metric)
+        is_same = NOTHING in (value, repeated) or repr(value) == repr(repeated)
         breaches.expect(
             is_same,
-            "Expected the same value when computed again, got another.",
+            "Expected the same value when computed again, got a different value.",
         )
     breaches.raise_any()

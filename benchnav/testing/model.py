@@ -1,6 +1,6 @@
 """The check of traversability models on small generated maps.
 
-Letters in shapes: M members, B maps, H×W cells, C classes, K components.
+Letters in shapes: M members of an ensemble, B maps, H×W cells, C classes.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,7 +30,7 @@ from benchnav.testing.distribution import check_functions
 from benchnav.testing.trainable import try_training, untrained, with_inputs
 
 _MAPS = 3
-_CLASSES = tuple(map(str, range(10)))  # more than any map contains
+_CLASSES = tuple(map(str, range(10)))  # names of more classes than any map contains
 
 
 def check_model(
@@ -51,31 +51,32 @@ def check_model(
     - the prediction is a TraversabilityDistribution of shape [B, H, W] for maps of any
       size, on the observation's device, of one floating-point dtype;
     - its CDF ascends from 0 to 1, its quantiles are in [0, 1] and are the inverse of
-      the CDF, and its integrals follow from both;
+      the CDF, and mean, CVaR and times agree with both;
     - a mixture has finite parameters, weights ≥ 0 that sum to 1, and standard
       deviations ≥ 0;
     - the observation and the global generators of Python, NumPy and PyTorch are
       unchanged;
     - the prediction is the same when repeated, and for a single map as in a batch;
-    - `class_names`, if not empty, has one name per class of the distribution: per
-      component of a mixture, or per group of `group`;
-    - `member_probabilities`, if not None, has shape [M, B, C, H, W]; in each cell the
-      class probabilities are in the order of their average, which may be calibrated.
+    - `class_names`, if not empty, has one name for each class of the distribution. The
+      classes of a mixture are its components, or the values of `group`;
+    - `member_probabilities`, if not None, has shape [M, B, C, H, W]. In each cell, the
+      prediction ranks the classes as the average over members does; its probabilities
+      may differ from the average, since they may be calibrated.
 
-    A class of trainable models is used as in training: its hooks are consistent, a step
-    changes its weights, cells with unobserved λ do not affect a finite loss, and
-    settings and tensors restore the same model. Layers that it requires and the recipe
-    lacks are random.
+    The check also trains a class of trainable models: its hooks are consistent, a
+    training step changes its weights, the loss is finite if λ of some cells is
+    unobserved, and settings and tensors restore the same model. If the recipe lacks a
+    layer that the model requires, random values are used.
 
     Args:
-        model: a model, an argument of `load_model`, or a class of trainable models, as
-            a class, path/to/file.py:Class or name. The oracle receives the Terrain.
-        shapes: (H, W) of the maps; for a model with a fixed size of maps, that size.
+        model: a model, an argument of `load_model`, or a class of trainable models: the
+            class, path/to/file.py:Class or its name. The oracle receives the Terrain.
+        shapes: (H, W) of the maps. If the model requires a fixed size, pass that size.
         recipe: recipe of the maps, a shipped id or the path of a YAML file; its first
             scenario is used.
         device: device of the observations.
-        tolerance: tolerance of sums, averages, λ, probabilities, and between a single
-            map and a batch, where the order of operations may differ.
+        tolerance: tolerance of sums, averages, λ and probabilities. It also applies
+            between a single map and a batch, whose order of operations may differ.
 
     Raises:
         ConfigError: If the model breaks the contract; the message lists all breaches.
@@ -117,7 +118,7 @@ def _is_sound(
     tolerance: float,
     breaches: Breaches,
 ) -> bool:
-    """Note faults of a prediction; return whether it is on the right device."""
+    """Note faults of a prediction; return whether it can be checked further."""
     if isinstance(predicted, TraversabilityMixture):
         values = {
             "weights": predicted.weights,
@@ -163,10 +164,12 @@ def _are_parameters(
     for name, value in values.items():
         is_finite = bool(value.isfinite().all())
         is_sound &= expect(
-            is_finite, f"Expected finite `{name}`, got some that are not."
+            is_finite, f"Expected finite `{name}`, got NaN or infinite values."
         )
         is_negative = name != "means" and bool((value < 0).any())
-        is_sound &= expect(not is_negative, f"Expected `{name}` ≥ 0, got some below.")
+        is_sound &= expect(
+            not is_negative, f"Expected `{name}` ≥ 0, got negative values."
+        )
     sums = weights.double().sum(1)
     ones = torch.ones_like(sums)
     return is_sound & expect(
@@ -175,30 +178,30 @@ def _are_parameters(
     )
 
 
-def _fit_names(names: int, predicted: TraversabilityDistribution) -> str:
-    """Return a message if the number of `class_names` is wrong, else an empty text."""
-    if names == 0:
+def _fit_names(n_names: int, predicted: TraversabilityDistribution) -> str:
+    """Return a message if the number of `class_names` is wrong; empty if it is right."""
+    if n_names == 0:
         return ""
     if not isinstance(predicted, TraversabilityMixture):
         try:
-            probabilities = predicted.class_probabilities(names)
+            probabilities = predicted.class_probabilities(n_names)
             got: Any = list(probabilities.shape)
         except ConfigError:
             got = f"a {type(predicted).__name__} without classes"
-        shape = [*predicted.shape[:-2], names, *predicted.shape[-2:]]
+        shape = [*predicted.shape[:-2], n_names, *predicted.shape[-2:]]
         if got == shape:
             return ""
         return f"Expected class probabilities of shape {shape}, got {got}."
     group = predicted.group
     n_components = predicted.weights.shape[1]
-    if group is None and names != n_components:
+    if group is None and n_names != n_components:
         return (
             f"Expected a name in `class_names` for each of {n_components} "
-            f"components, got {names}."
+            f"components, got {n_names}."
         )
-    if group is not None and names <= max(group):
+    if group is not None and n_names <= max(group):
         return (
-            f"Expected classes in `group` below {names}, the number of "
+            f"Expected classes in `group` below {n_names}, the number of "
             f"`class_names`, got {max(group)}."
         )
     return ""
@@ -212,9 +215,9 @@ def _check_classes(
     breaches: Breaches,
 ) -> None:
     """Note where a model's classes do not fit its distribution."""
-    names = len(model.class_names)
+    n_names = len(model.class_names)
     expect = breaches.expect
-    breach = _fit_names(names, predicted)
+    breach = _fit_names(n_names, predicted)
     if not expect(not breach, breach):
         return
     observation = terrain.observe()
@@ -226,10 +229,11 @@ def _check_classes(
     if members is None or members is NOTHING:
         return
     expect(
-        names > 0, "Expected `class_names` with `member_probabilities`, got no names."
+        n_names > 0,
+        "Expected `class_names`, since `member_probabilities` is not None, got no names.",
     )
-    if names:
-        weights = predicted.class_probabilities(names)
+    if n_names:
+        weights = predicted.class_probabilities(n_names)
     elif isinstance(predicted, TraversabilityMixture):
         weights = predicted.weights
     else:
@@ -241,21 +245,21 @@ def _check_classes(
         fits = members.shape[1:] == weights.shape and len(members) > 0
     shape = f"[M, {str(list(weights.shape))[1:]}"
     if expect(fits, f"Expected `member_probabilities` of shape {shape}, got {got}."):
-        # In each cell, the weights descend in the order of the average.
+        # The weights must descend in the order in which the average descends.
         descending = members.mean(0).argsort(1, descending=True)
         rise = weights.gather(1, descending).diff(dim=1)
         is_ordered = rise <= tolerance
-        order = "in the order of the average of `member_probabilities`"
         expect(
             bool(is_ordered.all()),
-            f"Expected class probabilities {order}, got another.",
+            "Expected class probabilities that rank the classes as the average of "
+            "`member_probabilities` does, got another order.",
         )
 
 
 def _create_terrain(
     recipe: str, height: int, width: int, device: torch.device
 ) -> Terrain:
-    """Return three maps of a recipe's first scenario, on a grid of another size."""
+    """Return three maps of a recipe's first scenario, of a given size in cells."""
     original = load_recipe(recipe)
     name, scenario = next(iter(original.scenarios.items()))
     cell_m = original.resolution_m

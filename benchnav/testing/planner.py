@@ -57,17 +57,17 @@ def check_planner(
     - problem, step, plan state and the global generators of Python, NumPy and PyTorch
       are unchanged;
     - the action is the same when repeated, with the same seed, after `init` on other
-      problems, and with or without drawing;
+      problems, and for any `Step.draw`;
     - it is the same for a single episode, and for episodes selected by `select`, as in
       the batch;
     - robots of the batch that have reached the goal or left the map cause no error;
-    - inputs that are not in `uses` have no effect, from whichever input free space
-      derives.
+    - inputs that are not in `uses` have no effect, whichever input determines free
+      space.
 
     Args:
         planner: a planner, or its name, file or mapping as in suites.
-        robots: robots, or their names, files or mappings; if None, all registered ones.
-            Those that `steers` or `robots` of the planner exclude are skipped.
+        robots: robots, or their names, files or mappings; if None, all registered
+            robots. Robots that the planner's `steers` or `robots` excludes are skipped.
         objective: an objective, or its name, file or mapping; if None, the distance to
             the goal.
         shapes: (H, W) of the maps.
@@ -81,10 +81,11 @@ def check_planner(
     new_planner = registry.take("planner", planner)
     breaches = Breaches("planner", type(new_planner).__name__)
     steers = new_planner.steers
-    are_names = isinstance(steers, tuple) and all(map(_are_lines, steers))
+    are_names = isinstance(steers, tuple) and all(map(_are_single_lines, steers))
     breaches.expect(
         steers is None or are_names,
-        f"Expected `steers` as tuples of action names, got {steers!r}.",
+        "Expected `steers` as a tuple of tuples of action names, or None, got "
+        f"{steers!r}.",
     )
     is_bool = isinstance(new_planner.blind, bool)
     breaches.expect(
@@ -95,14 +96,14 @@ def check_planner(
     rules = Rules()
     if robots is None:
         robots = registry.names("robot")
-    for label in robots:
-        robot = registry.take("robot", label)
+    for robot_or_name in robots:
+        robot = registry.take("robot", robot_or_name)
         if steers is not None and tuple(robot.action_names) not in steers:
             continue
         if new_planner.robots is not None and type(robot) not in new_planner.robots:
             continue
         n_robots += 1
-        name = label if isinstance(label, str) else type(robot).__name__
+        name = robot_or_name if isinstance(robot_or_name, str) else type(robot).__name__
         goal = registry.take(
             "objective",
             objective or GoalDistance(),
@@ -120,22 +121,23 @@ def check_planner(
             problem = create(task, height, width)
             _PlannerCheck(new_planner, problem, tolerance, breaches).run()
         height, width = shapes[0]
-        for by in ("risk", "mean"):
+        for source in ("risk", "mean"):
             breaches.location = f"{name} on {height}×{width}"
-            free_space_rules = replace(rules, free_space=FreeSpace(by=by))
+            free_space_rules = replace(rules, free_space=FreeSpace(by=source))
             problem = create(replace(task, rules=free_space_rules), height, width)
             _PlannerCheck(new_planner, problem, tolerance, breaches).check_uses()
     breaches.expect(
         n_robots > 0,
-        "Expected the planner to steer one of the tried robots, got no such robot.",
+        "Expected the planner to steer one of the tried robots, got no such robot. Pass "
+        "a robot that `steers` and `robots` of the planner include.",
     )
     breaches.raise_any()
 
 
-def _are_lines(values: Any) -> bool:
+def _are_single_lines(values: Any) -> bool:
     if not isinstance(values, tuple):
         return False
-    return all(isinstance(line, str) and "\n" not in line for line in values)
+    return all(isinstance(text, str) and "\n" not in text for text in values)
 
 
 @dataclass(frozen=True)
@@ -148,66 +150,69 @@ class _PlannerCheck:
     breaches: Breaches
 
     def run(self) -> None:
-        """Plan several steps, then again in ways that should change nothing.
+        """Plan several steps, then in ways that should have the same results.
 
-        It stops at the first breach that prevents further checks.
+        The check stops at the first breach that prevents further checks.
         """
         problem = self.problem
         start = problem.start
-        self.check_words()
+        self.check_texts()
         first_state = self.begin(problem)
         plan_state = first_state
         step = first_step(problem)
-        answered: list[tuple[Step, Tensor]] = []
-        last = torch.tensor([len(problem) - 1], device=start.device)
-        last_two = torch.cat((last, last - 1))
+        planned: list[tuple[Step, Tensor]] = []
+        last_episode = torch.tensor([len(problem) - 1], device=start.device)
+        last_two_episodes = torch.cat((last_episode, last_episode - 1))
         indices = torch.arange(len(problem), device=start.device)
         for number in range(_STEPS + 1):
             # In the last step, only the last two episodes are still running.
-            running = indices >= (number == _STEPS) * last_two[1]
+            running = indices >= (number == _STEPS) * last_two_episodes[1]
             step = numbered_step(problem, step, ~running, number)
-            answer = self.ask(step, plan_state, problem)
+            answer = self.plan(step, plan_state, problem)
             if answer is NOTHING:
                 return
             action, next_plan_state, plan = answer
             self.check_answer(action[running], plan)
-            self.ask_again(step, plan_state, action)
-            answered.append((step, action))
+            self.plan_again(step, plan_state, action)
+            planned.append((step, action))
             plan_state = next_plan_state
             step = step_after(problem, step, action)
         breach = (
-            "Expected the same action from a generator of the same seed, got another."
+            "Expected the same action from a generator of the same seed, got a "
+            "different action."
         )
         repeated_state = self.begin(problem)
-        second_state = self.expect_action(breach, answered[0], repeated_state, problem)
-        plan_state = self.begin(problem.select(last))
+        second_state = self.expect_action(breach, planned[0], repeated_state, problem)
+        plan_state = self.begin(problem.select(last_episode))
         breach = (
-            "Expected the same action for a single episode as in the batch, got "
-            "another."
+            "Expected the same action for a single episode as in the batch, got a "
+            "different action."
         )
-        for pair in answered[:_STEPS]:
-            plan_state = self.expect_action(breach, pair, plan_state, problem, last)
+        for pair in planned[:_STEPS]:
+            plan_state = self.expect_action(
+                breach, pair, plan_state, problem, last_episode
+            )
         selected = NOTHING
         if second_state is not NOTHING:
-            select = partial(self.planner.select, second_state, last_two)
+            select = partial(self.planner.select, second_state, last_two_episodes)
             selected = self.breaches.watch("select", select, plan_state=second_state)
         if selected is not NotImplemented:
             breach = (
-                "Expected the same actions for episodes that `select` keeps as in "
-                "the batch, got others."
+                "Expected the same actions for episodes that `select` returns as in "
+                "the batch, got different actions."
             )
-            self.expect_action(breach, answered[1], selected, problem, last_two)
-        different = invert_prediction(problem.select(last_two))
+            self.expect_action(breach, planned[1], selected, problem, last_two_episodes)
+        different = invert_prediction(problem.select(last_two_episodes))
         self.begin(different)
         breach = (
             "Expected the first step's action to be the same after other steps and "
-            "problems, got another. "
-            "Keep changing values in the plan state, not on the planner."
+            "problems, got a different action. Keep changing values in the plan state, "
+            "not on the planner."
         )
-        self.expect_action(breach, answered[0], first_state, problem)
+        self.expect_action(breach, planned[0], first_state, problem)
 
     def check_uses(self) -> None:
-        """Plan several steps, and again with other values of each unused input."""
+        """Check that inputs that are not in `uses` do not change the actions."""
         problem = self.problem
         expect = self.breaches.expect
         used = self.breaches.watch("uses", lambda: self.planner.uses(problem.task))
@@ -221,20 +226,20 @@ class _PlannerCheck:
         is_consistent = not self.planner.blind or not used
         expect(
             is_consistent,
-            "Expected `uses` of a `blind` planner to be empty, got some inputs.",
+            f"Expected `uses` of a `blind` planner to be empty, got {sorted(used)}.",
         )
         for name in sorted(INPUTS - used):
             changed = change_input(problem, name)
             breach = (
-                f"Expected the same action for any value of `{name}`, which "
-                "is not in `uses`, got another."
+                f"Expected the same action for any value of `{name}`, which is not in "
+                "`uses`, got a different action."
             )
             step = first_step(problem)
             plan_state = self.begin(problem)
             changed_state = self.begin(changed)
             for number in range(_STEPS):
                 step = replace(step, time_s=number * problem.dt_s)
-                answer = self.ask(step, plan_state, problem)
+                answer = self.plan(step, plan_state, problem)
                 if answer is NOTHING:
                     return
                 action, plan_state, _ = answer
@@ -250,8 +255,8 @@ class _PlannerCheck:
             "init", lambda: self.planner.init(problem, generator), problem=problem
         )
 
-    def ask(self, step: Step, plan_state: Any, problem: Problem) -> Any:
-        """Return the planner's answer, or `NOTHING` if it is not usable."""
+    def plan(self, step: Step, plan_state: Any, problem: Problem) -> Any:
+        """Return the result of the planner's `plan`, or `NOTHING` if it is invalid."""
         if plan_state is NOTHING:
             return NOTHING
         act = partial(self.planner.plan, step, plan_state)
@@ -264,27 +269,27 @@ class _PlannerCheck:
     def expect_action(
         self,
         breach: str,
-        answered: tuple[Step, Tensor],
+        planned: tuple[Step, Tensor],
         plan_state: Any,
         problem: Problem,
         members: Tensor | None = None,
     ) -> Any:
-        """Expect an action at a step; return the next plan state, or `NOTHING`.
+        """Check the action at a step; return the next plan state, or `NOTHING`.
 
         Args:
             breach: message if the action differs.
-            answered: the step, and the expected action of each episode.
+            planned: the step, and the expected action of each episode.
             plan_state: plan state before the step.
             problem: problem of all episodes.
-            members: indices of episodes to plan for, within `tolerance`; if None, all
-                episodes, exactly.
+            members: indices of episodes whose actions must agree within `tolerance`; if
+                None, the actions of all episodes must be equal.
         """
-        step, expected = answered
+        step, expected = planned
         if members is not None:
             step = step.select(members)
             expected = expected[members]
             problem = problem.select(members)
-        answer = self.ask(step, plan_state, problem)
+        answer = self.plan(step, plan_state, problem)
         if answer is NOTHING:
             self.breaches.expect(plan_state is NOTHING, breach)
             return NOTHING
@@ -298,47 +303,49 @@ class _PlannerCheck:
         self.breaches.expect(is_same, breach)
         return next_plan_state
 
-    def ask_again(self, step: Step, plan_state: Any, expected: Tensor) -> None:
-        """Plan again with drawing toggled, which should change nothing."""
+    def plan_again(self, step: Step, plan_state: Any, expected: Tensor) -> None:
+        """Check that the action is the same when repeated, and for any `Step.draw`."""
         toggled = replace(step, draw=not step.draw)
-        answer = self.ask(toggled, plan_state, self.problem)
+        answer = self.plan(toggled, plan_state, self.problem)
         if answer is NOTHING:
             return
         action, _, plan = answer
         self.check_layers(plan)
         if same(action, expected):
             return
-        answer = self.ask(step, plan_state, self.problem)
+        answer = self.plan(step, plan_state, self.problem)
         is_repeatable = self.breaches.expect(
             answer is not NOTHING and same(answer[0], expected),
-            "Expected the same action for the same step and plan state, got "
-            "another when called again.",
+            "Expected the same action for the same step and plan state, got a different "
+            "action when called again.",
         )
         if is_repeatable:
             self.breaches.expect(
                 False,
-                "Expected the same action whether it is drawn or not, got another.",
+                "Expected the same action for any `Step.draw`, got a different action.",
             )
 
-    def check_words(self) -> None:
+    def check_texts(self) -> None:
         """Note invalid texts of the planner."""
         watch = self.breaches.watch
         expect = self.breaches.expect
         task = self.problem.task
         follows = watch("follows", lambda: self.planner.follows(task))
         remarks = watch("remarks", lambda: self.planner.remarks(task))
-        is_line = follows is NOTHING or _are_lines((follows,))
+        is_line = follows is NOTHING or _are_single_lines((follows,))
         expect(
             is_line,
-            "Expected `follows` to return a single line, got something else.",
+            "Expected `follows` to return a single line, got another type or several "
+            "lines.",
         )
         expect(
-            remarks is NOTHING or _are_lines(remarks),
-            "Expected `remarks` to return a tuple of single lines, got something else.",
+            remarks is NOTHING or _are_single_lines(remarks),
+            "Expected `remarks` to return a tuple of single lines, got another type or "
+            "several lines.",
         )
 
     def check_answer(self, action: Tensor, plan: Plan) -> None:
-        """Note invalid values of an answer; ended episodes may have any action."""
+        """Note invalid values of the actions of running episodes, and of the plan."""
         expect = self.breaches.expect
         low, high = self.problem.action_bounds
         margin = 1e-5 * (high - low)
@@ -346,13 +353,14 @@ class _PlannerCheck:
         is_beyond = (action < low - margin) | (action > high + margin)
         expect(
             not bool(is_beyond.any()),
-            "Expected actions within the robot's bounds, got some beyond them.",
+            "Expected actions within the robot's bounds, got actions outside them.",
         )
         status = plan.status
         is_valid = (status >= min(PlanStatus)) & (status <= max(PlanStatus))
         expect(
             bool(is_valid.all()),
-            f"Expected `Plan.status` in 0–{int(max(PlanStatus))}, got other numbers.",
+            "Expected `Plan.status` as values of `PlanStatus`, "
+            f"0–{int(max(PlanStatus))}, got other numbers.",
         )
         self.check_layers(plan)
 

@@ -20,13 +20,13 @@ _RESOLUTION_M = 0.5
 
 
 def invert_prediction(problem: Problem) -> Problem:
-    """Return the problem with 1 − λ for λ in map and distribution."""
+    """Return the problem with λ replaced by 1 − λ in the risk map and distribution."""
     inverted = change_input(problem, "risk_map")
     return change_input(inverted, "distribution")
 
 
 def change_input(problem: Problem, name: str) -> Problem:
-    """Return the problem with other values of an input and of derived free space.
+    """Return the problem with an input changed, and the free space that follows from it.
 
     Args:
         problem: the problem.
@@ -46,13 +46,13 @@ def change_input(problem: Problem, name: str) -> Problem:
 
 
 def first_step(problem: Problem) -> Step:
-    """Return the step at the start, before λ was observed."""
+    """Return the first step, before λ was observed."""
     unobserved = torch.full_like(problem.start[:, 0], torch.nan)
     return Step(state=problem.start, traversability=unobserved, time_s=0.0)
 
 
 def step_after(problem: Problem, step: Step, action: Tensor) -> Step:
-    """Return the step after an action."""
+    """Return the step that follows an action."""
     observed = problem.traversability_at(step.state)
     command = action.clamp(*problem.action_bounds)
     state = problem.robot(step.state, command, observed)
@@ -60,7 +60,17 @@ def step_after(problem: Problem, step: Step, action: Tensor) -> Step:
 
 
 def numbered_step(problem: Problem, step: Step, ended: Tensor, number: int) -> Step:
-    """Return a step by number; one ended robot is off the map, others at the goal."""
+    """Return a step with a number, in which some episodes have ended.
+
+    The robot of the first ended episode is off the map; the robots of other ended
+    episodes are at the goal.
+
+    Args:
+        problem: problem of all episodes.
+        step: step with the states of running robots.
+        ended: mask of ended episodes, bool, shape [B].
+        number: number of the step; plans are drawn in odd steps.
+    """
     first_ended = ended.nonzero()[:1, 0]
     position_m = problem.goal_m.index_fill(0, first_ended, -0.3)
     state = step.state.clone()
@@ -87,7 +97,7 @@ def create_problem(
     """
     rows = torch.arange(height, device=device)[:, None]
     columns = torch.arange(width, device=device)
-    # λ varies in waves, so that all cells differ.
+    # λ varies in waves, so that cells differ.
     waves = 0.8 + 0.1 * torch.sin(0.7 * rows + 1.3 * columns)
     traversability = waves.repeat(4, 1, 1)
     wall = slice(height // 2, height // 2 + 2)

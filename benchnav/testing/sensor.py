@@ -44,26 +44,27 @@ def check_sensor(
 
     - at least one cell is observed;
     - the measurement has the shape, dtype and device of the λ field;
-    - λ is in [0, 1], or NaN without a measurement, with a standard deviation of at
-      least `MIN_STD`;
-    - an `Appearance` has the layers of the terrain, and in observed cells an elevation
-      and a noise level ≥ 0;
+    - λ is in [0, 1], or NaN in cells without a measurement; its standard deviation is
+      at least `MIN_STD`;
+    - an `Appearance` has the layers of the terrain, and in observed cells a finite
+      elevation and a noise level ≥ 0;
     - arguments and the global generators of Python, NumPy and PyTorch are unchanged;
     - the measurement is the same when repeated, and for selected episodes in any order
       as in the batch;
     - noise, if any, differs between episodes and steps.
 
-    The measurement must not depend on unobserved truth. It is the same when λ, its
-    distribution and its class are replaced in cells without measured λ, and when
-    colour, slope and layers are replaced in unobserved cells. The elevation of
-    unobserved cells is lowered by 1 to 3 m, since raised terrain may come into view.
-    The robot's cell keeps its elevation, since it carries the sensor.
+    The measurement must not depend on the truth of unobserved cells. It must be the
+    same if λ, its distribution and the class are replaced in cells without measured λ,
+    and if colour, slope and layers are replaced in unobserved cells. It must also be
+    the same if the elevation of unobserved cells is lowered by 1 to 3 m; it is not
+    raised, since raised terrain may come into view. The robot's cell keeps its
+    elevation, since the robot carries the sensor.
 
     Args:
         sensor: a sensor, or its name, file or mapping as in suites.
         shapes: (H, W) of the maps.
         device: device of the maps.
-        sinks: whether elevation is lowered too; False for a line of sight that
+        sinks: whether elevation is lowered. Pass False for a sensor whose line of sight
             unobserved terrain may block, such as single rays to the centres of cells.
         tolerance: tolerance between values that should be equal for other arguments.
 
@@ -92,7 +93,7 @@ def check_sensor(
 
 @dataclass(frozen=True, kw_only=True)
 class _Truth(Batch):
-    """The arguments of a sensor, except for the key of its noise."""
+    """Arguments of `Sensor.sense`, except for the key of the noise."""
 
     terrain: Terrain
     field: Tensor
@@ -111,8 +112,8 @@ class _SensorCheck:
     tolerance: float
 
     def run(self) -> None:
-        """Sense, then again in ways that should change nothing or only the noise."""
-        sensed = self.ask(self.truth)
+        """Sense, then in ways that should have the same results except for noise."""
+        sensed = self.sense(self.truth)
         if sensed is NOTHING:
             return
         appearance = sensed.appearance
@@ -120,55 +121,58 @@ class _SensorCheck:
         has_seen = appearance is not None and bool(appearance.seen.any())
         self.breaches.expect(
             has_sensed or has_seen,
-            "Expected a robot in the middle of a map to measure or see a cell, got no "
-            "such cell.",
+            "Expected the sensor to observe a cell for a robot in the middle of a map, "
+            "got no cell.",
         )
-        reported = _reported(sensed)
+        reported = _reported_values(sensed)
         is_same = self.breaches.expect(
-            self.is_alike(self.ask(self.truth), reported, 0),
-            "Expected the same measurement when called again, got another.",
+            self.is_alike(self.sense(self.truth), reported, 0),
+            "Expected the same measurement when called again, got a different "
+            "measurement.",
         )
         for indices in ([3], [2, 0]):
             members = torch.tensor(indices, device=self.truth.field.device)
             keys = [_KEYS[index] for index in indices]
-            of_members = self.ask(self.truth.select(members), keys)
+            selected_measurement = self.sense(self.truth.select(members), keys)
             expected = tuple(values[members] for values in reported)
             self.breaches.expect(
-                self.is_alike(of_members, expected, self.tolerance),
+                self.is_alike(selected_measurement, expected, self.tolerance),
                 "Expected the same results for single episodes and in another order as "
-                "in the batch, got others. Draw noise by `NoiseKey.normal`.",
+                "in the batch, got different results. Draw noise by `NoiseKey.normal`.",
             )
         if not is_same:
-            return  # the following comparisons would all fail
-        for what, changed in _replaced(self.truth, sensed, self.sinks):
+            return  # all further comparisons would fail
+        for description, changed_truth in _with_replaced_values(
+            self.truth, sensed, self.sinks
+        ):
             self.breaches.expect(
-                self.is_alike(self.ask(changed), reported, self.tolerance),
-                f"Expected the same measurement whatever {what}, got another. Read only "
-                "cells that are reported.",
+                self.is_alike(self.sense(changed_truth), reported, self.tolerance),
+                f"Expected a measurement that does not depend on {description}, got a "
+                "different measurement. Use only the truth of observed cells.",
             )
         self.try_noise(sensed)
 
     def try_noise(self, sensed: Measurement) -> None:
-        """Expect noise to differ between episodes and steps."""
-        with_keys = self.ask(self.truth, _OTHER_KEYS)
-        with_step = self.ask(self.truth, step=self.step + 1)
+        """Check that noise differs between episodes and between steps."""
+        with_keys = self.sense(self.truth, _OTHER_KEYS)
+        with_step = self.sense(self.truth, step=self.step + 1)
         by_key = with_keys is not NOTHING and _differ(sensed, with_keys)
         by_step = with_step is not NOTHING and _differ(sensed, with_step)
         self.breaches.expect(
             by_step or not by_key,
-            "Expected other noise in another step, got the same. Draw it by "
-            "`NoiseKey.normal`.",
+            "Expected different noise in different steps, got the same noise. Draw it "
+            "by `NoiseKey.normal`.",
         )
         self.breaches.expect(
             by_key or not by_step,
-            "Expected other noise under another key of the episode, got the same "
-            "though it differs from step to step. Draw it by `NoiseKey.normal`.",
+            "Expected different noise for different keys of an episode, got noise that "
+            "differs only between steps. Draw it by `NoiseKey.normal`.",
         )
 
-    def ask(
+    def sense(
         self, truth: _Truth, keys: Sequence[int] = _KEYS, step: int | None = None
     ) -> Any:
-        """Return the sensor's answer, or `NOTHING` if it is not usable."""
+        """Return the sensor's measurement, or `NOTHING` if it is invalid."""
         if step is None:
             step = self.step
         noise_key = NoiseKey(tuple(keys), step)
@@ -187,12 +191,12 @@ class _SensorCheck:
     def is_alike(
         self, sensed: Any, expected: tuple[Tensor, ...], tolerance: float
     ) -> bool:
-        """Return whether an answer is as expected; an exception is noted elsewhere."""
-        return sensed is NOTHING or same(_reported(sensed), expected, tolerance)
+        """Return whether a measurement has the expected values, or is `NOTHING`."""
+        return sensed is NOTHING or same(_reported_values(sensed), expected, tolerance)
 
 
 def _faults(sensed: Any, truth: _Truth) -> Iterator[str]:
-    """Yield a message for each fault of an answer's form."""
+    """Yield a message for each fault of a measurement's types, shapes and values."""
     like = truth.field
     if not isinstance(sensed, Measurement):
         yield f"Expected a Measurement from `sense`, got {type(sensed).__name__}."
@@ -207,13 +211,16 @@ def _faults(sensed: Any, truth: _Truth) -> Iterator[str]:
     traversability = sensed.traversability[sensed.mask]
     in_range = (traversability >= 0) & (traversability <= 1)
     if not bool(in_range.all()):
-        yield "Expected λ in [0, 1], or NaN where it is not sensed, got other numbers."
+        yield (
+            "Expected λ in [0, 1], or NaN in cells that are not measured, got other "
+            "numbers."
+        )
     std = sensed.std[sensed.mask]
     is_valid = (std >= MIN_STD) & std.isfinite()
     if not bool(is_valid.all()):
         yield (
-            f"Expected `Measurement.std` of at least {MIN_STD:g}, and finite, where λ "
-            "is sensed, got others."
+            f"Expected `Measurement.std` ≥ {MIN_STD:g} and finite in measured cells, "
+            "got other values."
         )
     if sensed.appearance is not None:
         yield from _appearance_faults(sensed.appearance, truth)
@@ -223,8 +230,8 @@ def _appearance_faults(appearance: Any, truth: _Truth) -> Iterator[str]:
     is_appearance = isinstance(appearance, Appearance)
     if not is_appearance or not isinstance(appearance.observation, Observation):
         yield (
-            "Expected `Measurement.appearance` as an Appearance with an Observation, "
-            "got something else."
+            "Expected `Measurement.appearance` as an Appearance whose `observation` is "
+            "an Observation, got another type."
         )
         return
     like = truth.field
@@ -236,8 +243,9 @@ def _appearance_faults(appearance: Any, truth: _Truth) -> Iterator[str]:
         expected_names = ", ".join(expected.layers)
         names = ", ".join(layers) or "no layers"
         yield (
-            "Expected the terrain's own grid and layers in `Appearance.observation`, "
-            f"{expected_names}, got {observation.grid} and {names}."
+            "Expected `Appearance.observation` with the terrain's grid "
+            f"{expected.grid} and layers {expected_names}, got {observation.grid} and "
+            f"{names}."
         )
         return
     pairs = {
@@ -259,18 +267,21 @@ def _appearance_faults(appearance: Any, truth: _Truth) -> Iterator[str]:
     seen = appearance.seen
     noise_level = appearance.noise_level[seen]
     if not bool((noise_level >= 0).all()):
-        yield "Expected `Appearance.noise_level` ≥ 0 where a cell is seen, got others."
+        yield (
+            "Expected `Appearance.noise_level` ≥ 0 in observed cells, got negative "
+            "values or NaN."
+        )
     elevation_m = observation.elevation_m[seen]
     if not bool(elevation_m.isfinite().all()):
-        yield "Expected finite elevation where a cell is seen, got others."
+        yield "Expected finite elevation in observed cells, got NaN or infinite values."
 
 
 def _tensor_fault(what: str, values: Any, like: Tensor) -> str:
     return find_tensor_fault(what, values, like.dtype, tuple(like.shape), like.device)
 
 
-def _reported(sensed: Measurement) -> tuple[Tensor, ...]:
-    """Return the reported values with NaN elsewhere, each of shape [B, H, W]."""
+def _reported_values(sensed: Measurement) -> tuple[Tensor, ...]:
+    """Return the maps of a measurement, NaN in unobserved cells, each [B, H, W]."""
     std = sensed.std.where(sensed.mask, torch.nan)
     appearance = sensed.appearance
     if appearance is None:
@@ -289,7 +300,7 @@ def _channels(appearance: Appearance) -> tuple[Tensor, ...]:
 
 
 def _differ(first: Measurement, second: Measurement) -> bool:
-    """Return whether two measurements differ in a cell that both report."""
+    """Return whether two measurements differ in a cell that both observe."""
     common = first.mask & second.mask
     is_different = first.traversability != second.traversability
     differ = bool(is_different[common].any())
@@ -301,16 +312,16 @@ def _differ(first: Measurement, second: Measurement) -> bool:
     return not all(same(a[common], b[common]) for a, b in pairs)
 
 
-def _replaced(
+def _with_replaced_values(
     truth: _Truth, sensed: Measurement, sinks: bool
 ) -> Iterator[tuple[str, _Truth]]:
-    """Yield descriptions of unreported values that were replaced, and the new truth."""
+    """Yield a description of replaced unobserved values, and the new truth."""
     terrain = truth.terrain
     mask = sensed.mask
     reported = mask
     if sensed.appearance is not None:
         reported = mask | sensed.appearance.seen
-    # The new values differ in each cell, and in summaries such as mean and maximum.
+    # Each cell's value changes, and so do summaries such as mean and maximum.
     mixture = terrain.truth
     is_fixed = mask[:, None]
     new_means = 0.4 * (1 - mixture.means)
@@ -331,7 +342,7 @@ def _replaced(
     new_field = 0.4 * (1 - truth.field)
     field = truth.field.where(mask, new_field)
     yield (
-        "λ, its distribution and its class are where λ is not sensed",
+        "λ, its distribution and the class in cells that are not measured",
         replace(truth, terrain=changed, field=field),
     )
     layers = {}
@@ -345,7 +356,7 @@ def _replaced(
         layers=layers,
     )
     yield (
-        "colour, slope and layers are where nothing is sensed or seen",
+        "colour, slope and layers in unobserved cells",
         replace(truth, terrain=changed),
     )
     if not sinks:
@@ -360,15 +371,15 @@ def _replaced(
     new_height = height - 2 - (7 * height).sin()
     changed = replace(terrain, elevation_m=height.where(is_kept, new_height))
     yield (
-        "the elevation is where nothing is sensed or seen",
+        "the elevation of unobserved cells",
         replace(truth, terrain=changed),
     )
 
 
 def _create_hills(height: int, width: int, device: torch.device) -> _Truth:
-    """Return four maps of hills that occlude each other, with some λ of 0 and 1.
+    """Return the truth of four episodes on maps of hills that occlude each other.
 
-    The maps have two classes and a layer.
+    λ is 0 or 1 in some cells. The maps have two classes and a layer.
 
     Args:
         height: number of rows.

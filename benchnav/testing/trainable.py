@@ -20,7 +20,12 @@ from benchnav.testing.breaches import SEED, Breaches, same
 
 
 def untrained(model: Any) -> TrainableModel | None:
-    """Return an unbuilt trainable model of a class or name; None for other models."""
+    """Return a trainable model that is not yet built; None for other arguments.
+
+    Args:
+        model: class of trainable models, its name, file or mapping; or any other
+            argument of `check_model`.
+    """
     options: Mapping[str, Any] = {}
     if isinstance(model, str | Mapping | registry.Part):
         try:
@@ -39,7 +44,10 @@ def untrained(model: Any) -> TrainableModel | None:
 
 
 def with_inputs(terrain: Terrain, model: TrainableModel) -> Terrain:
-    """Return maps with all layers of a model; added ones are random, a tenth is NaN."""
+    """Return maps with all input layers of a model.
+
+    Layers that the maps lack are random, and NaN in a tenth of the cells.
+    """
     generator = torch.Generator().manual_seed(SEED)
     layers = dict(terrain.layers)
     like = terrain.elevation_m
@@ -60,7 +68,7 @@ def try_training(
     """Build a model, and check its hooks and a training step.
 
     Args:
-        model: unbuilt model.
+        model: model that is not yet built.
         terrain: maps to train on.
         classes: names of the classes.
         breaches: collection of breaches.
@@ -94,7 +102,7 @@ def try_training(
             is_changed |= not torch.equal(before[name], value)
         breaches.expect(
             is_changed,
-            "Expected a training step to change the weights, got the same weights.",
+            "Expected a training step to change the weights, got no change.",
         )
         model.eval().zero_grad()
         settings = model.settings()
@@ -104,8 +112,8 @@ def try_training(
         restored_mean = restored.to(device).predict_raw(layers).mean()
         breaches.expect(
             same(restored_mean, mean, 1e-5),
-            "Expected the same prediction from the settings and tensors of a "
-            "checkpoint, got another.",
+            "Expected the same prediction from a model restored from its settings and "
+            "tensors, got a different prediction.",
         )
     except Exception as error:
         text = str(error) if isinstance(error, BenchnavError) else one_line(error)
@@ -116,7 +124,7 @@ def try_training(
 
 
 def _maps(model: TrainableModel, terrain: Terrain) -> dict[str, Tensor]:
-    """Return a batch as in training: inputs, slope and targets."""
+    """Return a batch as in training: inputs, slope, λ and classes."""
     inputs = layers_of(terrain.observe(), (*model.inputs, "slope_deg"))
     return {
         **inputs,

@@ -505,6 +505,6 @@ def test_a_layer_may_not_take_the_name_of_what_is_seen(
     monkeypatch.setattr(TerrainDataset, "terrain", terrain)
     with pytest.raises(
         ConfigError,
-        match=f"layers that are not named 'state' or 'goal', got \\['{name}'\\]",
+        match=f"layers with other names than the observations 'state' and 'goal', got \\['{name}'\\]",
     ):
         make(dataset_path)

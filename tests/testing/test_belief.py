@@ -161,22 +161,22 @@ def of_the_prior(
 BAD: dict[str, tuple[Any, str]] = {
     "no belief": (object(), "Expected the belief to be an instance of benchnav.planning.Belief, got object"),
     "learns by a word": (having(learns="yes"), "Expected `learns` of type bool, got 'yes'"),
-    "writes into the state": (doing("update", lambda s, *_: s.std.mul_(0.5)), "got another state.std."),
-    "writes into what is sensed": (doing("update", lambda _, s, *__: s.std.mul_(2)), "got another sensed.std."),
-    "writes into the prediction": (doing("init", lambda p, _: p.means.mul_(0.5)), "got another prior.means."),
+    "writes into the state": (doing("update", lambda s, *_: s.std.mul_(0.5)), "got changes in state.std."),
+    "writes into what is sensed": (doing("update", lambda _, s, *__: s.std.mul_(2)), "got changes in sensed.std."),
+    "writes into the prediction": (doing("init", lambda p, _: p.means.mul_(0.5)), "got changes in prior.means."),
     "writes while it is asked": (doing("at", lambda s, _: s.std.mul_(0.5)), "`at` to leave its arguments unchanged"),
     "writes while it draws": (doing("sample_fields", lambda s, *_: s.score.add_(1)), "`sample_fields` to leave its"),
     "PyTorch's generator": (doing("update", lambda *_: torch.rand(1)), "PyTorch's global generator"),
     "NumPy's generator": (doing("sample_fields", lambda *_: np.random.rand()), "NumPy's global generator"),  # noqa: NPY002
     "Python's generator": (doing("init", lambda *_: random.random()), "Python's global generator"),
-    "raises": (doing("update", lambda s, *_: s.std[9]), "Expected an answer from `update`, got IndexError"),
+    "raises": (doing("update", lambda s, *_: s.std[9]), "Expected a result from `update`, got IndexError"),
     "raises when a prediction is new": (
         doing("update", lambda _, __, p=None: None if p is None else p.means[9]), "from `update`, got IndexError"
     ),
     "no distribution": (giving("distribution", lambda *_: 3), "Expected a TraversabilityDistribution"),
     "one map for all": (giving("distribution", lambda d, _: d.select(torch.tensor([0]))), "got one of shape [1, 6, 8]"),
     "no numbers": (giving("init", lambda s, *_: replace(s, std=s.std * torch.nan)), "of the belief in [0, 1]"),
-    "another prediction": (giving("init", blurred), "initial belief to equal the prediction, got another"),
+    "another prediction": (giving("init", blurred), "initial belief to equal the prediction, got differences"),
     "forgets over time": (giving("update", blurred), "an update without measurements to change nothing"),
     "what the batch has": (
         giving("update", lambda new, *_: replace(new, std=new.std * (0.99 if len(new.std) == 4 else 0.8))),
@@ -192,7 +192,7 @@ BAD: dict[str, tuple[Any, str]] = {
     ),
     "counts again what it knows": (
         giving("update", lambda new, old, s, *_: replace(new, std=torch.where(s.mask, 0.5 * old.std, new.std))),
-        "Expected λ that is sensed again without noise to change nothing",
+        "Expected a repeated measurement without noise to change nothing",
     ),
     "less sure by what it learns": (
         giving("update", lambda new, old, s, *_: replace(
@@ -208,13 +208,13 @@ BAD: dict[str, tuple[Any, str]] = {
     "at of the prediction": (giving("at", lambda _, s, cells: s.prior.at(cells)), "Expected mean and CVaR of `at`"),
     "too few fields": (giving("sample_fields", lambda f, *_: f[:, 0]), "Expected fields of shape [4, 50, 6, 8]"),
     "fields of no λ": (giving("sample_fields", lambda f, *_: f + 1), "Expected fields of λ in [0, 1]"),
-    "fields without keys": (giving("sample_fields", unkeyed), "Expected other fields under other keys"),
-    "fields by place": (giving("sample_fields", in_turn), "fields to depend only on its key"),
+    "fields without keys": (giving("sample_fields", unkeyed), "Expected different fields from different keys"),
+    "fields by place": (giving("sample_fields", in_turn), "fields to depend only on its state and key"),
     "fields of the prediction": (giving("sample_fields", of_the_prior), "the belief's distribution"),
-    "selects others": (having(select=lambda _, s, m: s.select(m.sort().values)), "episodes that `select` keeps"),
+    "selects others": (having(select=lambda _, s, m: s.select(m.sort().values)), "episodes that `select` returns"),
     "puts nothing": (having(put=lambda _, s, m, o: s), "`put` inserts"),
     "puts elsewhere": (having(put=lambda b, s, m, o: s.put(m.flip(0), o)), "`put` inserts"),
-    "selects nothing": (having(select=lambda _, s, m: s), "shape [2, 6, 8] of episodes that `select` keeps"),
+    "selects nothing": (having(select=lambda _, s, m: s), "shape [2, 6, 8] for episodes that `select` returns"),
 }  # fmt: skip
 
 

@@ -192,8 +192,8 @@ BAD = {
         "`weights` ≥ 0",
     ),
     "weights of another sum": (poked("weights", 0.0), "sum to 1"),
-    "an observation brightened": (meddling(lambda seen: seen.rgb.add_(1)), "got another observation.rgb"),
-    "an observation flattened": (meddling(lambda seen: seen.slope_deg.zero_()), "got another observation.slope_deg"),
+    "an observation brightened": (meddling(lambda seen: seen.rgb.add_(1)), "got changes in observation.rgb"),
+    "an observation flattened": (meddling(lambda seen: seen.slope_deg.zero_()), "got changes in observation.slope_deg"),
     "PyTorch's generator": (meddling(lambda _: torch.rand(1)), "PyTorch's global generator"),
     "PyTorch's seed": (meddling(lambda _: torch.manual_seed(54321)), "PyTorch's global generator"),
     "NumPy's generator": (meddling(lambda _: np.random.rand()), "NumPy's global generator"),  # noqa: NPY002
@@ -201,20 +201,20 @@ BAD = {
     "another answer": (Forgetful(), "Expected the same result from `predict` when called again"),
     "an answer of the batch": (changed(of_batch), "Expected the same result from `predict` for a single element"),
     "too many names": (Misnamed(), "each of 2 components, got 3"),
-    "members without names": (Nameless(), "`class_names` with"),
+    "members without names": (Nameless(), "`class_names`, since"),
     "members of another shape": (with_members(lambda weights: weights), "shape [M, 3, 2, 32, 32], got [3, 2, 32, 32]"),
     "too few maps of members": (with_members(lambda weights: weights[None, :1]), "got [1, 1, 2, 32, 32]"),
     "no members": (with_members(lambda weights: weights[None][:0]), "got [0, 3, 2, 32, 32]"),
     "members that are no tensor": (with_members(lambda weights: [weights]), "got list"),
     "members of another average": (
         with_members(lambda weights: weights.flip(1)[None]),
-        "order of the average of `member_probabilities`",
+        "as the average of `member_probabilities` does",
     ),
     "components of a class without a name": (
         changed(lambda mixture, _: replace(mixture, group=(0, 2))),
         "classes in `group` below 2, the number of `class_names`, got 2",
     ),
-    "members whose soft spots are summed up wrongly": (with_soft_spots(0), "order of the average"),
+    "members whose soft spots are summed up wrongly": (with_soft_spots(0), "as the average of"),
     "members that raise": (with_members(lambda weights: weights[9]), "IndexError"),
     "members that draw": (
         with_members(lambda weights: weights[None] + 0 * torch.rand(1)),
@@ -235,7 +235,7 @@ def test_every_breach_is_named_once_with_the_maps_it_was_found_on() -> None:
         check_model(model, shapes=((9, 9), (12, 7)))
     message = str(caught.value)
     assert message.count("`stds` ≥ 0") == message.count("each of 2 components") == 1
-    assert message.count("[wherever it was tried]") == 2
+    assert message.count("[in all cases]") == 2
 
 
 def test_components_of_one_class_are_summed_up() -> None:
@@ -384,11 +384,11 @@ BAD_DISTRIBUTIONS = {
     "of another inverse": (
         overriding(quantile=lambda d, u: 0.9 * QuantileDistribution.quantile(d, u)), "inverse of `cdf`",
     ),
-    "of another mean": (overriding(mean=lambda d: QuantileDistribution.mean(d) + 0.01), "`mean` to follow from"),
-    "of another tail": (overriding(cvar=lambda d, level: d.var(level)), "`cvar` to follow from"),
-    "of another time": (overriding(expected_time=lambda d, floor: 1 / d.mean()), "`expected_time` to follow from"),
+    "of another mean": (overriding(mean=lambda d: QuantileDistribution.mean(d) + 0.01), "`mean` to agree with"),
+    "of another tail": (overriding(cvar=lambda d, level: d.var(level)), "`cvar` to agree with"),
+    "of another time": (overriding(expected_time=lambda d, floor: 1 / d.mean()), "`expected_time` to agree with"),
     "of other limits": (overriding(cdf_limits=lambda d, x: (0 * d.cdf(x), d.cdf(x)), cdf=lambda d, x: (
-        QuantileDistribution.cdf_limits(d, x)[1])), "`cdf_limits` to be P(λ < value)"),
+        QuantileDistribution.cdf_limits(d, x)[1])), "`cdf_limits` to return P(λ < value)"),
     "of another dtype": (
         overriding(quantile=lambda d, u: QuantileDistribution.quantile(d, u).double()), "torch.float32",
     ),

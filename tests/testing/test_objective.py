@@ -42,20 +42,20 @@ BAD: dict[str, tuple[Any, str]] = {
     "another cost": (Forgetful(), "Expected the same result from `stage` when called again"),
     "a path that is free": (changed("path_cost", lambda cost, *_: cost - 1), "Expected costs above 0 from `path_cost`"),
     "a path that pays": (changed("path_cost", lambda cost, *_: -cost), "Expected costs above 0 from `path_cost`"),
-    "writes into the target": (changed("stage", lambda cost, *g: g[-1].zero_() is None or cost), "got another"),
+    "writes into the target": (changed("stage", lambda cost, *g: g[-1].zero_() is None or cost), "got changes in"),
     "of λ̂ = 0 infinite": (changed("stage", lambda cost, *g: cost / g[2]), "Expected finite results of `stage`"),
     **{
         f"{method}: {name}": (changed(method, change), expected.format(method))
         for method in METHODS
         for name, change, expected in (
-            ("raises", lambda cost, *_: cost[99, 99, 99, 99], "Expected an answer from `{}`, got IndexError"),
+            ("raises", lambda cost, *_: cost[99, 99, 99, 99], "Expected a result from `{}`, got IndexError"),
             ("one cost for all", lambda cost, *_: cost.mean(), "results of `{}` as torch.float32 of shape [6] on cpu"),
             ("knows [B] alone", lambda cost, *_: cost.flatten(), "[*B = [6, 5], torch.float32"),
             ("single precision", lambda cost, *_: cost.float(), "[*B = [6], torch.float64"),
             ("no number", lambda cost, *_: cost * torch.nan, "Expected finite results of `{}`"),
             ("a cost of the batch", lambda cost, *_: cost + cost.mean(), "same result from `{}` for a single"),
             ("PyTorch's generator", lambda cost, *_: cost + 0 * torch.rand(1).to(cost), "PyTorch's global generator"),
-            ("writes into λ̂", lambda cost, *g: [v.mul_(0.5) for v in g] and cost, "got another"),
+            ("writes into λ̂", lambda cost, *g: [v.mul_(0.5) for v in g] and cost, "got changes in"),
         )
     },
 }  # fmt: skip

@@ -205,40 +205,40 @@ class Draws(Good):
 
 
 BAD: dict[str, tuple[Any, str]] = {
-    "no planner": (object(), "Expected the planner to be an instance of benchnav.planning.Planner, got object"),
-    "writes into the states": (acting(lambda step, _: step.state.zero_()), "got another step.state."),
+    "no planner": (object(), "Expected the planner to be a subclass of benchnav.planning.Planner, got object"),
+    "writes into the states": (acting(lambda step, _: step.state.zero_()), "got changes in step.state."),
     "writes into what was observed": (
         acting(lambda step, _: step.traversability.zero_()),
-        "got another step.traversability.",
+        "got changes in step.traversability.",
     ),
-    "writes into the map": (acting(lambda _, s: s.problem.risk_map.mul_(0.5)), "got another problem.risk_map."),
+    "writes into the map": (acting(lambda _, s: s.problem.risk_map.mul_(0.5)), "got changes in problem.risk_map."),
     "writes into the goal": (preparing(lambda p, _: p.goal_m.add_(1)), "`init` to leave its arguments unchanged"),
     "writes into the prediction": (preparing(lambda p, _: p.distribution.means.zero_()), "problem.distribution.means"),
     "writes into the image": (preparing(lambda p, _: p.observation.rgb.add_(1)), "problem.observation.rgb"),
-    "writes into the plan state": (acting(lambda _, s: s.last.add_(0.1)), "got another plan_state.last."),
-    "counts in the plan state": (acting(lambda _, s: count_up(s)), "got another plan_state.count."),
-    "draws from the plan state": (Draws(), "got another plan_state.generator"),
+    "writes into the plan state": (acting(lambda _, s: s.last.add_(0.1)), "got changes in plan_state.last."),
+    "counts in the plan state": (acting(lambda _, s: count_up(s)), "got changes in plan_state.count."),
+    "draws from the plan state": (Draws(), "got changes in plan_state.generator"),
     "no number": (action_of(poke), "Expected finite actions"),
     "one action for all": (action_of(lambda action, _: action[:1]), "got torch.float32 of shape [1, 2]"),
     "doubles": (action_of(lambda action, _: action.double()), "got torch.float64 of shape [4, 2]"),
     "elsewhere": (action_of(lambda action, _: action.to("meta")), "on cpu, got torch.float32 of shape [4, 2] on meta"),
     "too fast": (action_of(lambda action, _: action + 0.5), "within the robot's bounds"),
-    "no plan": (plan_of(lambda plan: None), "Expected `plan` to return a Plan as its third value"),
-    "an unknown status": (plan_of(lambda plan: replace(plan, status=plan.status + 3)), "`Plan.status` in 0–2"),
+    "no plan": (plan_of(lambda plan: None), "Expected a Plan as the last output"),
+    "an unknown status": (plan_of(lambda plan: replace(plan, status=plan.status + 3)), "values of `PlanStatus`, 0–2"),
     "a status for all": (plan_of(lambda plan: replace(plan, status=plan.status[:1])), "got torch.int64 of shape [1]"),
     "a path for all": (plan_of(lambda plan: replace(plan, path=plan.path[:1])), "shape [4, N, 2], got [1, 3, 2]"),
-    "raises": (acting(lambda step, _: step.state[9]), "Expected an answer from `plan`, got IndexError"),
+    "raises": (acting(lambda step, _: step.state[9]), "Expected a result from `plan`, got IndexError"),
     "raises off the map": (acting(leave_the_map), "got IndexError: off the map"),
-    "raises in init": (preparing(lambda p, _: p.goal_m[9]), "Expected an answer from `init`, got IndexError"),
+    "raises in init": (preparing(lambda p, _: p.goal_m[9]), "Expected a result from `init`, got IndexError"),
     "PyTorch's generator": (acting(lambda *_: torch.rand(1)), "PyTorch's global generator"),
     "PyTorch's seed in init": (preparing(lambda *_: torch.manual_seed(20_261)), "PyTorch's global generator"),
     "NumPy's generator": (acting(lambda *_: np.random.rand()), "NumPy's global generator"),  # noqa: NPY002
     "Python's generator": (acting(lambda *_: random.random()), "Python's global generator"),
-    "evolves on self": (OnSelf(), "got another when called again"),
+    "evolves on self": (OnSelf(), "got a different action when called again"),
     "keeps the problem on self": (ProblemOnSelf(), "same after other steps and problems"),
     "keeps what it saw on self": (LastSeen(), "same after other steps and problems"),
-    "no seed": (Unseeded(), "from a generator of the same seed, got another"),
-    "drives otherwise when drawn": (action_of(lambda a, step: 0.9 * a if step.draw else a), "whether it is drawn"),
+    "no seed": (Unseeded(), "from a generator of the same seed, got a different action"),
+    "drives otherwise when drawn": (action_of(lambda a, step: 0.9 * a if step.draw else a), "for any `Step.draw`"),
     "an action of the batch": (action_of(lambda a, _: a - 0.1 * a.mean(0)), "same action for a single episode"),
     "noise of the batch": (NoiseOfBatch(), "same action for a single episode"),
     "blind that is not": (having(blind=True), "the same action for any value of `risk_map`, which is not in `uses`"),
@@ -263,7 +263,7 @@ BAD: dict[str, tuple[Any, str]] = {
     ),
     "follows no text": (having(follows=lambda self, task: 3), "Expected `follows` to return a single line"),
     "follows that is text": (having(follows="time"), "from `follows`, got TypeError"),
-    "steers by one name": (having(steers=("speed_mps", "turn_rate_radps")), "`steers` as tuples of action names"),
+    "steers by one name": (having(steers=("speed_mps", "turn_rate_radps")), "as a tuple of tuples of action names"),
     "steers nothing": (having(steers=()), "Expected the planner to steer one of the tried robots, got no such robot"),
     "remarks that are no tuple": (having(remarks=lambda self, task: "slow"), "to return a tuple of single lines"),
     "remarks that raise": (having(remarks=lambda self, task: task.wheels), "from `remarks`, got AttributeError"),
@@ -330,11 +330,11 @@ def test_every_breach_is_named_once_with_the_robots_and_maps_it_was_found_on() -
     message = str(caught.value)
     assert (
         message.count("within the robot's bounds")
-        == message.count("`Plan.status` in 0–2")
+        == message.count("values of `PlanStatus`, 0–2")
         == 1
     )
-    assert message.count("[wherever it was tried]\n(2) ") == 1
-    assert message.endswith("[wherever it was tried]")
+    assert message.count("[in all cases]\n(2) ") == 1
+    assert message.endswith("[in all cases]")
 
 
 def test_a_breach_that_is_not_everywhere_names_its_robots_and_maps_and_an_error_its_line() -> (
@@ -484,5 +484,5 @@ def test_what_select_keeps_has_to_be_those_that_were_asked_for(order: str) -> No
     if order == "kept":
         check_planner(Leaving(), robots=[Unicycle()])
         return
-    with pytest.raises(ConfigError, match="for episodes that `select` keeps"):
+    with pytest.raises(ConfigError, match="for episodes that `select` returns"):
         check_planner(Leaving(), robots=[Unicycle()])

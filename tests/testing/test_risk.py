@@ -32,7 +32,7 @@ class Forgetful:
 
 BAD: dict[str, tuple[Any, str]] = {
     "no function": (3, "got TypeError"),
-    "raises": (changed(lambda mean, _: mean[99]), "Expected an answer from `risk`, got IndexError"),
+    "raises": (changed(lambda mean, _: mean[99]), "Expected a result from `risk`, got IndexError"),
     "a number for all": (changed(lambda mean, _: mean.mean()), "λ̂ of shape [3, 8, 11], got []"),
     "a map for each component": (changed(lambda mean, m: m.means), "λ̂ of shape [3, 8, 11], got [3, 1, 8, 11]"),
     "no tensor": (changed(lambda mean, _: mean.tolist()), "got list"),
@@ -42,13 +42,13 @@ BAD: dict[str, tuple[Any, str]] = {
     "no number": (changed(lambda mean, _: mean * torch.nan), "λ̂ in [0, 1]"),
     "slip": (changed(lambda mean, m: (m.stds[:, 0] > 0) / mean.new_zeros(())), "λ̂ in [0, 1]"),
     "λ̂ of the batch": (changed(lambda mean, _: mean / (1 + mean.mean())), "same result from `risk` for a single"),
-    "λ̂ of the neighbours": (changed(lambda mean, _: (mean + mean.roll(1, -1)) / 2), "of selected cells as on the map"),
+    "λ̂ of the neighbours": (changed(lambda mean, _: (mean + mean.roll(1, -1)) / 2), "for selected cells as on the map"),
     "cannot take some cells": (
         changed(lambda mean, _: mean if mean.shape[-2] > 1 else mean[99]),
-        "Expected an answer from `risk`, got IndexError",
+        "Expected a result from `risk`, got IndexError",
     ),
     "another λ̂": (Forgetful(), "Expected the same result from `risk` when called again"),
-    "writes into the mixture": (changed(lambda mean, m: [m.means.zero_()] and mean), "got another distribution"),
+    "writes into the mixture": (changed(lambda mean, m: [m.means.zero_()] and mean), "got changes in distribution"),
     "PyTorch's generator": (changed(lambda mean, _: mean + 0 * torch.rand(1)), "PyTorch's global generator"),
     "NumPy's generator": (changed(lambda mean, _: mean + 0 * np.random.rand()), "NumPy's global"),  # noqa: NPY002
     "knows one component alone": (changed(lambda mean, m: mean + 2 * (m.means.shape[1] - 1)), "[K = 3]"),

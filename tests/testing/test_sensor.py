@@ -161,14 +161,16 @@ def drawn(values: Tensor, *seed: int) -> Tensor:
     return torch.rand(values.shape, generator=torch.Generator().manual_seed(sum(seed)))
 
 
-ELSEWHERE = "the same measurement whatever λ, its distribution and its class are where λ is not sensed, got another."
-APPEARANCE = "the same measurement whatever colour, slope and layers are where nothing is sensed or seen, got another."
-ELEVATION = "the same measurement whatever the elevation is where nothing is sensed or seen, got another."
-ALONE = "Expected the same results for single episodes and in another order as in the batch, got others."
+ELSEWHERE = "its distribution and the class in cells that are not measured, got a different measurement."
+APPEARANCE = "does not depend on colour, slope and layers in unobserved cells, got a different measurement."
+ELEVATION = (
+    "does not depend on the elevation of unobserved cells, got a different measurement."
+)
+ALONE = "Expected the same results for single episodes and in another order as in the batch, got different results."
 BAD: dict[str, tuple[Any, str]] = {
     "senses nothing": (
         probing(lambda found, *_: torch.nan * found),
-        "to measure or see a cell, got no such cell",
+        "to observe a cell for a robot in the middle of a map, got no cell",
     ),
     **{
         f"knows {name} of the map": (
@@ -198,7 +200,7 @@ BAD: dict[str, tuple[Any, str]] = {
     "no sensor": (3, "subclass of benchnav.planning.Sensor, got int"),
     "raises": (
         probing(lambda found, *_: found[99]),
-        "Expected an answer from `sense`, got IndexError",
+        "Expected a result from `sense`, got IndexError",
     ),
     "says nothing": (
         telling(Probe(), lambda *_: None),
@@ -215,11 +217,11 @@ BAD: dict[str, tuple[Any, str]] = {
     "λ above 1": (probing(lambda found, *_: found + 1), "Expected λ in [0, 1]"),
     "too sure": (
         telling(Probe(), lambda sensed, *_: replace(sensed, std=0 * sensed.std)),
-        "`Measurement.std` of at least 0.001",
+        "`Measurement.std` ≥ 0.001",
     ),
     "never sure": (
         telling(Probe(), lambda sensed, *_: replace(sensed, std=sensed.std / 0)),
-        "`Measurement.std` of at least 0.001",
+        "`Measurement.std` ≥ 0.001",
     ),
     "sees all, it says": (Seer(), "Expected `sees_all` of type bool, got 'yes'"),
     "no appearance": (
@@ -240,11 +242,11 @@ BAD: dict[str, tuple[Any, str]] = {
     ),
     "elevation unknown": (
         seeing(elevation_m=lambda height: height / 0),
-        "Expected finite elevation where",
+        "Expected finite elevation in",
     ),
     "a layer less": (
         seeing(layers=lambda layers: {}),
-        "grid and layers in `Appearance.observation`, vegetation_m",
+        "and layers vegetation_m, got",
     ),
     "λ around": (
         probing(
@@ -365,19 +367,19 @@ BAD: dict[str, tuple[Any, str]] = {
     ),
     "noise of the count": (
         Forgetful(),
-        "Expected the same measurement when called again, got another.",
+        "Expected the same measurement when called again, got a different measurement.",
     ),
     "the same in each step": (
         moved(lambda noise_key: NoiseKey(noise_key.keys, 0)),
-        "Expected other noise in another step",
+        "Expected different noise in different steps",
     ),
     "colours the same in each step": (
         moved(lambda noise_key: NoiseKey(noise_key.keys, 0), Near()),
-        "Expected other noise in another step",
+        "Expected different noise in different steps",
     ),
     "the same in each episode": (
         moved(lambda noise_key: NoiseKey([7] * len(noise_key.keys), noise_key.step)),
-        "Expected other noise under another key",
+        "Expected different noise for different keys",
     ),
     "PyTorch's generator": (
         probing(lambda found, *_: found + 0 * torch.rand(1)),
@@ -385,11 +387,11 @@ BAD: dict[str, tuple[Any, str]] = {
     ),
     "writes into λ": (
         probing(lambda found, _, field, __: (field.zero_(), found)[1]),
-        "got another field",
+        "got changes in field",
     ),
     "writes into the terrain": (
         probing(lambda found, terrain, *_: (terrain.rgb.zero_(), found)[1]),
-        "got another terrain.rgb",
+        "got changes in terrain.rgb",
     ),
 }
 
@@ -424,5 +426,5 @@ def test_each_breach_is_told_once_with_its_places() -> None:
     with pytest.raises(ConfigError) as caught:
         check_sensor(probing(lambda found, *_: found + 1), shapes=[(9, 8)])
     assert str(caught.value).split("\n")[1:] == [
-        "(1) Expected λ in [0, 1], or NaN where it is not sensed, got other numbers. [wherever it was tried]"
+        "(1) Expected λ in [0, 1], or NaN in cells that are not measured, got other numbers. [in all cases]"
     ]

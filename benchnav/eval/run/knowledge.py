@@ -21,7 +21,7 @@ from benchnav.planning.free_space import cells_at_goal
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import steps_in
 from benchnav.planning.sensing.belief import Fields
-from benchnav.planning.sensing.knowledge import Knowledge, Truth, call
+from benchnav.planning.sensing.knowledge import Knowledge, Truth, call_user_code
 from benchnav.planning.sensing.learner import Learner
 from benchnav.planning.world.outcome import Outcome
 
@@ -182,7 +182,7 @@ class Knowing:
             changed = belief.select(current, indices)
             return belief.put(state, indices, changed)
 
-        return call(Outcome.BELIEF_ERROR, merge)
+        return call_user_code(Outcome.BELIEF_ERROR, merge)
 
     def look_ahead(self, step: int, robot_state: Tensor, running: Tensor) -> None:
         """Score the belief over the cells ahead of the robots; arguments as in `learn`."""

@@ -48,7 +48,7 @@ from benchnav.planning.sensing.belief import CovarianceModel, Fields
 from benchnav.planning.sensing.knowledge import (
     KnowledgeError,
     Truth,
-    call,
+    call_user_code,
     sensor_keys,
 )
 from benchnav.planning.sensing.learner import Learner
@@ -247,7 +247,7 @@ def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> Built:
             prediction_of_block = partial(
                 _predict, condition.model.key, block, simulation.field
             )
-            predicted = call(Outcome.MODEL_ERROR, prediction_of_block)
+            predicted = call_user_code(Outcome.MODEL_ERROR, prediction_of_block)
         start = task.robot.initial_state(heading_to(start_m, goal_m))
         knowledge = learner.begin(truth, start, predicted)
         prediction = Prediction(
@@ -283,9 +283,9 @@ def _learner(condition: Condition, block: Block) -> Learner:
     """Return the sensing and belief of a unit's robots."""
     dataset = condition.dataset
     world = condition.world
-    sensor = call(Outcome.SENSOR_ERROR, condition.sensor.create)
-    belief = call(Outcome.BELIEF_ERROR, condition.belief.create)
-    model = call(Outcome.MODEL_ERROR, lambda: condition.model.object)
+    sensor = call_user_code(Outcome.SENSOR_ERROR, condition.sensor.create)
+    belief = call_user_code(Outcome.BELIEF_ERROR, condition.belief.create)
+    model = call_user_code(Outcome.MODEL_ERROR, lambda: condition.model.object)
     correlation_m = world.correlation_m
     if world.noise == "stored":
         correlation_m = dataset.recipe.correlation_m
@@ -299,10 +299,10 @@ def _learner(condition: Condition, block: Block) -> Learner:
     )
     return Learner(
         sensor=sensor,
-        ground=call(Outcome.SENSOR_ERROR, condition.ground.create),
+        ground=call_user_code(Outcome.SENSOR_ERROR, condition.ground.create),
         belief=belief,
         covariance=covariance,
-        measure=call(Outcome.MODEL_ERROR, condition.risk.create),
+        measure=call_user_code(Outcome.MODEL_ERROR, condition.risk.create),
         rules=condition.rules,
         predict=partial(predict, model),
     )

@@ -1,4 +1,4 @@
-"""Memory of the observed appearance, and the map that a model receives of it.
+"""Memory of the observed appearance, and the model's input that follows from it.
 
 Letters in shapes: B episodes, H×W cells.
 """
@@ -27,9 +27,10 @@ class Memory(Batch):
         seen: mask of observed cells, bool, shape [B, H, W].
         rgb: colour, uint8, shape [B, 3, H, W].
         elevation_m: elevation in metres, shape [B, H, W].
-        layers: the map's other layers, by name, each of shape [B, H, W].
-        noise_level: noise of the observation, in the sensor's unit, shape [B, H, W].
-        grid: size and resolution.
+        layers: the map's other layers by name, each of shape [B, H, W].
+        noise_level: noise level of each cell's observation, in the sensor's unit; ∞ if
+            the cell is unobserved, shape [B, H, W].
+        grid: size and resolution of the maps.
     """
 
     seen: Tensor
@@ -40,7 +41,7 @@ class Memory(Batch):
     grid: Grid
 
     @classmethod
-    def none(cls, terrain: Terrain | Observation) -> Self:
+    def empty(cls, terrain: Terrain | Observation) -> Self:
         """Return an empty memory.
 
         Args:
@@ -63,42 +64,44 @@ class Memory(Batch):
 
 
 def remember(memory: Memory, appearance: Appearance) -> Memory:
-    """Add observations to a memory.
+    """Return the memory with added observations.
 
-    Each cell keeps its least noisy observation, and the earlier one if two are equally
-    noisy.
+    Each cell keeps its least noisy observation. If two observations are equally noisy,
+    it keeps the earlier one.
 
     Args:
-        memory: memory of B episodes.
-        appearance: new appearance of the same episodes, with all layers of the memory.
+        memory: memory of B episodes; it is not changed.
+        appearance: new appearance in the same episodes, with all layers of the memory.
     """
     seen = appearance.seen
     observation = appearance.observation
     noise_level = appearance.noise_level.to(memory.noise_level)
-    is_sharper = noise_level < memory.noise_level
-    better = seen & (~memory.seen | is_sharper)
-    rgb = torch.where(better[:, None], observation.rgb, memory.rgb)
-    elevation_m = torch.where(better, observation.elevation_m, memory.elevation_m)
+    is_less_noisy = noise_level < memory.noise_level
+    is_replaced = seen & (~memory.seen | is_less_noisy)
+    rgb = torch.where(is_replaced[:, None], observation.rgb, memory.rgb)
+    elevation_m = torch.where(is_replaced, observation.elevation_m, memory.elevation_m)
     layers = {}
     for name, layer in memory.layers.items():
-        layers[name] = torch.where(better, observation.layers[name], layer)
+        layers[name] = torch.where(is_replaced, observation.layers[name], layer)
     return Memory(
         seen=memory.seen | seen,
         rgb=rgb,
         elevation_m=elevation_m,
         layers=layers,
-        noise_level=torch.where(better, noise_level, memory.noise_level),
+        noise_level=torch.where(is_replaced, noise_level, memory.noise_level),
         grid=memory.grid,
     )
 
 
-def masked(memory: Memory, layer_means: Mapping[str, tuple[float, ...]]) -> Observation:
+def model_input(
+    memory: Memory, layer_means: Mapping[str, tuple[float, ...]]
+) -> Observation:
     """Return the observed part of the map as the input of a model.
 
-    Slopes are computed from the observed elevation as in recipes: by Horn's method,
-    with linear extrapolation at the map's borders. Hence cells observed without noise
-    equal those of the terrain's own observation bit for bit. Border cells of imported
-    terrain are an exception: their slopes include terrain beyond the map.
+    Slopes are computed from the observed elevation as in generated datasets: by Horn's
+    method, with linear extrapolation at the map's borders. Hence cells observed without
+    noise equal those of `Terrain.observe` bit for bit. Border cells of imported terrain
+    are an exception, since their true slopes include terrain beyond the map.
 
     Args:
         memory: memory of B episodes.
@@ -106,10 +109,10 @@ def masked(memory: Memory, layer_means: Mapping[str, tuple[float, ...]]) -> Obse
             maps, as in `GroundStatistics`.
 
     Returns:
-        Colour (rounded) and elevation are the training mean in unobserved cells. Slope
-        is the training mean if the cell or one of its neighbours on the map is
-        unobserved. Layers are NaN in unobserved cells. The layer `seen` is 1 in
-        observed cells, else 0.
+        The observation of B maps. In unobserved cells, colour (rounded) and elevation
+        are the training means. The slope of a cell is the training mean if the cell or
+        any of its eight neighbours is unobserved. Other layers are NaN in unobserved
+        cells. The layer `seen` is 1 in observed cells and 0 in others.
     """
     seen = memory.seen
     mean_rgb = torch.tensor(layer_means["rgb"])
@@ -118,15 +121,15 @@ def masked(memory: Memory, layer_means: Mapping[str, tuple[float, ...]]) -> Obse
     (mean_slope_deg,) = layer_means["slope_deg"]
     rgb = torch.where(seen[:, None], memory.rgb, mean_colour[:, None, None])
     elevation_m = torch.where(seen, memory.elevation_m, mean_elevation_m)
-    # A slope needs the cell and its neighbours on the map. The padding of the pooling
-    # does not count as unobserved.
+    # A slope needs the cell and its neighbours on the map. The pooling pads with −∞, so
+    # that cells beyond the map do not count as unobserved.
     unseen = (~seen).float()
     near_unseen = torch.nn.functional.max_pool2d(unseen, 3, stride=1, padding=1)
-    no_slope = near_unseen > 0
+    lacks_slope = near_unseen > 0
     heights = elevation_m.cpu().numpy()
     exact_slopes = slopes_deg(heights, memory.grid.resolution_m)
     slopes = torch.from_numpy(quantise(exact_slopes, 10)).to(elevation_m)
-    slope_deg = torch.where(no_slope, mean_slope_deg, slopes)
+    slope_deg = torch.where(lacks_slope, mean_slope_deg, slopes)
     layers = {}
     for name, layer in memory.layers.items():
         layers[name] = torch.where(seen, layer, torch.nan)

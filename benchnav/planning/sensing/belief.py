@@ -40,7 +40,8 @@ class CovarianceModel:
             exp(−d²/2ℓ²). If it is 0, cells are independent.
         nugget: fraction of the variance of a cell's normal score that is independent of
             all other cells, in [0, 1). It is 0 if the prediction is each cell's true
-            distribution. A model's errors reduce the correlation between neighbours.
+            distribution. It is above 0 for a model whose errors reduce the correlation
+            between neighbours.
         statistics: statistics of the training maps; None if no part needs them.
         class_names: names of the prediction's classes, in the order of their ids; empty
             if it has no classes.
@@ -70,8 +71,8 @@ class Belief(Specified, ABC, Generic[State]):
     """Base class of beliefs (parts of kind `belief`), which infer λ from measurements.
 
     Attributes:
-        learns: whether measured λ changes the belief. If False, the belief receives
-            only new predictions.
+        learns: whether measured λ changes the belief. If False, the belief receives no
+            measurements, only new predictions.
         needs_statistics: whether `CovarianceModel.statistics` is required.
     """
 
@@ -100,8 +101,8 @@ class Belief(Specified, ABC, Generic[State]):
 
         Args:
             state: state before the update; it is not changed.
-            sensed: measurement in the same episodes.
-            prior: the model's new prediction; None if its observation is unchanged.
+            sensed: measured λ in the same episodes.
+            prior: the model's new prediction; None if the model's input is unchanged.
         """
 
     @abstractmethod
@@ -109,18 +110,22 @@ class Belief(Specified, ABC, Generic[State]):
         """Return the distribution of λ, shape [B, H, W]."""
 
     def at(self, state: State, cells: Tensor) -> TraversabilityDistribution:
-        """Return the distribution of λ in some cells, as a map of one row, [1, N].
+        """Return the distribution of λ in N cells, as a map of one row, [1, N].
 
         Args:
             state: belief state.
-            cells: mask of the cells, bool, shape [B, H, W].
+            cells: mask of the N cells, bool, shape [B, H, W].
         """
         return self.distribution(state).at(cells)
 
     def changed(self, before: State, after: State) -> Tensor:
         """Return a mask of cells whose belief changed, bool, shape [B, H, W].
 
-        The base class returns all cells.
+        The base class returns a mask of all cells.
+
+        Args:
+            before: belief state before the update.
+            after: belief state after the update.
         """
         belief = self.distribution(after)
         return torch.ones(belief.shape, dtype=torch.bool, device=belief.device)
@@ -131,9 +136,9 @@ class Belief(Specified, ABC, Generic[State]):
 
         Args:
             state: belief state.
-            count: M.
-            keys: a stream key for each of B episodes, so that its fields do not depend
-                on the other episodes.
+            count: M, number of fields per episode.
+            keys: stream key of each episode, length B. The fields of an episode may
+                depend on no other episode.
 
         Returns:
             λ in [0, 1], shape [B, M, H, W].
@@ -142,27 +147,28 @@ class Belief(Specified, ABC, Generic[State]):
     def sample_cells(
         self, state: State, count: int, keys: Sequence[int], cells: Tensor
     ) -> Tensor:
-        """Draw the fields of `sample_fields` in some cells; others are undefined.
+        """Draw the fields of `sample_fields` in some cells; other cells are undefined.
 
         Args:
             state: belief state.
-            count: M.
-            keys: a stream key for each of B episodes.
+            count: M, number of fields per episode.
+            keys: stream key of each episode, length B.
             cells: mask of the requested cells, bool, shape [B, H, W].
         """
         return self.sample_fields(state, count, keys)
 
     def select(self, state: State, members: Tensor) -> State:
-        """Return some episodes, by index, int64."""
+        """Return the belief state of the episodes at these indices (int64)."""
         return state.select(members)
 
     def put(self, state: State, members: Tensor, others: State) -> State:
-        """Replace episodes.
+        """Return the belief state with some episodes replaced.
 
         Args:
             state: belief state of B episodes; it is not changed.
-            members: indices of the episodes to replace, int64, shape [M].
-            others: belief state of M episodes, under the same covariance model.
+            members: indices of the episodes to replace, int64.
+            others: belief state of the new episodes, one per index, under the same
+                covariance model.
         """
         return state.put(members, others)
 
@@ -173,32 +179,33 @@ class Fields:
 
     Args:
         belief: the belief.
-        state: state of the belief, of B episodes.
-        names: index of each of B episodes, which determines its random stream.
+        state: state of the belief in B episodes.
+        indices: integers that identify the random stream of each episode, length B.
     """
 
     belief: Belief[Any]
     state: Any
-    names: tuple[int, ...]
+    indices: tuple[int, ...]
 
     def sample(self, count: int, key: int, cells: Tensor | None = None) -> Tensor:
-        """Draw `count` fields of each episode, shape [B, M, H, W].
+        """Draw fields of each episode, shape [B, M, H, W].
 
         Args:
-            count: M.
+            count: M, number of fields per episode.
             key: root key of the random streams; see `Problem.sample_fields`.
-            cells: mask of the requested cells, bool, shape [B, H, W]; None for all.
+            cells: mask of the requested cells, bool, shape [B, H, W]; None for all
+                cells.
         """
-        keys = [rng.stream_key(key, "fields", name) for name in self.names]
+        keys = [rng.stream_key(key, "fields", index) for index in self.indices]
         if cells is None:
             return self.belief.sample_fields(self.state, count, keys)
         return self.belief.sample_cells(self.state, count, keys, cells)
 
     def select(self, members: Tensor) -> "Fields":
-        """Return some episodes, by index, int64."""
+        """Return the source of the episodes at these indices (int64)."""
         state = self.belief.select(self.state, members)
-        names = tuple(self.names[index] for index in members.tolist())
-        return Fields(self.belief, state, names)
+        indices = tuple(self.indices[index] for index in members.tolist())
+        return Fields(self.belief, state, indices)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -214,31 +221,32 @@ class Predicted(Batch):
     covariance: CovarianceModel
 
     def fields(self, scores: Tensor, cells: Tensor | None = None) -> Tensor:
-        """Return λ of normal scores under the prediction, shape [B, M, H, W].
+        """Return the λ at normal scores under the prediction, shape [B, M, H, W].
 
-        If the quantile function is slow, λ is exact at the values of `score_table` and
-        linear in the score in between.
+        If the prediction's quantile function is slow, λ is exact at the values of
+        `score_table` and linear in the score between them.
 
         Args:
             scores: normal scores, shape [B, M, H, W].
-            cells: mask of the requested cells, bool, shape [B, H, W]; None for all.
+            cells: mask of the requested cells, bool, shape [B, H, W]; None for all
+                cells.
         """
-        if self._rows is None:
+        if self._score_rows is None:
             return fields_of(self.prior, scores)
-        scores = scores.to(self._rows)
+        scores = scores.to(self._score_rows)
         fields = torch.zeros_like(scores)
-        for member, rows in enumerate(self._rows):
-            mask: Any = ... if cells is None else cells[member]
-            cell_scores = scores[member][:, mask].movedim(0, -1)
+        for episode, rows in enumerate(self._score_rows):
+            mask: Any = ... if cells is None else cells[episode]
+            cell_scores = scores[episode][:, mask].movedim(0, -1)
             cell_values = value_at(rows[mask], cell_scores)
-            fields[member][:, mask] = cell_values.movedim(-1, 0)
+            fields[episode][:, mask] = cell_values.movedim(-1, 0)
         return fields.to(self.prior.dtype)
 
     @cached_property
-    def _rows(self) -> Tensor | None:
-        """Scores of the table's values in each cell, float32, shape [B, H, W, K].
+    def _score_rows(self) -> Tensor | None:
+        """Scores of the K values of `score_table`, float32, shape [B, H, W, K].
 
-        None if quantiles of the prediction are fast.
+        None if the prediction's quantile function is fast.
         """
         prior = self.prior
         if not prior.searched:
@@ -250,11 +258,11 @@ class Predicted(Batch):
 
 @dataclass(frozen=True)
 class Static(Belief[Predicted]):
-    """The model's prediction; measurements during the episode are ignored.
+    """Belief that equals the model's prediction and ignores measured λ.
 
     Args:
         correlated: whether drawn fields have the correlations of the covariance model.
-            If False, cells are independent.
+            If False, their cells are independent.
     """
 
     learns: ClassVar[bool] = False
@@ -306,48 +314,56 @@ class Static(Belief[Predicted]):
 
 
 def draw_scores(covariance: CovarianceModel, count: int, keys: Sequence[int]) -> Tensor:
-    """Draw normal scores with the world's correlations, float32, shape [B, M, H, W].
+    """Draw correlated normal scores, float32, shape [B, M, H, W].
 
-    The correlation of two cells is a product over both axes. Hence white noise is
-    multiplied by a root of the correlations along either axis.
+    The correlation of two cells is the product of a correlation along the rows and one
+    along the columns. Hence white noise is multiplied by the square root of the
+    correlation matrix of each axis.
 
     Args:
         covariance: covariance model of the scores.
-        count: M; the first fields do not depend on it.
-        keys: a stream key for each of B episodes.
+        count: M, number of fields per episode; the first fields do not depend on it.
+        keys: stream key of each episode, length B.
     """
-    # One episode at a time: the last bits of a product depend on the size of the batch.
-    return torch.stack([_scores_of_one(covariance, count, key) for key in keys])
+    # Episodes are drawn one by one, since rounding depends on the size of a batch.
+    return torch.stack([_scores_of_episode(covariance, count, key) for key in keys])
 
 
-def _scores_of_one(covariance: CovarianceModel, count: int, key: int) -> Tensor:
-    """Return the scores of an episode, shape [M, H, W]."""
+def _scores_of_episode(covariance: CovarianceModel, count: int, key: int) -> Tensor:
+    """Return normal scores of one episode, float32, shape [M, H, W]."""
     shape = covariance.grid.shape
-    scores = _white(key, count, shape)
+    scores = _white_noise(key, count, shape)
     if covariance.correlation_m:
-        down, across = (_root(size, covariance.correlation_cells) for size in shape)
-        scores = down @ scores @ across
+        row_root, column_root = (
+            _correlation_root(size, covariance.correlation_cells) for size in shape
+        )
+        scores = row_root @ scores @ column_root
     nugget = covariance.nugget
     if nugget:
-        independent = _white(rng.stream_key(key, "nugget"), count, shape)
-        scores = math.sqrt(1 - nugget) * scores + math.sqrt(nugget) * independent
+        nugget_noise = _white_noise(rng.stream_key(key, "nugget"), count, shape)
+        scores = math.sqrt(1 - nugget) * scores + math.sqrt(nugget) * nugget_noise
     return scores
 
 
-def _white(key: int, count: int, shape: tuple[int, int]) -> Tensor:
+def _white_noise(key: int, count: int, shape: tuple[int, int]) -> Tensor:
     """Return standard normals, float32, shape [M, H, W]."""
     n_numbers = count * math.prod(shape)
-    # PyTorch draws numbers in blocks of sixteen, and any remainder by another method.
+    # PyTorch draws sixteen numbers at a time, and a remainder by another method.
     n_drawn = -(-n_numbers // 16) * 16
     numbers = torch.randn(n_drawn, generator=rng.generator(key))[:n_numbers]
     return numbers.view(count, *shape)
 
 
 @lru_cache(maxsize=64)
-def _root(size: int, correlation_cells: float) -> Tensor:
-    """Return the symmetric root of the correlations along one axis.
+def _correlation_root(size: int, correlation_cells: float) -> Tensor:
+    """Return the symmetric square root of the correlation matrix along one axis.
 
-    Float32, shape [size, size].
+    Args:
+        size: number of cells along the axis.
+        correlation_cells: ℓ in cells.
+
+    Returns:
+        Float32, shape [size, size].
     """
     along = torch.from_numpy(correlations(size, correlation_cells))
     index = torch.arange(size)
@@ -358,7 +374,7 @@ def _root(size: int, correlation_cells: float) -> Tensor:
 
 
 def fields_of(distribution: TraversabilityDistribution, scores: Tensor) -> Tensor:
-    """Return λ of normal scores, shape [B, M, H, W].
+    """Return the λ at normal scores, shape [B, M, H, W].
 
     Args:
         distribution: distribution of λ, shape [B, H, W].

@@ -16,10 +16,10 @@ from benchnav.planning.sensing.sensor import MIN_STD, Measurement
 from benchnav.planning.sensing.sites import Evidence
 from benchnav.planning.sensing.truncated_normal import interval_moments
 
-# Minimum change of an observed score after which its label is drawn again.
+# Tolerance of an observed score; labels of a cell are drawn again beyond it.
 _SAME_SCORE = 0.05
 MIN_PROBABILITY = 1e-9
-"""Minimum probability of a class, so that its log odds are finite."""
+"""Minimum probability of a class, so that log odds are finite."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,19 +27,19 @@ class ClassesState(Batch):
     """State of the belief of look-alike classes.
 
     Args:
-        copula: scores under the more probable class of each observed cell; its
-            prediction is that of the first class.
-        per_class: observations under the first and under the second class; their
-            posterior scores are not computed.
+        copula: state of the copula belief, with observed scores under the more probable
+            class of each cell, and with the prediction under the first class.
+        per_class: states with the observations under the first and under the second
+            class; their posterior scores are not computed.
         density: log f / φ of the observation under either class, 0 for an interval,
             shape [B, 2, H, W].
-        pair: index of the pair of each cell, from 1; 0 if the cell has no pair, int64,
-            shape [B, H, W].
-        odds: predicted log odds of the first class, float64, shape [B, H, W].
+        pair: index of each cell's pair, from 1; 0 without a pair, int64, shape
+            [B, H, W].
+        log_odds: predicted log odds of the first class, float64, shape [B, H, W].
         p_first: posterior probability of the first class under even prior odds,
             float64, shape [B, H, W].
-        labels: labels of the chains; a set bit is the first class, int64, shape
-            [B, H, W].
+        labels: words of the labels (see `labels`); a set bit is the first class, int64,
+            shape [B, H, W].
         sweeps: number of sweeps of each episode, int64, shape [B].
     """
 
@@ -47,7 +47,7 @@ class ClassesState(Batch):
     per_class: tuple[CopulaState, CopulaState]
     density: Tensor
     pair: Tensor
-    odds: Tensor
+    log_odds: Tensor
     p_first: Tensor
     labels: Tensor
     sweeps: Tensor
@@ -57,12 +57,12 @@ class ClassesState(Batch):
 
         It is 1 for cells without a pair.
         """
-        log_odds = self.odds + torch.logit(self.p_first, eps=MIN_PROBABILITY)
-        return torch.where(self.pair > 0, torch.sigmoid(log_odds), 1.0)
+        posterior = self.log_odds + torch.logit(self.p_first, eps=MIN_PROBABILITY)
+        return torch.where(self.pair > 0, torch.sigmoid(posterior), 1.0)
 
 
 def log_density_ratio(given_class: CopulaState, cells: Tensor, value: Tensor) -> Tensor:
-    """Return log f / φ of observed λ under a class, shape [N].
+    """Return log f / φ of observed λ under a class.
 
     Args:
         given_class: observations under the class.
@@ -70,7 +70,7 @@ def log_density_ratio(given_class: CopulaState, cells: Tensor, value: Tensor) ->
         value: observed λ, shape [N].
 
     Returns:
-        Log of the ratio, 0 for intervals, shape [N].
+        Log of the ratio; 0 for intervals, float64, shape [N].
     """
     low, high = copula_state.scores_at(given_class.prior, cells, value)
     prior = given_class.prior.at(cells)
@@ -81,23 +81,25 @@ def log_density_ratio(given_class: CopulaState, cells: Tensor, value: Tensor) ->
     return torch.where(high > low, 0.0, log_prob + log_normal)
 
 
-def note(state: ClassesState, sensed: Measurement) -> tuple[ClassesState, Tensor]:
-    """Add a measurement to the observations under either class.
+def add_measurement(
+    state: ClassesState, sensed: Measurement
+) -> tuple[ClassesState, Tensor]:
+    """Return the state with a measurement added to the observations under either class.
 
     Returns:
-        The state, and the mask of changed observations, bool, shape [B, H, W].
+        The new state, and a mask of changed observations, bool, shape [B, H, W].
     """
     changed = torch.zeros_like(sensed.mask)
     per_class = []
     density = state.density.clone()
-    for part, given_class in enumerate(state.per_class):
-        noted, is_new = copula_state.note(given_class, sensed)
+    for class_index, given_class in enumerate(state.per_class):
+        with_measurement, is_new = copula_state.add_measurement(given_class, sensed)
         if bool(is_new.any()):
-            class_density = density[:, part]
+            class_density = density[:, class_index]
             class_density[is_new] = _new_density(
                 given_class, sensed, is_new, class_density[is_new]
             )
-        per_class.append(noted)
+        per_class.append(with_measurement)
         changed |= is_new
     first, second = per_class
     return replace(state, per_class=(first, second), density=density), changed
@@ -108,8 +110,8 @@ def _new_density(
 ) -> Tensor:
     """Return log f / φ of changed observations under a class, shape [N].
 
-    A repeated number adds its own density, and that of its distance from the earlier
-    number.
+    A repeated number adds its own density, and the normal exponent of its distance from
+    the earlier number.
     """
     value = sensed.traversability[is_new]
     std = sensed.std[is_new].double().clamp(min=MIN_STD)
@@ -124,21 +126,18 @@ def _new_density(
     return torch.where(is_repeated, total, density)
 
 
-def moved_cells(before: ClassesState, after: ClassesState) -> Tensor:
-    """Return a mask of observed cells with other scores or another pair.
-
-    Bool, shape [B, H, W].
-    """
-    moved = before.pair != after.pair
+def rescored_cells(before: ClassesState, after: ClassesState) -> Tensor:
+    """Return a mask of observed cells whose scores or pair differ, bool, [B, H, W]."""
+    is_rescored = before.pair != after.pair
     for old, new in zip(before.per_class, after.per_class, strict=True):
         for name in ("lower", "upper"):
             old_end = getattr(old, name)
             new_end = getattr(new, name)
-            # Infinite ends may be equal, but their difference is NaN.
+            # Equal infinite ends are compared first, since their difference is NaN.
             is_close = (old_end - new_end).abs() <= _SAME_SCORE
-            moved |= ~((old_end == new_end) | is_close)
+            is_rescored |= ~((old_end == new_end) | is_close)
     observed = after.per_class[0].observed
-    return moved & observed & (after.pair > 0)
+    return is_rescored & observed & (after.pair > 0)
 
 
 def evidence_of(state: ClassesState) -> Evidence:
@@ -161,10 +160,10 @@ def evidence_of(state: ClassesState) -> Evidence:
     )
 
 
-def labelled(state: ClassesState) -> CopulaState:
-    """Return the scores observed under the more probable class of each cell.
+def scores_of_likelier_class(state: ClassesState) -> CopulaState:
+    """Return the copula state with scores under the more probable class of each cell.
 
-    Intervals that differ from before have no terms.
+    Intervals that changed have no Gaussian terms yet.
     """
     is_first = state.probability() >= 0.5
     first, second = state.per_class
@@ -205,18 +204,19 @@ def moments_of(state: ClassesState) -> tuple[Tensor, Tensor, Tensor]:
     is_first = state.probability()[cells] >= 0.5
     mean = copula.mean[cells]
     variance = copula.std[cells].square().clamp(min=1e-12)
-    # The cavity of the cell's own term. The prior field has a precision of 1.
+    # The cavity is the posterior without the cell's own term. Its precision is at least
+    # that of the prior, 1.
     cavity_precision = (1 / variance - copula.precision[cells]).clamp(min=1)
     centre = (mean / variance - copula.shift[cells]) / cavity_precision
     cavity = 1 / cavity_precision
-    for part, given_class in enumerate(state.per_class):
+    for class_index, given_class in enumerate(state.per_class):
         new_mean, new_std = _moments_given(given_class, cells, centre, cavity)
-        # The posterior already holds under the more probable class.
-        is_chosen = is_first == (part == 0)
+        # The state's posterior is that under the more probable class.
+        is_chosen = is_first == (class_index == 0)
         new_skew = torch.zeros_like(new_std)
         updates = (means, new_mean), (stds, new_std), (skews, new_skew)
         for values, new_values in updates:
-            class_values = values[:, part]
+            class_values = values[:, class_index]
             old_values = class_values[cells]
             class_values[cells] = torch.where(is_chosen, old_values, new_values)
     return means, stds, skews
@@ -238,7 +238,7 @@ def _moments_given(
     total = cavity + given_class.noise_std[cells].square()
     gain = cavity / total
     is_number = upper <= lower
-    # A number has no interval; its moments are replaced below.
+    # Numbers get a dummy interval here; their moments are replaced below.
     interval_upper = torch.where(is_number, lower + 1, upper)
     intervals = centre, total, lower, interval_upper
     arrays = [values.cpu().numpy() for values in intervals]

@@ -1,29 +1,29 @@
-"""The belief of look-alike classes: observed λ determines the class of cells, and
-conditions λ within the class.
+"""The belief `classes`: observed λ updates the class of look-alike cells, and λ.
 
 Some classes look exactly alike, so that a prediction splits a cell's weight between the
-two classes of a pair. Such a cell has a label, the first class or the second. Under
+two classes of a pair. Such a cell has a label: the first class or the second. Under
 either label, that class has all of the pair's weight in the cell's prediction; the
-weights of other classes are unchanged. A cell that may belong to two pairs belongs to
-the heavier one. Given labels c and normal scores z_i = Φ⁻¹(F_i(y_i | c_i)) of observed
-λ y, the joint density of all observations is
+weights of other classes are unchanged. A cell that may belong to two pairs is assigned
+to the heavier pair. Given labels c_i and normal scores z_i = Φ⁻¹(F_i(y_i | c_i)) of
+observed λ y_i, the joint density of all observations is
 
     p(y | c) = N(z; 0, K + noise) · Π_i f_i(y_i | c_i) / φ(z_i),
 
-where K is the correlation matrix of the scores. For λ of 0 or 1, the probability of an
+where F_i and f_i are the predicted CDF and density, φ is the standard normal density
+and K is the correlation matrix of the scores. For λ of 0 or 1, the probability of an
 interval replaces the density. The labels are a Potts field without an outer field
-(`labels`), of which 64 chains are drawn given y (`chains`).
+(`labels`). It is sampled given y by 64 chains (`chains`).
 
-The prediction's odds of the two classes enter a cell's own posterior once,
-P(first | y) ∝ odds · P(first | y, even odds). They are not an outer field of the
-chains: the model has already used the neighbours of a cell, and an outer field would
-count this evidence once more for each of them. Without measurements a cell has the model's
-probabilities.
+The predicted odds of the two classes of a cell enter its posterior odds as a factor,
+once. They are not an outer field of the chains: a model has already used the cell's
+neighbours, and an outer field would count this evidence again for each of them. Without
+measurements, P(class) is the model's.
 
-λ is then the average of its distributions under either label, each conditioned as in
-`copula`: with scores of the field at the more probable label of each observed cell, and
-for an observed cell also at the other label. Cells without a pair, such as unobserved
-ones, are as under `copula`.
+The belief is the average of two distributions of λ, one under either label, weighted by
+P(class). Each is conditioned as in `copula`, with the scores of observed cells under
+their more probable labels. The distribution of an observed cell under its less probable
+label uses the cell's own score under that label. Cells without a pair are updated as in
+`copula`.
 Letters in shapes: B episodes, H×W cells.
 """
 
@@ -47,31 +47,31 @@ from benchnav.planning.sensing.chains import draw_labels
 from benchnav.planning.sensing.class_state import (
     MIN_PROBABILITY,
     ClassesState,
+    add_measurement,
     evidence_of,
-    labelled,
     log_density_ratio,
     moments_of,
-    moved_cells,
-    note,
+    rescored_cells,
+    scores_of_likelier_class,
 )
 from benchnav.planning.sensing.copula import Copula
 from benchnav.planning.sensing.labels import (
     CHAINS,
-    Lattice,
+    Couplings,
     count_bits,
-    fair,
-    noise,
+    fair_labels,
+    sweep_bits,
     sweep_labels,
 )
-from benchnav.planning.sensing.pairs import split, statistics_of
+from benchnav.planning.sensing.pairs import split_by_class, statistics_of
 from benchnav.planning.sensing.score_table import TabulatedDistribution
 from benchnav.planning.sensing.sensor import Measurement
 
-_MAX_STRENGTH = 0.88  # ln(1 + √2) is critical
-_FIRST_SWEEPS = 40  # of cells without measurements, on whole maps
-_MORE_SWEEPS = 10  # of cells whose appearance is observed later
+_MAX_STRENGTH = 0.88  # below the critical strength ln(1 + √2) of a Potts field
+_FIRST_SWEEPS = 40  # at the start, over whole maps
+_MORE_SWEEPS = 10  # over cells that are assigned to a pair later
 _MIN_STD = 1e-9  # of a score, as a divisor
-_SAME_ODDS = 0.01  # maximum difference of log odds that counts as none
+_SAME_LOG_ODDS = 0.01  # smaller differences of predicted log odds are ignored
 
 
 @dataclass(frozen=True)
@@ -85,14 +85,14 @@ class Classes(Belief[ClassesState]):
     Args:
         correlation_m: assumed ℓ, as in `Copula`.
         window: maximum number of observations in an update, as in `Copula`.
-        strength: β, the log odds that a neighbour adds for its own class; None for the
-            strength on the training maps, but at most 0.88. Above 0.881 = ln(1 + √2) a
-            Potts field tends to a single class, so that few observations would decide
-            the class of all look-alike cells. A strength fitted to neighbouring cells
-            is far higher, 2.3 on stakes-v1. On these maps the mean log loss of P(class)
-            in cells up to 6 m from a path with measurements is 0.693 without evidence,
-            0.665 with β = 0.5, 0.617 with 0.8, 0.603 with 0.88, 0.624 with 1.0, 0.774
-            with 1.4 and 1.070 with 2.15.
+        strength: β ≥ 0, the log odds that a neighbour adds for its own class; None for
+            the strength fitted to the training maps, but at most 0.88. Above
+            ln(1 + √2) ≈ 0.881, a Potts field tends to a single class, so that few
+            observations would decide the class of all look-alike cells. The fitted
+            strength is far higher, 2.3 on stakes-v1. On these maps, in cells up to 6 m
+            from a path with measurements, the mean log loss of P(class) is 0.693
+            without evidence, 0.665 with β = 0.5, 0.617 with 0.8, 0.603 with 0.88, 0.624
+            with 1.0, 0.774 with 1.4 and 1.070 with 2.15.
     """
 
     needs_statistics: ClassVar[bool] = True
@@ -119,7 +119,7 @@ class Classes(Belief[ClassesState]):
             ConfigError: If the prediction has no classes, or the statistics do not list
                 the look-alike classes.
         """
-        first, second, pair, odds = split(prior, covariance)
+        first, second, pair, log_odds = split_by_class(prior, covariance)
         copula = self._copula.init(first, covariance)
         under_second = self._copula.init(second, covariance)
         zeros = torch.zeros_like(copula.mean)
@@ -129,9 +129,9 @@ class Classes(Belief[ClassesState]):
             per_class=(copula, under_second),
             density=density,
             pair=pair,
-            odds=odds,
+            log_odds=log_odds,
             p_first=zeros + 0.5,
-            labels=_fair(pair),
+            labels=_fair_labels_for(pair),
             sweeps=torch.zeros_like(pair[:, 0, 0]),
         )
         return self._sweep(state, pair > 0, _FIRST_SWEEPS)
@@ -142,65 +142,74 @@ class Classes(Belief[ClassesState]):
         sensed: Measurement,
         prior: TraversabilityDistribution | None = None,
     ) -> ClassesState:
-        """Draw labels near new observations, and condition cells there.
+        """Draw labels near new observations, and condition cells near them.
 
-        A new prediction replaces the old one in the same cells as in `Copula`. Scores
-        of observed λ there are computed again; several measurements of a cell count as
-        one.
+        A new prediction replaces the old one where it differs, as in `Copula`. The
+        scores of observed λ are computed again there, and repeated measurements of a
+        cell then count as one.
         """
         updated = state
-        renewed = torch.zeros_like(sensed.mask)
+        has_new_prediction = torch.zeros_like(sensed.mask)
         if prior is not None:
-            updated, renewed = self._with_prior(state, prior)
-        updated, changed = note(updated, sensed)
-        rescored = renewed & moved_cells(state, updated)
-        updated = self._draw_labels(updated, changed | rescored)
-        copula = labelled(updated)
+            updated, has_new_prediction = self._with_prior(state, prior)
+        updated, changed = add_measurement(updated, sensed)
+        is_rescored = has_new_prediction & rescored_cells(state, updated)
+        updated = self._draw_labels(updated, changed | is_rescored)
+        copula = scores_of_likelier_class(updated)
         other_lower = copula.lower != updated.copula.lower
         other_upper = copula.upper != updated.copula.upper
-        other_label = other_lower | other_upper
-        new = changed | (copula.observed & (renewed | other_label))
-        copula = self._copula.learn(copula, new)
+        is_relabelled = other_lower | other_upper
+        to_condition = changed | (
+            copula.observed & (has_new_prediction | is_relabelled)
+        )
+        copula = self._copula.learn(copula, to_condition)
         updated = replace(updated, copula=copula)
-        # Rows of the tables for `at`.
+        # The tables need rows for the cells that `at` will be called with.
         cells = self.changed(state, updated)
         first, second = updated.per_class
-        first_table = copula.table.having(first.prior, cells)
+        first_rows = copula.table.with_rows(first.prior, cells)
         paired_cells = cells & (updated.pair > 0)
-        second_table = second.table.having(second.prior, paired_cells)
-        copula = replace(copula, table=first_table)
-        second = replace(second, table=second_table)
+        second_rows = second.table.with_rows(second.prior, paired_cells)
+        copula = replace(copula, table=first_rows)
+        second = replace(second, table=second_rows)
         return replace(updated, copula=copula, per_class=(first, second))
 
-    def _draw_labels(self, state: ClassesState, new: Tensor) -> ClassesState:
-        """Return the state with labels drawn near new observations, bool, [B, H, W]."""
-        members = _members_with(new & (state.pair > 0))
-        if len(members) == 0:
+    def _draw_labels(self, state: ClassesState, changed: Tensor) -> ClassesState:
+        """Return the state with labels drawn near changed observations.
+
+        Args:
+            state: state with the observations; it is not changed.
+            changed: mask of changed observations, bool, shape [B, H, W].
+        """
+        episodes = _episodes_with(changed & (state.pair > 0))
+        if len(episodes) == 0:
             return state
         strength = self._strength(state.copula.covariance)
-        evidence = evidence_of(state).select(members)
-        drawn = draw_labels(evidence, new[members], strength, self.window)
-        p_first = state.p_first.index_copy(0, members, drawn.p_first)
-        labels = state.labels.index_copy(0, members, drawn.labels)
-        sweeps = state.sweeps.index_copy(0, members, drawn.sweeps)
+        evidence = evidence_of(state).select(episodes)
+        new_evidence = draw_labels(evidence, changed[episodes], strength, self.window)
+        p_first = state.p_first.index_copy(0, episodes, new_evidence.p_first)
+        labels = state.labels.index_copy(0, episodes, new_evidence.labels)
+        sweeps = state.sweeps.index_copy(0, episodes, new_evidence.sweeps)
         return replace(state, p_first=p_first, labels=labels, sweeps=sweeps)
 
     def distribution(self, state: ClassesState) -> TraversabilityDistribution:
         """Return the average of the distributions under either class.
 
-        Each is conditioned on all observations.
+        Each of the two distributions is conditioned on all observations.
         """
         if not statistics_of(state.copula.covariance).look_alikes:
             return self._copula.distribution(state.copula)
         dtype = state.copula.prior.dtype
         moments = [values.to(dtype) for values in moments_of(state)]
-        parts = []
-        for part, given_class in enumerate(state.per_class):
-            mean, std, skew = (values[:, part] for values in moments)
-            parts.append(ConditionedDistribution(given_class.prior, mean, std, skew))
+        distributions = []
+        for class_index, given_class in enumerate(state.per_class):
+            mean, std, skew = (values[:, class_index] for values in moments)
+            distributions.append(
+                ConditionedDistribution(given_class.prior, mean, std, skew)
+            )
         p_first = state.probability()
         weights = torch.stack((p_first, 1 - p_first), 1).to(dtype)
-        return PooledDistribution(tuple(parts), weights)
+        return PooledDistribution(tuple(distributions), weights)
 
     def at(self, state: ClassesState, cells: Tensor) -> TabulatedDistribution:
         """Return the belief in some cells, from tables of scores.
@@ -216,9 +225,9 @@ class Classes(Belief[ClassesState]):
         moments = [values[cells] for values in by_class]
         tables = state.copula.table, state.per_class[1].table
         under_class = []
-        for part, given_class in enumerate(state.per_class):
-            table = tables[part].having(given_class.prior, cells)
-            mean, std, skew = (values[:, part] for values in moments)
+        for class_index, given_class in enumerate(state.per_class):
+            table = tables[class_index].with_rows(given_class.prior, cells)
+            mean, std, skew = (values[:, class_index] for values in moments)
             under_class.append(table.below(cells, mean, std, skew))
         under_first, under_second = under_class
         p_first = state.probability()[cells].to(under_first)
@@ -229,22 +238,22 @@ class Classes(Belief[ClassesState]):
 
     def changed(self, before: ClassesState, after: ClassesState) -> Tensor:
         """Return a mask of cells whose score, class or prediction changed."""
-        moved = self._copula.changed(before.copula, after.copula)
+        is_changed = self._copula.changed(before.copula, after.copula)
         other_probability = before.p_first != after.p_first
-        other_odds = before.odds != after.odds
-        moved |= (other_probability | other_odds) & (after.pair > 0)
+        other_log_odds = before.log_odds != after.log_odds
+        is_changed |= (other_probability | other_log_odds) & (after.pair > 0)
         for old, new in zip(before.per_class, after.per_class, strict=True):
             other_score = old.lower != new.lower
             other_noise = old.noise_std != new.noise_std
-            moved |= new.observed & (other_score | other_noise)
+            is_changed |= new.observed & (other_score | other_noise)
             if old.prior is not new.prior:
-                moved |= old.prior.differs(new.prior)
-        return moved
+                is_changed |= old.prior.differs(new.prior)
+        return is_changed
 
     def put(
         self, state: ClassesState, members: Tensor, others: ClassesState
     ) -> ClassesState:
-        """Replace episodes; see `Belief`."""
+        """Return the belief state with some episodes replaced; see `Belief`."""
         put = self._copula.put
         copula = put(state.copula, members, others.copula)
         first, second = state.per_class
@@ -257,11 +266,11 @@ class Classes(Belief[ClassesState]):
     def sample_fields(
         self, state: ClassesState, count: int, keys: Sequence[int]
     ) -> Tensor:
-        """Draw a chain's labels, then scores given all observations, and λ of both.
+        """Draw fields of λ from the labels of a random chain and from drawn scores.
 
-        Prior odds can make the probability of a label differ from its fraction among
-        the chains. Labels of the less likely class are then changed to the other class,
-        by one random number per field, so that patches remain whole.
+        Predicted odds can make P(class) differ from the fraction of the chains with
+        that class. Then some labels are switched to the more probable class. All cells
+        of a field are switched by the same random number, so that patches stay whole.
         """
         scores = self._copula.sample_scores(state.copula, count, keys)
         means, stds, _ = moments_of(state)
@@ -271,101 +280,113 @@ class Classes(Belief[ClassesState]):
         streams = [rng.stream_key(key, "labels") for key in keys]
         indices = np.arange(count)
         uniforms = [rng.uniform(stream, indices, (2,)) for stream in streams]
-        drawn = torch.from_numpy(np.stack(uniforms)).to(scores.device)
-        chains = (drawn[..., 0] * CHAINS).long()
-        tosses = drawn[..., 1]
+        uniforms_by_field = torch.from_numpy(np.stack(uniforms)).to(scores.device)
+        chain_indices = (uniforms_by_field[..., 0] * CHAINS).long()
+        switch_uniforms = uniforms_by_field[..., 1]
         fields = []
         for index, field_scores in enumerate(scores.unbind(1)):
-            chain = chains[:, index, None, None]
-            toss = tosses[:, index, None, None]
+            chain = chain_indices[:, index, None, None]
+            uniform = switch_uniforms[:, index, None, None]
             bits = state.labels >> chain & 1
             in_first = bits.bool()
-            is_first = torch.where(in_first, toss >= p_to_second, toss < p_to_first)
+            is_first = torch.where(
+                in_first, uniform >= p_to_second, uniform < p_to_first
+            )
             is_first = is_first | (state.pair == 0)
             residual = field_scores - state.copula.mean
-            parts = []
-            for part, given_class in enumerate(state.per_class):
-                score = means[:, part] + scales[:, part] * residual
-                parts.append(given_class.fields(score[:, None])[:, 0])
-            fields.append(torch.where(is_first, parts[0], parts[1]))
+            fields_by_class = []
+            for class_index, given_class in enumerate(state.per_class):
+                score = means[:, class_index] + scales[:, class_index] * residual
+                fields_by_class.append(given_class.fields(score[:, None])[:, 0])
+            fields.append(torch.where(is_first, fields_by_class[0], fields_by_class[1]))
         return torch.stack(fields, 1)
 
     def _strength(self, covariance: CovarianceModel) -> float:
-        """Return β: the option, or the fitted strength up to the maximum."""
+        """Return β: the option `strength`, or the fitted strength up to the maximum."""
         if self.strength is not None:
             return self.strength
         return min(statistics_of(covariance).potts_strength, _MAX_STRENGTH)
 
-    def _sweep(self, state: ClassesState, fresh: Tensor, count: int) -> ClassesState:
-        """Sweep labels of unobserved cells, bool [B, H, W], given those of all others."""
-        members = _members_with(fresh)
-        if len(members) == 0:
+    def _sweep(
+        self, state: ClassesState, unlabelled: Tensor, count: int
+    ) -> ClassesState:
+        """Draw labels of some cells by sweeps, given the labels of all other cells.
+
+        Args:
+            state: current state; it is not changed.
+            unlabelled: mask of cells without measurements whose labels are drawn, bool,
+                shape [B, H, W].
+            count: number of sweeps.
+        """
+        episodes = _episodes_with(unlabelled)
+        if len(episodes) == 0:
             return state
-        fresh = fresh[members]
-        labels = state.labels[members]
-        sweeps = state.sweeps[members]
+        unlabelled = unlabelled[episodes]
+        labels = state.labels[episodes]
+        sweeps = state.sweeps[episodes]
         strength = self._strength(state.copula.covariance)
-        lattice = Lattice.of(state.pair[members], strength)
-        degree = lattice.degree()
-        height, width = fresh.shape[1:]
-        rows = torch.arange(height, device=fresh.device)
-        columns = torch.arange(width, device=fresh.device)
-        row = rows[:, None].expand_as(fresh)
-        column = columns.expand_as(fresh)
-        free = -fresh.long()
+        couplings = Couplings.of(state.pair[episodes], strength)
+        degree = couplings.degree()
+        height, width = unlabelled.shape[1:]
+        rows = torch.arange(height, device=unlabelled.device)
+        columns = torch.arange(width, device=unlabelled.device)
+        row = rows[:, None].expand_as(unlabelled)
+        column = columns.expand_as(unlabelled)
+        free = -unlabelled.long()
         even = -((row + column) % 2)
-        torus = max(height, width)
+        torus_size = max(height, width)
         for _ in range(count):
-            bits = noise(sweeps, row, column, degree, strength, torus)
-            labels = sweep_labels(labels, lattice, free, even, bits)
+            bits = sweep_bits(sweeps, row, column, degree, strength, torus_size)
+            labels = sweep_labels(labels, couplings, free, even, bits)
             sweeps = sweeps + 1
-        all_labels = state.labels.index_copy(0, members, labels)
-        all_sweeps = state.sweeps.index_copy(0, members, sweeps)
+        all_labels = state.labels.index_copy(0, episodes, labels)
+        all_sweeps = state.sweeps.index_copy(0, episodes, sweeps)
         return replace(state, labels=all_labels, sweeps=all_sweeps)
 
     def _with_prior(
         self, state: ClassesState, prior: TraversabilityDistribution
     ) -> tuple[ClassesState, Tensor]:
-        """Replace the prediction where it differs, and score the observed λ again.
+        """Replace the prediction where it differs, and recompute observed scores there.
 
         Returns:
-            The state, and the mask of cells with a new prediction, bool, [B, H, W].
+            The new state, and a mask of cells with a new prediction, bool, shape
+            [B, H, W].
         """
-        first, second, pair, odds = split(prior, state.copula.covariance)
+        first, second, pair, log_odds = split_by_class(prior, state.copula.covariance)
         new_first, first_differs = copula_state.with_prior(state.per_class[0], first)
         new_second, second_differs = copula_state.with_prior(state.per_class[1], second)
-        odds_differ = (odds - state.odds).abs() > _SAME_ODDS
-        renewed = first_differs | second_differs | odds_differ
-        rescored = renewed & new_first.observed
+        log_odds_differ = (log_odds - state.log_odds).abs() > _SAME_LOG_ODDS
+        has_new_prediction = first_differs | second_differs | log_odds_differ
+        rescored = has_new_prediction & new_first.observed
         density = state.density.clone()
-        for part, given_class in enumerate((new_first, new_second)):
+        for class_index, given_class in enumerate((new_first, new_second)):
             value = given_class.value[rescored]
             log_ratio = log_density_ratio(given_class, rescored, value)
-            density[:, part][rescored] = log_ratio
-        fresh = renewed & (pair != state.pair)
-        table = state.copula.table.without(first_differs)
+            density[:, class_index][rescored] = log_ratio
+        has_new_pair = has_new_prediction & (pair != state.pair)
+        table = state.copula.table.without_rows(first_differs)
         copula = replace(state.copula, prior=new_first.prior, table=table)
         updated = replace(
             state,
             copula=copula,
             per_class=(new_first, new_second),
             density=density,
-            pair=torch.where(renewed, pair, state.pair),
-            odds=torch.where(renewed, odds, state.odds),
-            p_first=torch.where(fresh, 0.5, state.p_first),
-            labels=torch.where(fresh, _fair(pair), state.labels),
+            pair=torch.where(has_new_prediction, pair, state.pair),
+            log_odds=torch.where(has_new_prediction, log_odds, state.log_odds),
+            p_first=torch.where(has_new_pair, 0.5, state.p_first),
+            labels=torch.where(has_new_pair, _fair_labels_for(pair), state.labels),
         )
-        swept = self._sweep(updated, fresh & (pair > 0), _MORE_SWEEPS)
-        return swept, renewed
+        with_labels = self._sweep(updated, has_new_pair & (pair > 0), _MORE_SWEEPS)
+        return with_labels, has_new_prediction
 
 
-def _fair(pair: Tensor) -> Tensor:
+def _fair_labels_for(pair: Tensor) -> Tensor:
     height, width = pair.shape[1:]
-    labels = fair(height, width).to(pair.device)
+    labels = fair_labels(height, width).to(pair.device)
     return labels.expand_as(pair)
 
 
-def _members_with(cells: Tensor) -> Tensor:
+def _episodes_with(cells: Tensor) -> Tensor:
     """Return the indices of episodes with a cell of a mask, int64."""
     return cells.flatten(1).any(1).nonzero()[:, 0]
 
@@ -373,8 +394,8 @@ def _members_with(cells: Tensor) -> Tensor:
 def _switch_probabilities(state: ClassesState) -> tuple[Tensor, Tensor]:
     """Return probabilities of switching a label to the first class and to the second.
 
-    They make up for the difference between the posterior probability of the first class
-    and its fraction among the chains. Each has the shape [B, H, W].
+    With these, drawn labels have the posterior probability of the first class instead
+    of its fraction among the chains. Each result has the shape [B, H, W].
     """
     p_first = state.probability()
     of_chains = count_bits(state.labels) / CHAINS

@@ -1,13 +1,13 @@
 """The copula belief: observed λ conditions the Gaussian field behind the world's λ.
 
-A cell's λ has a rank in its own predicted distribution. The normal score of the rank is
-a number, or an interval where the distribution has an atom, as at 0 and 1. The scores
-of all cells are a correlated Gaussian field (`benchnav.core.copula`), which is
-conditioned on the observed scores (`gaussian`). With the true distribution of each cell
-this is the posterior under the covariance model, up to four approximations: expectation
-propagation for intervals, limited distances (`conditioning`), the lattice that replaces
-many observations (`lattice`), and the rejection of draws without a feasible path. With
-a model's prediction the marginals are approximate too.
+The normal score of a cell's λ is Φ⁻¹(F(λ)), where F is the cell's predicted CDF. It is
+a number, or an interval if λ is at an atom, such as 0 or 1. The scores of all cells are
+a correlated Gaussian field (`benchnav.core.copula`), which is conditioned on the
+observed scores (`gaussian`). If the prediction is the true distribution of each cell,
+the result is the posterior under the covariance model, up to four approximations:
+expectation propagation for intervals; limited distances (`conditioning`); a lattice of
+cells if there are many observations (`lattice`); and no correction for fields without a
+feasible path, which worlds reject. A model's prediction also approximates the marginals.
 
 Letters in shapes: B episodes, H×W cells, N observations, R×C cells of a block, K values
 of λ.
@@ -39,7 +39,11 @@ from benchnav.planning.sensing.conditioning import (
     estimate_length,
     nearest,
 )
-from benchnav.planning.sensing.copula_state import CopulaState, note, with_prior
+from benchnav.planning.sensing.copula_state import (
+    CopulaState,
+    add_measurement,
+    with_prior,
+)
 from benchnav.planning.sensing.gaussian import Field
 from benchnav.planning.sensing.score_table import ScoreTable, TabulatedDistribution
 from benchnav.planning.sensing.sensor import Measurement
@@ -56,7 +60,7 @@ _MAPS = (
     "std",
     "skew",
 )
-_LEARNT = ("field", "estimated_from", *_MAPS[4:])
+_CONDITIONED = ("field", "estimated_from", *_MAPS[4:])
 
 
 @dataclass(frozen=True)
@@ -64,16 +68,18 @@ class Copula(Belief[CopulaState]):
     """Belief that updates cells near measurements of λ, by spatial correlation.
 
     Args:
-        correlation_m: assumed ℓ in metres; `world` for the ℓ of the world, which is
-            privileged; or `estimated` for an estimate from each episode's observations.
-            The estimate is the mode of the posterior of log ℓ under a log-normal prior
-            of median 1.5 m and standard deviation ln 2. It is computed at 8, 16, 32, …
-            observations until the window is full; before, ℓ is the median.
-        window: maximum number of observations in an estimate of ℓ, those nearest to
-            changed ones. If an update has more observations, and ℓ is four cells or
-            more, it solves for a lattice of cells (`lattice`).
+        correlation_m: assumed ℓ in metres, ≥ 0; `world` for the ℓ of the world, which
+            is privileged; or `estimated` for an estimate from each episode's
+            observations. The estimate is the mode of the posterior of log ℓ. The prior
+            of log ℓ is normal, with median ln 1.5 m and standard deviation ln 2. ℓ is
+            1.5 m at first, and is estimated at 8, 16, 32, … observations until the
+            window is full.
+        window: maximum number of observations in an estimate of ℓ, ≥ 1; the
+            observations nearest to changed ones are used. If an update has more
+            observations and ℓ is four cells or more, the field is approximated by a
+            lattice of cells (`lattice`).
         nugget: fraction of the variance of a cell's score that is independent of all
-            other cells; None for that of the covariance model.
+            other cells, in [0, 1); None for the nugget of the covariance model.
     """
 
     correlation_m: float | Literal["world", "estimated"] = "world"
@@ -88,9 +94,10 @@ class Copula(Belief[CopulaState]):
             is_valid = 0 <= length < math.inf
         expect(
             is_valid,
-            f"`correlation_m` ≥ 0 and finite, 'world' or 'estimated', got {length!r}.",
+            "`correlation_m` as a finite number ≥ 0, 'world' or 'estimated', got "
+            f"{length!r}.",
         )
-        expect(self.window >= 1, f"`window` of at least 1, got {self.window}.")
+        expect(self.window >= 1, f"`window` ≥ 1, got {self.window}.")
         expect(
             self.nugget is None or 0 <= self.nugget < 1,
             f"`nugget` in [0, 1), got {self.nugget}.",
@@ -139,70 +146,83 @@ class Copula(Belief[CopulaState]):
     ) -> CopulaState:
         """Condition cells near new observations.
 
-        Repeated measurements of a number are averaged. If a measurement is an interval,
-        the least noisy one is used. A new prediction replaces the old one in cells
-        whose parameters differ by more than 10⁻³.
+        Repeated measurements of a cell are averaged if their scores are numbers. Of
+        intervals, the least noisy one is used. A new prediction replaces the old one in
+        cells where its parameters differ by more than 10⁻³.
         """
-        noted = state
+        updated = state
         new_prior = torch.zeros_like(state.observed)
         if prior is not None:
-            noted, new_prior = with_prior(state, prior)
-        noted, changed = note(noted, sensed)
-        learnt = self.learn(noted, changed | (new_prior & noted.observed))
-        moved = new_prior | _moved(state, learnt)
-        return replace(learnt, table=learnt.table.having(learnt.prior, moved))
+            updated, new_prior = with_prior(state, prior)
+        updated, changed = add_measurement(updated, sensed)
+        conditioned = self.learn(updated, changed | (new_prior & updated.observed))
+        is_changed = new_prior | _score_changed(state, conditioned)
+        return replace(
+            conditioned,
+            table=conditioned.table.with_rows(conditioned.prior, is_changed),
+        )
 
-    def learn(self, noted: CopulaState, changed: Tensor) -> CopulaState:
-        """Condition cells near changed observations.
+    def learn(self, state: CopulaState, changed: Tensor) -> CopulaState:
+        """Return the state with cells near changed observations conditioned.
 
         Args:
-            noted: state with the observations; it is not changed.
-            changed: mask of observations not yet conditioned on, bool, shape [B, H, W].
+            state: state with the observations; it is not changed.
+            changed: mask of observations on which the state is not yet conditioned,
+                bool, shape [B, H, W].
         """
         has_changed = changed.flatten(1).any(1)
-        members = has_changed.nonzero()[:, 0].tolist()
-        if not members:
-            return noted
-        # On the host, where such small systems are solved quickest.
-        maps = {name: getattr(noted, name).to("cpu") for name in _MAPS}
-        host = replace(noted, **maps)
-        copies = {name: getattr(host, name).clone().to("cpu") for name in _LEARNT}
+        episodes = has_changed.nonzero()[:, 0].tolist()
+        if not episodes:
+            return state
+        # Such small systems are solved quickest on the CPU.
+        maps = {name: getattr(state, name).to("cpu") for name in _MAPS}
+        host = replace(state, **maps)
+        copies = {name: getattr(host, name).clone().to("cpu") for name in _CONDITIONED}
         host = replace(host, **copies)
-        new = changed[members].cpu().numpy()
-        for index, member in enumerate(members):
-            self._learn(host, member, new[index])
-        learnt = {name: getattr(host, name).to(changed.device) for name in _LEARNT}
-        return replace(noted, **learnt)
+        changed_by_episode = changed[episodes].cpu().numpy()
+        for index, episode in enumerate(episodes):
+            self._condition_episode(host, episode, changed_by_episode[index])
+        conditioned = {
+            name: getattr(host, name).to(changed.device) for name in _CONDITIONED
+        }
+        return replace(state, **conditioned)
 
-    def _learn(self, state: CopulaState, member: int, new: ndarray) -> None:
+    def _condition_episode(
+        self, state: CopulaState, episode: int, changed: ndarray
+    ) -> None:
         """Condition one episode on its observations, in place.
 
-        Episodes are conditioned one by one, since their numbers of observations differ,
-        and no episode may depend on the others.
+        Episodes are conditioned one by one, since their numbers of observations differ
+        and no episode may depend on another.
+
+        Args:
+            state: state of all episodes, on the CPU; it is changed.
+            episode: index of the episode.
+            changed: mask of its changed observations, bool, shape [H, W].
         """
-        maps = {name: getattr(state, name)[member].numpy() for name in _MAPS}
+        maps = {name: getattr(state, name)[episode].numpy() for name in _MAPS}
         observed = ~np.isnan(maps["value"])
-        count = int(observed.sum())
-        before = int(state.estimated_from[member])
-        has_doubled = max(MIN_OBSERVATIONS, 2 * before) <= count
-        may_estimate = self.correlation_m == "estimated" and before < self.window
+        n_observed = int(observed.sum())
+        n_at_estimate = int(state.estimated_from[episode])
+        has_doubled = max(MIN_OBSERVATIONS, 2 * n_at_estimate) <= n_observed
+        may_estimate = self.correlation_m == "estimated" and n_at_estimate < self.window
         if may_estimate and has_doubled:
-            state.estimated_from[member] = count
-            row, column = nearest(observed, new, self.window)
+            state.estimated_from[episode] = n_observed
+            row, column = nearest(observed, changed, self.window)
             row = row[: self.window]
             column = column[: self.window]
             covariance = state.covariance
             length = estimate_length(covariance, maps, row, column)
-            if length != float(state.field.length[member]):
+            if length != float(state.field.length[episode]):
                 shape = covariance.grid.shape
                 field = Field.of(shape, [length], "cpu", covariance.nugget)
-                state.field.write(member, field)
-                # All observations are conditioned on again, from the prior.
+                state.field.write(episode, field)
+                # Under the new ℓ, the prior is conditioned on all observations again.
                 maps["mean"][:] = 0
                 maps["std"][:] = 1
                 maps["skew"][:] = 0
-                new = observed
-        condition_maps(state.field, member, maps, new, self.window)
+                changed = observed
+        condition_maps(state.field, episode, maps, changed, self.window)
 
     def distribution(self, state: CopulaState) -> TraversabilityDistribution:
         """Return the distribution of λ given all observations, shape [B, H, W]."""
@@ -212,12 +232,11 @@ class Copula(Belief[CopulaState]):
         return ConditionedDistribution(state.prior, mean, std, state.skew.to(dtype))
 
     def at(self, state: CopulaState, cells: Tensor) -> TabulatedDistribution:
-        """Return the belief in some cells; see `Belief`.
+        """Return the belief in some cells, from a table of scores; see `Belief`.
 
-        A table of scores makes it far faster than `distribution`; λ̂ differs by less
-        than 0.01.
+        This is far faster than `distribution`. λ̂ differs from it by less than 0.01.
         """
-        table = state.table.having(state.prior, cells)
+        table = state.table.with_rows(state.prior, cells)
         mean = state.mean[cells]
         std = state.std[cells]
         below = table.below(cells, mean, std, state.skew[cells])
@@ -225,10 +244,10 @@ class Copula(Belief[CopulaState]):
 
     def changed(self, before: CopulaState, after: CopulaState) -> Tensor:
         """Return a mask of cells whose score or prediction changed."""
-        moved = _moved(before, after)
+        is_changed = _score_changed(before, after)
         if before.prior is after.prior:
-            return moved
-        return moved | before.prior.differs(after.prior)
+            return is_changed
+        return is_changed | before.prior.differs(after.prior)
 
     def put(
         self, state: CopulaState, members: Tensor, others: CopulaState
@@ -242,7 +261,8 @@ class Copula(Belief[CopulaState]):
     ) -> Tensor:
         """Draw fields given all observations, by Matheron's rule.
 
-        A field drawn from the covariance model is shifted towards the observations.
+        Fields are drawn from the covariance model and then corrected by the
+        observations.
         """
         return state.fields(self.sample_scores(state, count, keys))
 
@@ -251,54 +271,54 @@ class Copula(Belief[CopulaState]):
     ) -> Tensor:
         """Return normal scores of the fields of `sample_fields`, shape [B, M, H, W]."""
         scores = []
-        for member, key in enumerate(keys):
-            scores.append(self._sample_member(state, member, count, key))
+        for episode, key in enumerate(keys):
+            scores.append(self._sample_episode(state, episode, count, key))
         mean = state.mean[:, None]
         std = state.std[:, None]
         normal = (torch.stack(scores) - mean) / std.clamp(min=_NO_TERM)
         skewed_normal = skewed(normal, state.skew[:, None])
         return mean + std * skewed_normal
 
-    def _sample_member(
-        self, state: CopulaState, member: int, count: int, key: int
+    def _sample_episode(
+        self, state: CopulaState, episode: int, count: int, key: int
     ) -> Tensor:
-        """Return Gaussian scores of one episode by Matheron's rule, [M, H, W]."""
+        """Return Gaussian scores of one episode by Matheron's rule, shape [M, H, W]."""
         grid = state.covariance.grid
         device = state.mean.device
-        length_m = float(state.field.length[member]) * grid.resolution_m
+        length_m = float(state.field.length[episode]) * grid.resolution_m
         covariance = replace(state.covariance, correlation_m=length_m)
-        drawn = draw_scores(covariance, count, [key])[0]
-        drawn = drawn.to(device).double()
-        has_term = state.precision[member] > _NO_TERM
+        scores = draw_scores(covariance, count, [key])[0]
+        scores = scores.to(device).double()
+        has_term = state.precision[episode] > _NO_TERM
         row, column = has_term.nonzero(as_tuple=True)
         if len(row) == 0:
-            return drawn
-        precision = state.precision[member, row, column]
-        shift = state.shift[member, row, column]
+            return scores
+        precision = state.precision[episode, row, column]
+        shift = state.shift[episode, row, column]
         noise_key = rng.stream_key(key, "observations")
-        white = replace(covariance, correlation_m=0.0, nugget=0.0)
-        noise = draw_scores(white, count, [noise_key])[0]
-        noise = noise.to(drawn)[:, row, column] / precision.sqrt()
+        noise_model = replace(covariance, correlation_m=0.0, nugget=0.0)
+        noise = draw_scores(noise_model, count, [noise_key])[0]
+        noise = noise.to(scores)[:, row, column] / precision.sqrt()
         term_mean = shift / precision
-        residual = term_mean - drawn[:, row, column] - noise
+        residual = term_mean - scores[:, row, column] - noise
         row_offsets = row[:, None] - row
         column_offsets = column[:, None] - column
-        inner = state.field.covariance(member, row_offsets, column_offsets)
-        inner.diagonal().add_(1 / precision)
-        factor = torch.linalg.cholesky(inner)
+        noisy_covariance = state.field.covariance(episode, row_offsets, column_offsets)
+        noisy_covariance.diagonal().add_(1 / precision)
+        factor = torch.linalg.cholesky(noisy_covariance)
         weights = torch.cholesky_solve(residual.T, factor)
         rows = torch.arange(grid.height, device=device)[:, None]
         columns = torch.arange(grid.width, device=device)
         row_offsets = row[:, None, None] - rows
         column_offsets = column[:, None, None] - columns
-        across = state.field.covariance(member, row_offsets, column_offsets)
-        correction = (across.flatten(1).T @ weights).T
-        drawn += correction.view_as(drawn)
-        return drawn
+        map_covariance = state.field.covariance(episode, row_offsets, column_offsets)
+        correction = (map_covariance.flatten(1).T @ weights).T
+        scores += correction.view_as(scores)
+        return scores
 
 
-def _moved(before: CopulaState, after: CopulaState) -> Tensor:
+def _score_changed(before: CopulaState, after: CopulaState) -> Tensor:
     """Return a mask of cells whose posterior score changed, bool, shape [B, H, W]."""
-    moved = before.mean != after.mean
-    moved = moved | (before.std != after.std)
-    return moved | (before.skew != after.skew)
+    is_changed = before.mean != after.mean
+    is_changed = is_changed | (before.std != after.std)
+    return is_changed | (before.skew != after.skew)

@@ -1,7 +1,7 @@
 """State of the copula belief: observations of λ as normal scores, and the posterior.
 
-λ that is impossible under a prediction counts as the nearest possible value, with a
-score `_MAX_SCORE` standard deviations away.
+λ that is impossible under a prediction counts as the nearest possible value, whose
+score is limited to ±`_MAX_SCORE`.
 Letters in shapes: B episodes, H×W cells, N observations.
 """
 
@@ -16,21 +16,22 @@ from benchnav.planning.sensing.gaussian import Field
 from benchnav.planning.sensing.score_table import ScoreTable
 from benchnav.planning.sensing.sensor import MIN_STD, Measurement
 
-# A repeated measurement is ignored if it changes the score by less than this, and
-# averaging reduces the standard deviation to more than this fraction.
+# A repeated measurement is ignored if averaging changes the score by less than
+# `_SAME_SCORE` and leaves more than `_SAME_STD` of the noise's standard deviation.
 _SAME_SCORE = 1e-6
 _SAME_STD = 0.99
 _MAX_SCORE = 6.0
-_SAME_PREDICTION = 1e-3  # tolerance of its parameters; λ̂ changes by about as much
+_SAME_PREDICTION = 1e-3  # of a parameter; its effect on λ̂ is about as large
 
 
 @dataclass(frozen=True, kw_only=True)
 class CopulaState(Predicted):
-    """State of the copula belief; maps of observations are NaN if not observed.
+    """State of the copula belief; maps of observations are NaN in unobserved cells.
 
     Args:
-        table: scores of λ under the prediction, for cells whose belief differs from it.
-        field: correlations of the scores, of B fields.
+        table: scores of λ under the prediction, for cells whose belief differs from the
+            prediction.
+        field: correlations of the scores of B episodes.
         estimated_from: number of observations in the estimate of ℓ; 0 without an
             estimate, int64, shape [B].
         value: observed λ, averaged over the measurements of a cell, float64, shape
@@ -70,10 +71,14 @@ class CopulaState(Predicted):
 def with_prior(
     state: CopulaState, prior: TraversabilityDistribution
 ) -> tuple[CopulaState, Tensor]:
-    """Replace the prediction where it differs, and score the observed λ there again.
+    """Replace the prediction where it differs, and recompute observed scores there.
+
+    Args:
+        state: state with the old prediction; it is not changed.
+        prior: the new prediction, shape [B, H, W].
 
     Returns:
-        The state, and the mask of cells with a new prediction, bool, shape [B, H, W].
+        The new state, and a mask of cells with a new prediction, bool, shape [B, H, W].
     """
     differs = state.prior.differs(prior, _SAME_PREDICTION)
     if not bool(differs.any()):
@@ -88,7 +93,7 @@ def with_prior(
     updated = replace(
         state,
         prior=prior,
-        table=state.table.without(differs),
+        table=state.table.without_rows(differs),
         lower=state.lower.index_put((rescored,), low),
         upper=state.upper.index_put((rescored,), high),
         precision=state.precision.index_put((rescored,), precision),
@@ -98,7 +103,7 @@ def with_prior(
 
 
 def _terms(low: Tensor, high: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:
-    """Return precision and shift of the terms of scores; 0 for intervals."""
+    """Return precision and shift of the Gaussian terms of scores; 0 for intervals."""
     is_number = high <= low
     precision = torch.where(is_number, 1 / std.square(), 0.0)
     shift = torch.where(is_number, precision * low, 0.0)
@@ -108,7 +113,7 @@ def _terms(low: Tensor, high: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:
 def scores_at(
     prior: TraversabilityDistribution, cells: Tensor, value: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return minimum and maximum scores of observed λ; they differ only at an atom.
+    """Return minimum and maximum scores of observed λ, which differ only at an atom.
 
     Args:
         prior: the prediction, shape [B, H, W].
@@ -125,11 +130,17 @@ def scores_at(
     return low, high
 
 
-def note(state: CopulaState, sensed: Measurement) -> tuple[CopulaState, Tensor]:
-    """Add a measurement to the observations.
+def add_measurement(
+    state: CopulaState, sensed: Measurement
+) -> tuple[CopulaState, Tensor]:
+    """Return the state with an added measurement.
+
+    Args:
+        state: state before the measurement; it is not changed.
+        sensed: measured λ in the same episodes.
 
     Returns:
-        The state, and the mask of changed observations, bool, shape [B, H, W].
+        The new state, and a mask of changed observations, bool, shape [B, H, W].
     """
     new = sensed.mask
     if not bool(new.any()):
@@ -154,8 +165,8 @@ def note(state: CopulaState, sensed: Measurement) -> tuple[CopulaState, Tensor]:
     same_std = new_std > _SAME_STD * old_std
     is_repeated = was_number & same_score & same_std
     is_less_noisy = ~was_number & (std < old_std)
-    is_sharper = ~was_observed | is_less_noisy
-    is_new = torch.where(is_number, ~is_repeated, is_sharper)
+    is_first_or_less_noisy = ~was_observed | is_less_noisy
+    is_new = torch.where(is_number, ~is_repeated, is_first_or_less_noisy)
     changed = torch.zeros_like(new)
     changed[new] = is_new
 

@@ -1,15 +1,17 @@
 """Conditioning of a field of correlated standard normals on observations.
 
 An observation of a cell's normal score is either a number with noise, or an interval
-with noise, for example if λ is 0 or 1. Conditioning on numbers is exact. Intervals have
-no closed form: expectation propagation finds a Gaussian term for each. The product of
-the terms with the field matches, cell by cell, the mean and variance under the
-intervals (Minka 2001). Equations are as in Rasmussen and Williams (2006), section 3.6,
-with all terms updated at once and damped.
+with noise, for example if λ is 0 or 1. Conditioning on numbers is exact. Conditioning
+on intervals has no closed form. Expectation propagation represents each interval by a
+Gaussian term. The field times these terms has, in each cell, the mean and variance that
+it has under the cell's interval (Minka 2001). Equations are as in Rasmussen and Williams
+(2006), section 3.6, except that all terms are updated at once, with damping.
 
 Fields are conditioned one at a time, in float64. NumPy has the least overhead for small
-systems; PyTorch multiplies and solves, since NumPy's rounding there depends on the
-number of threads. Letters in shapes: B fields, N observations, M cells, H×W map.
+systems. PyTorch computes products and solutions, since NumPy's rounding in these
+depends on the number of threads.
+Letters in shapes: B fields, N observations, M cells, H×W map; T is the diagonal matrix
+of the terms' precisions.
 """
 
 from collections.abc import Sequence
@@ -32,19 +34,20 @@ from benchnav.planning.sensing.truncated_normal import (
 
 _DAMPING = 0.8
 DAMPED_ROUNDS = 40
-_TOLERANCE = 1e-3  # change of a mean and of a standard deviation, in normal scores
+"""Maximum number of updates of the terms."""
+_TOLERANCE = 1e-3  # maximum change of a mean at convergence, in normal scores
 MIN_VARIANCE = 1e-12
-_MAX_SKEW = 2.0  # skewness of an exponential, the limit far out in a tail
+_MAX_SKEW = 2.0  # of an exponential distribution, the limit far out in a tail
 
 
 @dataclass(frozen=True)
 class Field(Batch):
-    """Correlations between cells of maps, by their distances along both axes.
+    """Correlations between cells of maps, by their offsets along both axes.
 
     Args:
         length: ℓ in cells, float64, shape [B].
-        down: correlations by rows, float64, shape [B, H].
-        across: correlations by columns, float64, shape [B, W].
+        down: correlation of cells by their offset in rows, float64, shape [B, H].
+        across: correlation of cells by their offset in columns, float64, shape [B, W].
         nugget: fraction of a cell's variance that is independent of all other cells.
     """
 
@@ -61,16 +64,16 @@ class Field(Batch):
         device: torch.device | str,
         nugget: float = 0.0,
     ) -> "Field":
-        """Return fields as drawn by `benchnav.core.copula.correlated_normal`.
+        """Return the correlations of `benchnav.core.copula.correlated_normal`.
 
         Args:
             shape: (H, W).
-            lengths: ℓ in cells of each field, B of them.
+            lengths: ℓ of each field in cells, length B.
             device: device of the correlations.
-            nugget: nugget of all fields.
+            nugget: nugget of all fields, in [0, 1).
         """
         height, width = shape
-        # Most fields have the same ℓ.
+        # Most fields have the same ℓ, so correlations are computed once per ℓ.
         down_by_length = {ell: correlations(height, ell) for ell in set(lengths)}
         across_by_length = {ell: correlations(width, ell) for ell in set(lengths)}
         down = np.stack([down_by_length[ell] for ell in lengths])
@@ -83,26 +86,31 @@ class Field(Batch):
         )
 
     def write(self, member: int, field: "Field") -> None:
-        """Replace one field by the only field of another object, in place."""
+        """Replace the field at an index by a single field (B = 1), in place."""
         for name in ("length", "down", "across"):
             getattr(self, name)[member] = getattr(field, name)[0]
 
     def covariance(self, member: int | Tensor, rows: Tensor, columns: Tensor) -> Tensor:
-        """Return correlations of pairs of cells, of the broadcast shape.
+        """Return correlations of pairs of cells.
 
         Args:
-            member: index of the field, or of the field of each pair, int64.
-            rows: offset in rows between the two cells, of either sign, int64.
-            columns: offset in columns.
+            member: index of the field; a tensor (int64) contains an index per pair.
+            rows: offset in rows between the cells of each pair, of either sign, int64.
+            columns: offset in columns, int64.
+
+        Returns:
+            Correlations, float64, of the arguments' broadcast shape.
         """
-        correlation = self.shared(member, rows, columns)
+        correlation = self.covariance_without_nugget(member, rows, columns)
         if self.nugget:
             same_cell = (rows == 0) & (columns == 0)
             correlation = torch.where(same_cell, correlation + self.nugget, correlation)
         return correlation
 
-    def shared(self, member: int | Tensor, rows: Tensor, columns: Tensor) -> Tensor:
-        """Return `covariance` without the nugget, also of a cell with itself."""
+    def covariance_without_nugget(
+        self, member: int | Tensor, rows: Tensor, columns: Tensor
+    ) -> Tensor:
+        """Return `covariance` without the nugget, which a cell has with itself."""
         down = self.down[member, rows.abs()]
         across = self.across[member, columns.abs()]
         return (1 - self.nugget) * down * across
@@ -113,8 +121,9 @@ class Observed:
     """Observed scores, and the Gaussian terms that represent them.
 
     Args:
-        lower: minimum score, −∞ if unbounded, shape [N].
-        upper: maximum score; for a number, equal to the minimum.
+        lower: minimum score; −∞ if unbounded, shape [N].
+        upper: maximum score, ∞ if unbounded; for a number, equal to the minimum, shape
+            [N].
         std: standard deviation of the noise of the score, shape [N].
         precision: precision of the Gaussian terms; 0 if not yet computed, shape [N].
         shift: precision times mean of the terms, shape [N].
@@ -151,17 +160,18 @@ class Posterior:
     shift: ndarray
 
     def moments(self, covariance: ndarray) -> tuple[ndarray, ndarray, ndarray]:
-        """Return moments of M cells of unit variance.
+        """Return posterior moments of M cells, whose prior variance is 1.
 
         Args:
-            covariance: covariances of observed cells with the M cells, [N, M].
+            covariance: covariances of the observed cells with the M cells, shape
+                [N, M].
 
         Returns:
-            Mean [M], variance [M], and A of shape [N, M]; AᵀA is the reduction in their
-            covariance.
+            Mean [M], variance [M], and A of shape [N, M]; AᵀA is the reduction of the
+            covariance of the M cells.
         """
         reduction = _reduction(self.factor, self.root, covariance)
-        mean = times(self.weights, covariance)
+        mean = product(self.weights, covariance)
         explained = np.square(reduction).sum(0)
         variance = (1 - explained).clip(0)
         return mean, variance, reduction
@@ -178,7 +188,7 @@ def posterior(covariance: ndarray, precision: ndarray, shift: ndarray) -> Poster
     root = np.sqrt(precision)
     factor = _factor(covariance, root)
     # (K⁻¹ + T)⁻¹ ν = K (ν − √T (I + √T K √T)⁻¹ √T K ν)
-    scaled = torch.from_numpy(root * times(covariance, shift))
+    scaled = torch.from_numpy(root * product(covariance, shift))
     solved = torch.cholesky_solve(scaled[:, None], factor)[:, 0].numpy()
     weights = shift - root * solved
     return Posterior(
@@ -199,18 +209,18 @@ def condition(covariance: ndarray, observed: Observed) -> Posterior:
     numbers = posterior(covariance, precision, shift)
     if not censored.any():
         return numbers
-    # Intervals form a field of few cells, whose mean and covariance follow from the
-    # numbers.
+    # Expectation propagation runs on the interval-censored cells only, whose mean and
+    # covariance are first conditioned on the numbers.
     columns = covariance[:, censored]
     centre, _, reduction = numbers.moments(columns)
-    residual_cov = columns[censored] - times(reduction.T, reduction)
+    residual_cov = columns[censored] - product(reduction.T, reduction)
     terms = Terms(observed.precision[censored], observed.shift[censored])
     lower = observed.lower[censored]
     upper = observed.upper[censored]
     std = observed.std[censored]
     for _ in range(DAMPED_ROUNDS):
         mean, variance = terms.moments(residual_cov, centre)
-        terms, converged = terms.step(mean, variance, lower, upper, std)
+        terms, converged = terms.updated(mean, variance, lower, upper, std)
         if converged:
             break
     precision = precision.copy()
@@ -219,11 +229,11 @@ def condition(covariance: ndarray, observed: Observed) -> Posterior:
     return posterior(covariance, precision, shift)
 
 
-def evidence(covariance: ndarray, observed: Observed, solved: Posterior) -> float:
+def log_evidence(covariance: ndarray, observed: Observed, solved: Posterior) -> float:
     """Return the log-likelihood of observations, up to a constant.
 
-    Numbers are exact. Intervals are by expectation propagation (Rasmussen and Williams
-    2006, equation 3.65).
+    The result is exact for numbers. For intervals it is the estimate of expectation
+    propagation (Rasmussen and Williams 2006, equation 3.65).
 
     Args:
         covariance: K of the observed cells, shape [N, N].
@@ -242,7 +252,7 @@ def evidence(covariance: ndarray, observed: Observed, solved: Posterior) -> floa
     lower = observed.lower[censored]
     upper = observed.upper[censored]
     log_mass = standardise(centre, total, lower, upper)[2]
-    # The integral of the Gaussian term, which the interval's mass replaces.
+    # The probability of the interval replaces the integral of its Gaussian term.
     scaled = 1 + cavity * terms.precision
     joint = np.square(centre + cavity * terms.shift) / scaled
     exponent = (joint - np.square(centre)) / (2 * cavity)
@@ -255,30 +265,32 @@ def predict(
 ) -> tuple[ndarray, ndarray, ndarray]:
     """Return mean, variance and skewness of M cells, each of shape [M].
 
-    An interval skews the posterior of its cell and, by residual correlation, of its
-    neighbours. A cell's third cumulant is a sum over interval-censored cells: their
-    third cumulant times the cube of the cell's regression on them. This is exact for a
-    single interval and of first order for several (Opper, Paquet and Winther 2013,
+    An interval skews the posterior of its cell and, by correlation, of cells nearby. A
+    cell's third cumulant is a sum over the interval-censored cells: the third cumulant
+    of each, times the cube of the cell's regression coefficient on it. The sum is exact
+    for one interval and of first order for several (Opper, Paquet and Winther 2013,
     "Perturbative corrections for approximate inference in Gaussian latent variable
     models").
 
     Args:
         solved: the conditioned field, from `condition`.
         covariance: K of the observed cells, shape [N, N].
-        observed: observations.
+        observed: the N observations.
         block: covariances of the observed cells with the M cells, shape [N, M].
     """
     mean, variance, reduction = solved.moments(block)
     censored = observed.interval
     if not censored.any():
         return mean, variance, np.zeros_like(mean)
-    own_mean, own_variance, own_reduction = solved.moments(covariance[:, censored])
-    own_variance = own_variance.clip(MIN_VARIANCE)
-    third = third_cumulants(
-        observed, solved.precision, solved.shift, own_mean, own_variance
+    censored_mean, censored_variance, censored_reduction = solved.moments(
+        covariance[:, censored]
     )
-    residual = block[censored] - times(own_reduction.T, reduction)
-    regression = residual / own_variance[:, None]
+    censored_variance = censored_variance.clip(MIN_VARIANCE)
+    third = third_cumulants(
+        observed, solved.precision, solved.shift, censored_mean, censored_variance
+    )
+    residual = block[censored] - product(censored_reduction.T, reduction)
+    regression = residual / censored_variance[:, None]
     return mean, variance, skewness(third, regression, variance)
 
 
@@ -296,7 +308,7 @@ def third_cumulants(
         precision: precision of all terms, shape [N].
         shift: precision times mean of all terms, shape [N].
         mean: posterior mean of the interval-censored cells.
-        variance: their posterior variance, > 0.
+        variance: posterior variance of the interval-censored cells, > 0.
     """
     censored = observed.interval
     terms = Terms(precision[censored], shift[censored])
@@ -312,11 +324,12 @@ def skewness(third: ndarray, regression: ndarray, variance: ndarray) -> ndarray:
 
     Args:
         third: third cumulants of the interval-censored cells.
-        regression: regression of the M cells on these, shape [intervals, M].
-        variance: variance of the cells, [M].
+        regression: regression coefficients of the M cells on the interval-censored
+            cells, one row per interval-censored cell and M columns.
+        variance: variance of the M cells, shape [M].
     """
     # Products and roots are far faster than powers.
-    cumulant = times(third, regression * regression * regression)
+    cumulant = product(third, regression * regression * regression)
     spread = variance.clip(MIN_VARIANCE)
     skew: ndarray = cumulant / (spread * np.sqrt(spread))
     return skew.clip(-_MAX_SKEW, _MAX_SKEW)
@@ -330,49 +343,52 @@ def _factor(covariance: ndarray, root: ndarray) -> Tensor:
 
 
 def _reduction(factor: Tensor, root: ndarray, covariance: ndarray) -> ndarray:
-    """Return A = L⁻¹√T K for M cells, shape [N, M]; AᵀA is the reduction in covariance."""
+    """Return A = L⁻¹√T K, shape [N, M]; AᵀA is the reduction of the M cells' covariance."""
     scaled = torch.from_numpy(root[:, None] * covariance)
     return torch.linalg.solve_triangular(factor, scaled, upper=False).numpy()
 
 
-def times(first: ndarray, second: ndarray) -> ndarray:
+def product(first: ndarray, second: ndarray) -> ndarray:
     """Return the product of two matrices or vectors."""
     return (torch.from_numpy(first) @ torch.from_numpy(second)).numpy()
 
 
 class Terms(NamedTuple):
-    """Gaussian terms of cells: exp(shift · z − precision · z² / 2).
+    """Gaussian terms of N cells: exp(shift · z − precision · z² / 2).
 
-    Both fields have the shape [N].
+    `precision` and `shift` have the shape [N].
     """
 
     precision: ndarray
     shift: ndarray
 
     def moments(self, covariance: ndarray, centre: ndarray) -> tuple[ndarray, ndarray]:
-        """Return mean and variance of the cells of a field, given the terms.
+        """Return posterior mean and variance of the cells, given their terms.
 
         Args:
-            covariance: covariance of the field, shape [N, N].
-            centre: mean of the field, shape [N].
+            covariance: prior covariance of the cells, shape [N, N].
+            centre: prior mean of the cells, shape [N].
         """
         root = np.sqrt(self.precision)
         factor = _factor(covariance, root)
         reduction = _reduction(factor, root, covariance)
-        residual_cov = covariance - times(reduction.T, reduction)
+        residual_cov = covariance - product(reduction.T, reduction)
         residual_shift = self.shift - self.precision * centre
-        mean = centre + times(residual_cov, residual_shift)
+        mean = centre + product(residual_cov, residual_shift)
         variance = residual_cov.diagonal().clip(MIN_VARIANCE)
         return mean, variance
 
     def cavity(self, mean: ndarray, variance: ndarray) -> tuple[ndarray, ndarray]:
-        """Return cavity means and variances."""
+        """Return cavity means and variances, from posterior means and variances.
+
+        The cavity of a cell is its posterior without its own term.
+        """
         precision = (1 / variance - self.precision).clip(MIN_VARIANCE)
         cavity = 1 / precision
         centre = cavity * (mean / variance - self.shift)
         return centre, cavity
 
-    def step(
+    def updated(
         self,
         mean: ndarray,
         variance: ndarray,
@@ -380,17 +396,18 @@ class Terms(NamedTuple):
         upper: ndarray,
         std: ndarray,
     ) -> "tuple[Terms, bool]":
-        """Return the terms of `towards`, and whether they converged.
+        """Return the terms of `matched`, and whether they converged.
 
-        Terms have converged if no term moves its own cell by more than `_TOLERANCE`.
+        Terms have converged if no new term changes the mean of its cell by more than
+        `_TOLERANCE`.
         """
-        new = self.towards(mean, variance, lower, upper, std)
+        new = self.matched(mean, variance, lower, upper, std)
         added = new.precision - self.precision
         moved = abs(new.shift - self.shift) + abs(added * mean)
         change = moved / (1 / variance + added.clip(0))
         return new, bool(change.max() <= _TOLERANCE)
 
-    def towards(
+    def matched(
         self,
         mean: ndarray,
         variance: ndarray,
@@ -400,7 +417,14 @@ class Terms(NamedTuple):
     ) -> "Terms":
         """Return damped terms that match the moments of each interval.
 
-        Every cell is updated with all others fixed.
+        The term of each cell is computed with the terms of all other cells fixed.
+
+        Args:
+            mean: posterior mean of the cells, shape [N].
+            variance: posterior variance of the cells, > 0, shape [N].
+            lower: lower bound of each interval, shape [N].
+            upper: upper bound of each interval, shape [N].
+            std: standard deviation of the noise of the scores, shape [N].
         """
         centre, cavity = self.cavity(mean, variance)
         total = cavity + np.square(std)

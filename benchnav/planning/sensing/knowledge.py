@@ -1,9 +1,10 @@
 """Knowledge of robots about their maps: observations, belief, λ̂ and free mask.
 
-A belief that learns receives measured λ at each step. At some steps the appearance
-sensor is used as well, the model predicts again if more was observed, and the belief is
-updated. A `Learner` contains the parts that do this, and a `Knowledge` the current
-state. Only sensors receive the `Truth`.
+A belief that learns receives measured λ at each step. At some steps, the appearance
+sensor also observes terrain. If it observed something new, the model predicts again.
+Then the belief is updated. A `Learner` contains the sensors, the model and the belief;
+a `Knowledge` contains their results so far. Only sensors and privileged models receive
+the `Truth`.
 Letters in shapes: B episodes, S state dimensions, H×W cells, N cells of all maps
 together.
 """
@@ -27,7 +28,7 @@ from benchnav.planning.sensing.appearance import Memory
 from benchnav.planning.sensing.sensor import Measurement
 from benchnav.planning.world.outcome import Outcome
 
-_PESSIMISTIC = 0.8  # level of the CVaR that is assumed for unobserved terrain
+_PESSIMISTIC_LEVEL = 0.8  # of the CVaR that `pessimistic` assumes for unobserved λ
 
 Result = TypeVar("Result")
 
@@ -35,7 +36,9 @@ Result = TypeVar("Result")
 class KnowledgeError(BenchnavError):
     """Failure of a sensor, belief, model or risk measure during an episode.
 
-    `__cause__` is the original exception, `outcome` the outcome of the episodes.
+    Attributes:
+        outcome: outcome with which the episodes end; `__cause__` is the original
+            exception.
     """
 
     def __init__(self, message: str, outcome: Outcome) -> None:
@@ -46,12 +49,12 @@ class KnowledgeError(BenchnavError):
 
 @dataclass(frozen=True, kw_only=True)
 class Truth(Batch):
-    """True state of the episodes; only sensors receive it.
+    """True state of the episodes; only sensors and privileged models receive it.
 
     Args:
-        terrain: the true maps, B of them.
+        terrain: the B true maps.
         field: current λ of all cells, shape [B, H, W].
-        keys: a stream key of the sensors' noise for each of B episodes.
+        keys: key of the random stream of each episode's sensor noise, length B.
     """
 
     terrain: Terrain
@@ -59,12 +62,12 @@ class Truth(Batch):
     keys: tuple[int, ...]
 
     def select(self, members: Tensor) -> "Truth":
-        """Return some episodes, by index, int64."""
+        """Return the episodes at these indices (int64)."""
         keys = tuple(self.keys[index] for index in members.tolist())
         return replace(super().select(members), keys=keys)
 
     def put(self, members: Tensor, others: "Truth") -> "Truth":
-        """Replace episodes, by index, int64."""
+        """Return a copy in which the episodes at these indices (int64) are replaced."""
         keys = list(self.keys)
         for index, key in zip(members.tolist(), others.keys, strict=True):
             keys[index] = key
@@ -73,25 +76,29 @@ class Truth(Batch):
 
 @dataclass(frozen=True, kw_only=True)
 class Knowledge(Batch):
-    """Knowledge in B episodes.
+    """Knowledge of the robots in B episodes.
 
     Args:
         memory: observed appearance; None if the whole map was observed at the start.
-        has_news: mask of episodes with new or less noisy observations that the
-            prediction does not include, bool, shape [B].
-        sensed: measured λ since the last update; the last measurement of each cell.
-        ever_sensed: mask of cells with measured λ, bool, shape [B, H, W].
-        footprint: mask of cells observed in the last step, bool, shape [B, H, W].
-        observation: input of the model.
+        has_new_appearance: mask of episodes with appearance that the prediction does
+            not yet include, newly observed or less noisy than before, bool, shape [B].
+        sensed: λ measured since the last update; if a cell was measured more than once,
+            its last measurement.
+        ever_sensed: mask of cells whose λ was measured in the episode, bool, shape
+            [B, H, W].
+        footprint: mask of cells that any sensor observed in the last step, bool, shape
+            [B, H, W].
+        observation: the model's last input.
         belief_state: state of the belief.
         risk_map: λ̂, shape [B, H, W].
-        spread: spread of the belief (`TraversabilityDistribution.spread`), shape
-            [B, H, W]; None if it is not stored.
-        free: free mask, to which the area at the goal is not added, bool, [B, H, W].
+        spread: half of the range from the 16 % to the 84 % quantile of λ under the
+            belief, shape [B, H, W]; None if it is not stored.
+        free: mask of free cells, before the cells around the goal are set free, bool,
+            shape [B, H, W].
     """
 
     memory: Memory | None
-    has_news: Tensor
+    has_new_appearance: Tensor
     sensed: Measurement
     ever_sensed: Tensor
     footprint: Tensor
@@ -109,16 +116,18 @@ class Knowledge(Batch):
         return self.memory.seen
 
 
-def unseen_ground(
+def prior_of_unobserved(
     statistics: GroundStatistics, unseen: str, shape: torch.Size, like: Tensor
 ) -> TraversabilityMixture:
-    """Return the λ assumed for unobserved terrain.
+    """Return the distribution of λ that is assumed for unobserved terrain.
 
     Args:
         statistics: statistics of the training maps.
-        unseen: option of `Rules`.
-        shape: [B, H, W].
-        like: tensor of the dtype and device.
+        unseen: assumption, as in `Rules.unseen`: `prior` for the distribution over all
+            training maps, `optimistic` for λ = 1, or `pessimistic` for the CVaR of that
+            distribution.
+        shape: shape of the result, [B, H, W].
+        like: tensor whose dtype and device the result takes.
     """
     prior = statistics.mixture(shape, like)
     if unseen == "prior":
@@ -126,39 +135,58 @@ def unseen_ground(
     value = 1.0
     if unseen == "pessimistic":
         single_cell = statistics.mixture((1, 1, 1), like.double())
-        value = float(single_cell.cvar(_PESSIMISTIC))
+        value = float(single_cell.cvar(_PESSIMISTIC_LEVEL))
     means = torch.full_like(prior.means[:, :1], value)
     return TraversabilityMixture(torch.ones_like(means), means, torch.zeros_like(means))
 
 
-def nothing_sensed(like: Tensor) -> Measurement:
-    """Return a measurement without λ, shape [B, H, W]."""
+def no_measurement(like: Tensor) -> Measurement:
+    """Return a measurement of no cell.
+
+    Args:
+        like: tensor whose shape [B, H, W], dtype and device the result takes.
+    """
     unmeasured = torch.full_like(like, torch.nan)
     return Measurement(traversability=unmeasured, std=torch.ones_like(unmeasured))
 
 
 def sensor_keys(noise_key: int, maps: Any) -> tuple[int, ...]:
-    """Return stream keys of the sensors' noise.
+    """Return the key of the random stream of each episode's sensor noise.
 
     Args:
-        noise_key: root key of a world's noise.
-        maps: indices of the maps of the episodes.
+        noise_key: root key of the world's noise.
+        maps: integer that identifies each episode's stream, B of them; in an
+            evaluation, the index of its map.
     """
     return tuple(rng.stream_key(noise_key, "sensor", int(index)) for index in maps)
 
 
 def check_map(name: str, values: Any, dtype: torch.dtype, like: Tensor) -> None:
-    """Check a tensor's dtype, shape and device."""
+    """Check a map's dtype, shape and device.
+
+    Args:
+        name: name of the map for the message.
+        values: the map; any type.
+        dtype: expected dtype.
+        like: tensor of the expected shape and device.
+
+    Raises:
+        ConfigError: If the map is not a tensor of this dtype, shape and device.
+    """
     fault_text = find_tensor_fault(name, values, dtype, tuple(like.shape), like.device)
     if fault_text:
         raise ConfigError(fault_text)
 
 
-def call(outcome: Outcome, work: Callable[[], Result]) -> Result:
-    """Call user code; convert its exceptions.
+def call_user_code(outcome: Outcome, work: Callable[[], Result]) -> Result:
+    """Call a function that may run user code, and convert its exceptions.
+
+    Args:
+        outcome: outcome with which the episodes end if the function fails.
+        work: the function, without arguments.
 
     Raises:
-        KnowledgeError: If `work` fails; the episodes end with this outcome.
+        KnowledgeError: If `work` raises anything but a GPU fault.
     """
     try:
         return work()

@@ -1,17 +1,18 @@
-"""A Potts field of two states on look-alike cells, sampled by 64 chains of one bit.
+"""A Potts field of two states on look-alike cells, sampled by 64 chains.
 
 A cell that may belong to either class of a pair is coupled to those of its four
 neighbours that may belong to the same pair. Without an outer field, at strength β:
 
-    P(labels) ∝ exp(β · number of coupled neighbours with equal labels).
+    P(labels) ∝ exp(β · number of coupled pairs of neighbours with equal labels).
 
-A cell's 64 labels are the bits of one integer, so that a few integer operations sweep
-all chains (multi-spin coding). Heat-bath sweeps alternate between the two colours of
-the checkerboard. P(class) is estimated from clusters (Swendsen and Wang 1987): bonds
-join coupled neighbours of equal label with the probability 1 − exp(−β). A cell that no
-bonds join to evidence has either class with probability ½, whatever its bit. Random
-numbers are keyed by cell and by the number of sweeps of an episode, so that they do not
-depend on the other episodes of a batch.
+A label is one bit, 1 for the first class. The labels of a cell in the 64 chains are the
+bits of one integer, its word, so that a few integer operations sweep all chains
+(multi-spin coding). Heat-bath sweeps draw first the cells of one colour of the
+checkerboard, then those of the other. P(class) is estimated from clusters (Swendsen and
+Wang 1987): bonds join coupled neighbours of equal label with the probability
+1 − exp(−β). If no bonds join a cell to evidence, either class has the probability ½ in
+that chain, and the cell's bit is ignored. Random numbers depend only on the cell and on
+its episode's number of sweeps, not on the other episodes of a batch.
 Letters in shapes: B episodes, H×W cells, S chains.
 """
 
@@ -25,24 +26,24 @@ from torch import Tensor
 from benchnav.core import rng
 
 CHAINS = 64
-_SWEEPS = 64  # with stored random numbers; later sweeps use those of other cells
-_STEP = 11, 29  # offset of these cells in rows and columns, on the torus
+_SWEEPS = 64  # number of sweeps with stored random numbers
+_STEP = 11, 29  # rows and columns by which the stored numbers then shift, on the torus
 _NEIGHBOURS = 4
-_MAX_LEVEL = 2 * _NEIGHBOURS  # of stored bits by log odds; bonds follow
+_MAX_LEVEL = 2 * _NEIGHBOURS  # index of the stored bits with log odds 4β
 
 # Masks of alternate bits, pairs of bits and groups of four bits.
 _MASKS = (0x5555555555555555, 0x3333333333333333, 0x0F0F0F0F0F0F0F0F)
 
 
 @dataclass(frozen=True)
-class Lattice:
+class Couplings:
     """Couplings between neighbouring cells.
 
     Args:
-        right: all bits set where a cell is coupled to the one to its right, int64,
-            shape [B, H, W].
-        down: likewise for the cell below.
-        strength: β.
+        right: words with all bits set in cells that are coupled to the cell to their
+            right, and with no bit set in others, int64, shape [B, H, W].
+        down: the same for the cell below, int64, shape [B, H, W].
+        strength: β, ≥ 0.
     """
 
     right: Tensor
@@ -50,12 +51,13 @@ class Lattice:
     strength: float
 
     @classmethod
-    def of(cls, pair: Tensor, strength: float) -> "Lattice":
+    def of(cls, pair: Tensor, strength: float) -> "Couplings":
         """Return the couplings of cells.
 
         Args:
-            pair: index of each cell's pair from 1; 0 without one, int64, [B, H, W].
-            strength: β.
+            pair: index of each cell's pair from 1; 0 without a pair, int64, shape
+                [B, H, W].
+            strength: β, ≥ 0.
         """
         right = torch.zeros_like(pair)
         down = torch.zeros_like(pair)
@@ -68,7 +70,10 @@ class Lattice:
         return cls(right, down, strength)
 
     def neighbours(self, words: Tensor) -> tuple[Tensor, ...]:
-        """Return words of the right, left, lower and upper neighbours; 0 if uncoupled."""
+        """Return the words of the right, left, lower and upper neighbours.
+
+        The word of a neighbour that is not coupled is 0.
+        """
         right = words.roll(-1, -1) & self.right
         left = (words & self.right).roll(1, -1)
         below = words.roll(-1, -2) & self.down
@@ -76,65 +81,68 @@ class Lattice:
         return right, left, below, above
 
     def degree(self) -> Tensor:
-        """Return the number of coupled neighbours, int64, shape [B, H, W]."""
+        """Return each cell's number of coupled neighbours, int64, shape [B, H, W]."""
         all_bits = torch.full_like(self.right, -1)
         return -sum(self.neighbours(all_bits), torch.zeros_like(all_bits))
 
 
 @dataclass(frozen=True)
-class Noise:
+class SweepBits:
     """Random bits of a sweep.
 
     Args:
-        chosen: bits of the chains in which a cell takes the first class, for 0 to 4
-            neighbours of that class, int64, five of shape [B, H, W].
-        right: bonds to the right neighbour, effective if both have the same class.
-        down: likewise for the cell below.
+        first_bits: new labels of each cell if 0, 1, 2, 3 or 4 of its neighbours have
+            the first class, five tensors of int64 and shape [B, H, W].
+        right: bonds to the right neighbour, which apply if both cells have the same
+            class, int64, shape [B, H, W].
+        down: bonds to the lower neighbour, int64, shape [B, H, W].
     """
 
-    chosen: tuple[Tensor, ...]
+    first_bits: tuple[Tensor, ...]
     right: Tensor
     down: Tensor
 
 
-def noise(
+def sweep_bits(
     sweep: Tensor,
     row: Tensor,
     column: Tensor,
     degree: Tensor,
     strength: float,
     size: int,
-) -> Noise:
+) -> SweepBits:
     """Return the random bits of each episode's next sweep.
 
     Args:
         sweep: number of sweeps of each episode so far, int64, shape [B].
         row: rows of the cells, int64, shape [B, H, W].
-        column: columns of the cells.
-        degree: number of coupled neighbours of the cells.
-        strength: β.
-        size: side of the torus of stored random numbers, at least that of a map.
+        column: columns of the cells, int64, shape [B, H, W].
+        degree: number of coupled neighbours of each cell, int64, shape [B, H, W].
+        strength: β, ≥ 0.
+        size: number of rows and of columns of stored random numbers, at least that of a
+            map.
     """
     bank = _bank(strength, size).to(row.device)
     uses = sweep[:, None, None] // _SWEEPS
-    turn = sweep[:, None, None] % _SWEEPS
+    bank_sweep = sweep[:, None, None] % _SWEEPS
     bank_row = (row + uses * _STEP[0]) % size
     bank_column = (column + uses * _STEP[1]) % size
     index = bank_row * size + bank_column
-    chosen = []
+    first_bits = []
     for n_first in range(_NEIGHBOURS + 1):
         level = (2 * n_first - degree + _NEIGHBOURS).clamp(0, _MAX_LEVEL)
-        chosen.append(bank[turn, index, level])
-    right = bank[turn, index, _MAX_LEVEL + 1]
-    down = bank[turn, index, _MAX_LEVEL + 2]
-    return Noise(tuple(chosen), right, down)
+        first_bits.append(bank[bank_sweep, index, level])
+    right = bank[bank_sweep, index, _MAX_LEVEL + 1]
+    down = bank[bank_sweep, index, _MAX_LEVEL + 2]
+    return SweepBits(tuple(first_bits), right, down)
 
 
 @lru_cache(maxsize=4)
 def _bank(strength: float, size: int) -> Tensor:
-    """Return the bits of all sweeps, int64, shape [sweeps, size², 11].
+    """Return the stored bits of all sweeps, int64, shape [sweeps, size², 11].
 
-    The first nine are for log odds of −4β to 4β, the other two are bonds.
+    The first nine words of a cell are labels for log odds of −4β, −3β, …, 4β. The last
+    two are bonds to the right and to the lower neighbour.
     """
     key = rng.stream_key(0, "labels", "sweeps")
     log_odds = strength * np.arange(-_NEIGHBOURS, _NEIGHBOURS + 1)
@@ -157,8 +165,8 @@ def _packed(bits: np.ndarray) -> np.ndarray:
     return octets.view("<i8")[:, 0]
 
 
-def fair(height: int, width: int) -> Tensor:
-    """Return labels of probability ½, int64, shape [H, W]."""
+def fair_labels(height: int, width: int) -> Tensor:
+    """Return words of labels, either class with probability ½, int64, shape [H, W]."""
     key = rng.stream_key(0, "labels", "first")
     uniform = rng.uniform(key, np.arange(height * width), (CHAINS,))
     words = _packed(uniform < 0.5)
@@ -166,19 +174,21 @@ def fair(height: int, width: int) -> Tensor:
 
 
 def sweep_labels(
-    labels: Tensor, lattice: Lattice, free: Tensor, even: Tensor, drawn: Noise
+    labels: Tensor, couplings: Couplings, free: Tensor, even: Tensor, bits: SweepBits
 ) -> Tensor:
-    """Resample labels given their neighbours', int64, shape [B, H, W].
+    """Return labels resampled given the labels of neighbours, int64, shape [B, H, W].
 
     Args:
         labels: current labels, int64, shape [B, H, W].
-        lattice: couplings of these cells.
-        free: all bits set where a label may change, int64.
-        even: all bits set on the cells of one colour of the checkerboard, int64.
-        drawn: random bits.
+        couplings: couplings of the cells.
+        free: words with all bits set in cells whose labels may change, int64, shape
+            [B, H, W].
+        even: words with all bits set in cells of one colour of the checkerboard, int64,
+            shape [B, H, W].
+        bits: random bits of the sweep.
     """
     for colour in (free & even, free & ~even):
-        right, left, below, above = lattice.neighbours(labels)
+        right, left, below, above = couplings.neighbours(labels)
         # Binary digits of the number of neighbours of the first class.
         odd_row = right ^ left
         pair_row = right & left
@@ -194,28 +204,32 @@ def sweep_labels(
         is_three = ones & twos
         counts = (is_zero, is_one, is_two, is_three, fours)
         new = torch.zeros_like(labels)
-        for has_count, chosen in zip(counts, drawn.chosen, strict=True):
-            new |= has_count & chosen
+        for has_count, first_bits in zip(counts, bits.first_bits, strict=True):
+            new |= has_count & first_bits
         labels = (labels & ~colour) | (new & colour)
     return labels
 
 
 def connected_to_evidence(
-    labels: Tensor, lattice: Lattice, evidence: Tensor, drawn: Noise
+    labels: Tensor, couplings: Couplings, evidence: Tensor, bits: SweepBits
 ) -> Tensor:
-    """Return bits of chains in which bonds join a cell to evidence, int64, [B, H, W].
+    """Return a mask of the chains in which bonds join a cell to evidence.
 
     Args:
         labels: labels of the chains, int64, shape [B, H, W].
-        lattice: couplings of these cells.
-        evidence: all bits set on cells with evidence of their label, int64.
-        drawn: random bits.
+        couplings: couplings of the cells.
+        evidence: words with all bits set in cells with evidence of their label, int64,
+            shape [B, H, W].
+        bits: random bits of the sweep.
+
+    Returns:
+        Words with a bit set for each such chain, int64, shape [B, H, W].
     """
     same_right = ~(labels ^ labels.roll(-1, -1))
     same_below = ~(labels ^ labels.roll(-1, -2))
-    right = lattice.right & drawn.right & same_right
-    down = lattice.down & drawn.down & same_below
-    bonds = Lattice(right, down, lattice.strength)
+    right = couplings.right & bits.right & same_right
+    down = couplings.down & bits.down & same_below
+    bonds = Couplings(right, down, couplings.strength)
     connected = evidence
     while True:
         before = connected
@@ -229,11 +243,11 @@ def connected_to_evidence(
 def count_bits(words: Tensor) -> Tensor:
     """Return the number of set bits, int64."""
     bit_mask, pair_mask, four_mask = _MASKS
-    # Counts in each pair of bits, then in each four, then in each byte.
+    # Count in each pair of bits, then in each group of four bits, then in each byte.
     words = words - ((words >> 1) & bit_mask)
     words = (words & pair_mask) + ((words >> 2) & pair_mask)
     words = (words + (words >> 4)) & four_mask
-    total = words * 0x0101010101010101  # the sum of all bytes is in the highest
+    total = words * 0x0101010101010101  # the highest byte is the sum of all bytes
     return (total >> 56) & 0xFF
 
 

@@ -1,4 +1,4 @@
-"""Learner: how a robot's knowledge is updated during an episode.
+"""Updates of robots' knowledge during an episode: sense, predict, infer λ, apply risk.
 
 Letters in shapes: B episodes, S state dimensions, H×W cells, N cells of all maps
 together.
@@ -19,15 +19,15 @@ from benchnav.core.ground import GroundStatistics
 from benchnav.core.terrain import Observation, Terrain
 from benchnav.planning import risk
 from benchnav.planning.free_space import Rules
-from benchnav.planning.sensing.appearance import Memory, masked, remember
+from benchnav.planning.sensing.appearance import Memory, model_input, remember
 from benchnav.planning.sensing.belief import Belief, CovarianceModel
 from benchnav.planning.sensing.knowledge import (
     Knowledge,
     Truth,
-    call,
+    call_user_code,
     check_map,
-    nothing_sensed,
-    unseen_ground,
+    no_measurement,
+    prior_of_unobserved,
 )
 from benchnav.planning.sensing.sensor import (
     Appearance,
@@ -38,25 +38,25 @@ from benchnav.planning.sensing.sensor import (
 from benchnav.planning.world.outcome import Outcome
 
 Predict = Callable[[Terrain, Observation], TraversabilityDistribution]
-"""Function from terrain and its observation to a prediction.
+"""Function that returns a prediction for terrain, with its current λ, and an observation.
 
-The terrain, with its current λ, is only for privileged models.
+Only privileged models use the terrain.
 """
 
 
 @dataclass(frozen=True, kw_only=True)
 class Learner:
-    """Parts that update a robot's knowledge.
+    """Parts that update the knowledge of robots.
 
     Args:
-        sensor: sensor of appearance.
-        ground: sensor of λ.
+        sensor: appearance sensor.
+        ground: traversability sensor.
         belief: belief about λ.
         covariance: covariance model of the λ field.
         measure: risk measure that returns λ̂.
-        rules: free space, and the λ assumed for unobserved terrain.
-        predict: the model; unused if the sensor shows the whole map.
-        keeps_spread: whether the spread of the belief is stored next to λ̂, for policies.
+        rules: rules of free space and of unobserved terrain.
+        predict: the model; not called if the sensor observes the whole map.
+        keeps_spread: whether the belief's spread is stored with λ̂, for policies.
     """
 
     sensor: Sensor
@@ -70,15 +70,16 @@ class Learner:
 
     @property
     def statistics(self) -> GroundStatistics:
-        """Statistics of the training maps, used for unobserved terrain.
+        """Statistics of the training maps, which unobserved terrain needs.
 
         Raises:
             ConfigError: If the covariance model has no statistics.
         """
         expect(
             self.covariance.statistics is not None,
-            "`CovarianceModel.statistics` for a sensor that does not show the whole "
-            "map, got None.",
+            "`CovarianceModel.statistics`, which a sensor that does not observe the "
+            "whole map needs, got None. Use a model that has terrain statistics, or "
+            "the sensor 'full'.",
         )
         assert self.covariance.statistics is not None
         return self.covariance.statistics
@@ -92,9 +93,10 @@ class Learner:
         """Return the knowledge at the start: observed appearance, no measured λ.
 
         Args:
-            truth: for the sensor and privileged models.
+            truth: true state at the start, for the sensor and privileged models.
             robot_state: robot states, shape [B, S].
-            prediction: prediction of the whole map if the sensor shows it; else None.
+            prediction: prediction of the whole map if the sensor observes it at the
+                start; else None.
 
         Raises:
             KnowledgeError: If the sensor, the model, the belief or the risk measure
@@ -107,7 +109,7 @@ class Learner:
             noise_key = NoiseKey(truth.keys, 0)
             first = self._measurement(self.sensor, truth, robot_state, noise_key)
             assert first.appearance is not None
-            memory = remember(Memory.none(observation), first.appearance)
+            memory = remember(Memory.empty(observation), first.appearance)
             seen = memory.seen
             observation, prediction = self._predict(memory, truth)
         assert prediction is not None
@@ -118,8 +120,8 @@ class Learner:
         no_cells = torch.zeros_like(truth.field, dtype=torch.bool)
         return Knowledge(
             memory=memory,
-            has_news=no_episodes,
-            sensed=nothing_sensed(truth.field),
+            has_new_appearance=no_episodes,
+            sensed=no_measurement(truth.field),
             ever_sensed=no_cells,
             footprint=no_cells.clone(),
             observation=observation,
@@ -130,14 +132,14 @@ class Learner:
         )
 
     def believe(self, prediction: TraversabilityDistribution) -> Any:
-        """Return the belief state of a prediction without measurements.
+        """Return the initial belief state, which follows from a prediction.
 
         Raises:
             KnowledgeError: If the belief raises.
         """
         # A custom belief may modify its input.
         prior = prediction.clone()
-        return call(
+        return call_user_code(
             Outcome.BELIEF_ERROR, lambda: self.belief.init(prior, self.covariance)
         )
 
@@ -150,16 +152,17 @@ class Learner:
         observes: Tensor,
         measures: Tensor,
     ) -> Knowledge:
-        """Add the observations of a step.
+        """Return the knowledge with the observations of a step added.
 
-        A belief that does not learn receives no λ. Appearance is usually observed only
-        before an update: at every step, it would take far longer and add little.
+        λ is measured only for a belief that learns. Appearance is usually observed only
+        before an update, since an observation in each step would take far longer and
+        add little.
 
         Args:
             knowledge: current knowledge; it is not changed.
             truth: true state in this step.
             robot_state: robot states, shape [B, S].
-            step: number of steps taken, one for all episodes or one for each.
+            step: number of steps taken so far, one integer or one per episode.
             observes: mask of episodes that use the appearance sensor, bool, shape [B].
             measures: mask of episodes that use the sensor of λ, bool, shape [B].
 
@@ -188,25 +191,25 @@ class Learner:
 
         Args:
             knowledge: current knowledge; it is not changed.
-            truth: for privileged models only.
+            truth: true state in this step, for privileged models.
 
         Returns:
-            The knowledge, and a mask of cells whose belief changed, bool, shape
+            The new knowledge, and a mask of cells whose belief changed, bool, shape
             [B, H, W].
 
         Raises:
             KnowledgeError: If the model, the belief or the risk measure raises, or
                 returns an invalid value.
         """
-        has_news = bool(knowledge.has_news.any())
-        if not has_news and not bool(knowledge.sensed.mask.any()):
+        has_new_appearance = bool(knowledge.has_new_appearance.any())
+        if not has_new_appearance and not bool(knowledge.sensed.mask.any()):
             return knowledge, torch.zeros_like(knowledge.free)
         before = knowledge.belief_state
         observation = knowledge.observation
         prior = None
-        if has_news and knowledge.memory is not None:
+        if has_new_appearance and knowledge.memory is not None:
             observation, prior = self._predict(knowledge.memory, truth)
-        after = call(
+        after = call_user_code(
             Outcome.BELIEF_ERROR,
             lambda: self.belief.update(before, knowledge.sensed, prior),
         )
@@ -216,11 +219,11 @@ class Learner:
             check_map("cells from `changed`", cells, torch.bool, knowledge.free)
             return cells
 
-        changed = call(Outcome.BELIEF_ERROR, changed_cells)
+        changed = call_user_code(Outcome.BELIEF_ERROR, changed_cells)
         knowledge = replace(
             knowledge,
-            has_news=torch.zeros_like(knowledge.has_news),
-            sensed=nothing_sensed(knowledge.risk_map),
+            has_new_appearance=torch.zeros_like(knowledge.has_new_appearance),
+            sensed=no_measurement(knowledge.risk_map),
             observation=observation,
             belief_state=after,
         )
@@ -229,7 +232,11 @@ class Learner:
         return knowledge, changed
 
     def at(self, knowledge: Knowledge, cells: Tensor) -> TraversabilityDistribution:
-        """Return the belief in cells, bool [B, H, W], as a map of one row, [1, N].
+        """Return the distribution of λ in N cells, as a map of one row, [1, N].
+
+        Args:
+            knowledge: current knowledge.
+            cells: mask of the N cells, bool, shape [B, H, W].
 
         Raises:
             KnowledgeError: If the belief raises, or returns an invalid value.
@@ -246,7 +253,7 @@ class Learner:
             )
             return believed
 
-        return call(Outcome.BELIEF_ERROR, believe)
+        return call_user_code(Outcome.BELIEF_ERROR, believe)
 
     def distribution(self, knowledge: Knowledge) -> TraversabilityDistribution:
         """Return the distribution of λ, shape [B, H, W].
@@ -266,15 +273,15 @@ class Learner:
             )
             return believed
 
-        return call(Outcome.BELIEF_ERROR, believe)
+        return call_user_code(Outcome.BELIEF_ERROR, believe)
 
     def select(self, knowledge: Knowledge, members: Tensor) -> Knowledge:
-        """Return some episodes, by index, int64.
+        """Return the knowledge in the episodes at these indices (int64).
 
         Raises:
             KnowledgeError: If the belief raises.
         """
-        belief_state = call(
+        belief_state = call_user_code(
             Outcome.BELIEF_ERROR,
             lambda: self.belief.select(knowledge.belief_state, members),
         )
@@ -284,12 +291,12 @@ class Learner:
     def put(
         self, knowledge: Knowledge, members: Tensor, others: Knowledge
     ) -> Knowledge:
-        """Replace episodes, by index, int64.
+        """Return the knowledge with the episodes at these indices (int64) replaced.
 
         Raises:
             KnowledgeError: If the belief raises.
         """
-        belief_state = call(
+        belief_state = call_user_code(
             Outcome.BELIEF_ERROR,
             lambda: self.belief.put(
                 knowledge.belief_state, members, others.belief_state
@@ -302,13 +309,13 @@ class Learner:
     def _inferred(self, knowledge: Knowledge, changed: Tensor) -> Knowledge:
         """Return the knowledge with λ̂ and the free mask of changed cells updated."""
         believed = self.at(knowledge, changed)
-        # Risk measures expect a batch of maps.
+        # A risk measure receives a batch of maps, [1, 1, N].
         batch = map_tensors(believed, lambda values: values[None])
         risk_map, spread = self._measured(batch)
         seen = None
         if knowledge.memory is not None:
             seen = knowledge.memory.seen[changed][None]
-        free = call(
+        free = call_user_code(
             Outcome.BELIEF_ERROR, lambda: self.rules.free(risk_map[0], believed, seen)
         )
         new_risk = risk_map.flatten().to(knowledge.risk_map.dtype)
@@ -324,30 +331,32 @@ class Learner:
     def _measured(
         self, believed: TraversabilityDistribution
     ) -> tuple[Tensor, Tensor | None]:
-        """Return λ̂ and, if it is stored, the spread of a batch of maps."""
+        """Return λ̂ and the spread of a batch of maps; None if spread is not stored."""
 
         def measure() -> tuple[Tensor, Tensor | None]:
             risk_map = risk.apply(self.measure, believed)
             spread = believed.spread() if self.keeps_spread else None
             return risk_map, spread
 
-        return call(Outcome.MODEL_ERROR, measure)
+        return call_user_code(Outcome.MODEL_ERROR, measure)
 
     def _predict(
         self, memory: Memory, truth: Truth
     ) -> tuple[Observation, TraversabilityDistribution]:
-        """Return the model's input and its prediction.
+        """Return the model's input and the prediction.
 
-        In unobserved cells, `rules.unseen` determines the prediction.
+        In unobserved cells, the prediction is what `rules.unseen` assumes.
         """
         statistics = self.statistics
-        observation = masked(memory, statistics.layer_means)
+        observation = model_input(memory, statistics.layer_means)
         terrain = replace(truth.terrain, traversability=truth.field)
-        predicted = call(
+        predicted = call_user_code(
             Outcome.MODEL_ERROR, lambda: self.predict(terrain, observation)
         )
         seen = memory.seen
-        unseen = unseen_ground(statistics, self.rules.unseen, seen.shape, truth.field)
+        unseen = prior_of_unobserved(
+            statistics, self.rules.unseen, seen.shape, truth.field
+        )
         return observation, choose(seen, predicted, unseen)
 
     def _measurement(
@@ -359,7 +368,7 @@ class Learner:
             terrain = truth.terrain
             field = truth.field
             state = robot_state
-            # A custom sensor may modify its inputs; those of this package do not.
+            # A custom sensor may modify its inputs; sensors of this package do not.
             if not type(sensor).__module__.startswith("benchnav."):
                 terrain = terrain.clone()
                 field = field.clone()
@@ -368,18 +377,18 @@ class Learner:
             _check_measurement(measurement, truth.field)
             expect(
                 sensor is not self.sensor or measurement.appearance is not None,
-                "`Measurement.appearance` from a sensor of appearance, got None. List "
-                "λ sensors under `grounds`.",
+                "`Measurement.appearance` from an appearance sensor, got None. List "
+                "traversability sensors under `grounds`.",
             )
             return measurement
 
-        return call(Outcome.SENSOR_ERROR, sense)
+        return call_user_code(Outcome.SENSOR_ERROR, sense)
 
 
 def _with_traversability(
     knowledge: Knowledge, new: Measurement, in_use: Tensor
 ) -> Knowledge:
-    """Add measured λ of the episodes that use the sensor, bool, shape [B]."""
+    """Add λ measured in the episodes that use the sensor (mask, bool, shape [B])."""
     mask = new.mask & in_use[:, None, None]
     before = knowledge.sensed
     traversability = torch.where(mask, new.traversability, before.traversability)
@@ -396,22 +405,26 @@ def _with_traversability(
 def _with_appearance(
     knowledge: Knowledge, memory: Memory, new: Appearance, in_use: Tensor
 ) -> Knowledge:
-    """Add the appearance in episodes that use the sensor, bool, shape [B]."""
+    """Add appearance observed in the episodes that use the sensor (mask, bool, [B])."""
     seen = new.seen & in_use[:, None, None]
     new_memory = remember(memory, replace(new, seen=seen))
-    # A cell is observed for the first time, or with less noise.
+    # The noise level changes if a cell is observed first, or with less noise.
     is_better = new_memory.noise_level != memory.noise_level
     is_new = is_better.flatten(1).any(1)
     return replace(
         knowledge,
         memory=new_memory,
-        has_news=knowledge.has_news | is_new,
+        has_new_appearance=knowledge.has_new_appearance | is_new,
         footprint=knowledge.footprint | seen,
     )
 
 
 def _check_measurement(measurement: Any, like: Tensor) -> None:
-    """Check a sensor's measurement against maps of the episodes.
+    """Check a sensor's measurement.
+
+    Args:
+        measurement: result of `Sensor.sense`; any type.
+        like: map of the expected dtype, shape and device.
 
     Raises:
         ConfigError: If its type, dtype, shape, device or values are invalid.
@@ -426,7 +439,11 @@ def _check_measurement(measurement: Any, like: Tensor) -> None:
     check_map("`Measurement.std`", measurement.std, dtype, like)
     values = traversability[measurement.mask]
     is_valid = (values >= 0) & (values <= 1)
-    expect(bool(is_valid.all()), "`Measurement.traversability` in [0, 1], or NaN.")
+    expect(
+        bool(is_valid.all()),
+        "`Measurement.traversability` in [0, 1] in measured cells, got other values. "
+        "Return NaN in cells that are not measured.",
+    )
     appearance = measurement.appearance
     if appearance is not None:
         check_map("`Appearance.seen`", appearance.seen, torch.bool, like)

@@ -1,12 +1,12 @@
 """The sensor `near`: a mast camera whose noise grows with distance.
 
-A cell is visible unless terrain in between rises above the line from the mast to it.
-The horizon is computed ring by ring around the robot's cell, outwards, and is linear
-between the cells of a ring (XDraw). Planes and long walls along the grid are therefore
-exact. The mast is in the middle of the robot's cell. Terrain that is out of range, out
-of the field of view or hidden below the horizon raises no horizon. Hence the mask of
-observed cells depends only on observed terrain, as long as hidden terrain stays below
-its horizon.
+A cell is visible unless terrain in between rises above the line from the top of the
+mast to the cell. The horizon is computed ring by ring, outwards from the robot's cell,
+and is interpolated linearly between the cells of a ring (XDraw). Visibility on planes
+and behind long walls along the grid is therefore exact. The mast is in the middle of
+the robot's cell. Terrain that is out of range, out of the field of view or below the
+horizon does not raise the horizon. Hence the mask of observed cells depends only on
+observed terrain, as long as hidden terrain stays below the horizon.
 Letters in shapes: B episodes, S state dimensions, H×W cells, N cells of the rings.
 
 Source: Franklin, Ray and Mehta (1994), "Geometric algorithms for siting of air defense
@@ -33,19 +33,20 @@ class Near(Sensor):
     The robot's own cell and its eight neighbours are always observed. Any other cell is
     observed if its centre is in range, in the field of view and in line of sight. Noise
     is normal and independent between cells and steps. Its standard deviation is
-    proportional to the distance of the cell's centre. The defaults are ±4 of 255 and
-    ±16 mm at 8 m, as for a good stereo camera. Slopes of cells of 0.5 m then have an
-    error of about 1°. Layers other than colour and elevation have no noise, and slope
-    is computed from observed elevation.
+    proportional to the distance of the cell's centre. At 8 m, the defaults are 4 of 255
+    for colour and 16 mm for elevation, as for a good stereo camera. Slopes of cells of
+    0.5 m then have an error of about 1°. Layers other than colour and elevation have no
+    noise, and slope is computed from observed elevation.
 
     Args:
-        range_m: range in metres.
-        fov_deg: field of view, centred on the robot's heading, in (0, 360].
+        range_m: maximum distance from the robot to the centre of an observed cell, in
+            metres.
+        fov_deg: field of view in degrees, centred on the robot's heading, in (0, 360].
         height_m: height of the mast above the terrain under the robot, in metres.
-        colour_noise: standard deviation of each colour channel (0–255) per metre of
-            distance.
-        elevation_noise: standard deviation of elevation in metres, per metre of
-            distance.
+        colour_noise: standard deviation of the noise of each colour channel, on the
+            scale 0–255, per metre of distance.
+        elevation_noise: standard deviation of the noise of elevation in metres, per
+            metre of distance to the cell.
     """
 
     range_m: float = 8.0
@@ -60,23 +61,23 @@ class Near(Sensor):
             value = getattr(self, name)
             expect(
                 0 < value < math.inf,
-                f"`{name}` of the sensor near > 0 and finite, got {value}.",
+                f"`{name}` of sensor 'near' > 0 and finite, got {value}.",
             )
         expect(
             0 < self.fov_deg <= 360,
-            f"`fov_deg` of the sensor near in (0, 360], got {self.fov_deg}.",
+            f"`fov_deg` of sensor 'near' in (0, 360], got {self.fov_deg}.",
         )
         for name in ("colour_noise", "elevation_noise"):
             value = getattr(self, name)
             expect(
                 0 <= value < math.inf,
-                f"`{name}` of the sensor near ≥ 0 and finite, got {value}.",
+                f"`{name}` of sensor 'near' ≥ 0 and finite, got {value}.",
             )
 
     def sense(
         self, terrain: Terrain, field: Tensor, robot_state: Tensor, noise_key: NoiseKey
     ) -> Measurement:
-        """Return the appearance of cells in sight; robots off the map observe nothing."""
+        """Return the appearance of visible cells; robots off the map observe no cell."""
         distance = self._distances(terrain, robot_state.double())
         seen = distance.isfinite()
         # Independent normals for red, green, blue and elevation.
@@ -108,9 +109,9 @@ class Near(Sensor):
         return Measurement.of_appearance(appearance)
 
     def _distances(self, terrain: Terrain, robot_state: Tensor) -> Tensor:
-        """Return distances to the centres of observed cells, in metres, [B, H, W].
+        """Return distances to the centres of observed cells in metres.
 
-        The distance is infinite for all other cells.
+        The distance is infinite for unobserved cells. Shape [B, H, W].
         """
         grid = terrain.grid
         x, y, heading = robot_state[:, :3].T[..., None]
@@ -133,66 +134,68 @@ class Near(Sensor):
             off_heading = turn.remainder(math.tau) - math.pi
             half_fov = math.radians(self.fov_deg) / 2
             in_view &= off_heading.abs() <= half_fov
-        in_view = on_map & (in_view | (rings.number <= 1))
+        in_view = on_map & (in_view | (rings.ring_number <= 1))
 
         row_on_map = rows.clamp(0, grid.height - 1)
         column_on_map = columns.clamp(0, grid.width - 1)
         cell = row_on_map * grid.width + column_on_map
         height_m = terrain.elevation_m.flatten(1).gather(1, cell).double()
         rise = height_m - height_m[:, :1] - self.height_m
-        gradient = rise / rings.number.clamp(min=1)
+        gradient = rise / rings.ring_number.clamp(min=1)
         # Only cells in view raise the horizon.
         gradient = gradient.where(in_view, -math.inf)
         visible = in_view & rings.in_sight(gradient)
         distances = torch.full_like(terrain.elevation_m, math.inf, dtype=distance.dtype)
-        member, ray = visible.nonzero(as_tuple=True)
-        cells = member, rows[member, ray], columns[member, ray]
-        distances[cells] = distance[member, ray]
+        episode, ray = visible.nonzero(as_tuple=True)
+        cells = episode, rows[episode, ray], columns[episode, ray]
+        distances[cells] = distance[episode, ray]
         return distances
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Rings(Batch):
-    """Cells around a central one, ring by ring from the centre, and their rays.
+    """Cells around a central cell, ring by ring outwards, and their rays to the centre.
 
     Args:
         row: row of each cell relative to the centre, int64, shape [N].
-        column: column, likewise.
-        number: number of the ring, shape [N]: the larger of the distances to the
-            centre in rows and in columns.
-        inner: the two cells of the next inner ring between which each cell's ray
-            passes, as indices within that ring, shape [N, 2].
-        fraction: weight of the second of these cells, float64, shape [N].
+        column: column of each cell relative to the centre, int64, shape [N].
+        ring_number: number of each cell's ring: the larger of its distances to the
+            centre in rows and in columns, int64, shape [N].
+        inner_cells: the two cells of the next inner ring between which each cell's ray
+            passes, as indices within that ring, int64, shape [N, 2].
+        fraction: interpolation weight of the second of these two cells, float64, shape
+            [N].
     """
 
     row: Tensor
     column: Tensor
-    number: Tensor
-    inner: Tensor
+    ring_number: Tensor
+    inner_cells: Tensor
     fraction: Tensor
 
-    def in_sight(self, rise: Tensor) -> Tensor:
+    def in_sight(self, gradient: Tensor) -> Tensor:
         """Return a mask of cells that are not below the horizon, bool, shape [B, N].
 
         Args:
-            rise: height of each cell above the mast's top, divided by the number of its
-                ring, shape [B, N]. Along a ray, this orders cells as the tangent of
-                their elevation angle does. It is −∞ for cells that raise no horizon.
+            gradient: height of each cell above the mast's top, divided by the number of
+                the cell's ring, shape [B, N]. Along a ray, cells have the same order by
+                gradient as by elevation angle. It is −∞ for cells that do not raise the
+                horizon.
         """
-        visible = [torch.ones_like(rise[:, :9], dtype=torch.bool)]
-        horizon = rise[:, 1:9]
-        n_rings = int(self.number[-1])
-        for number in range(2, n_rings + 1):
-            start = (2 * number - 1) ** 2
-            stop = (2 * number + 1) ** 2
+        visible = [torch.ones_like(gradient[:, :9], dtype=torch.bool)]
+        horizon = gradient[:, 1:9]
+        n_rings = int(self.ring_number[-1])
+        for ring_number in range(2, n_rings + 1):
+            start = (2 * ring_number - 1) ** 2
+            stop = (2 * ring_number + 1) ** 2
             ring = slice(start, stop)
-            ring_rise = rise[:, ring]
-            first, second = self.inner[ring].T
+            ring_gradient = gradient[:, ring]
+            first, second = self.inner_cells[ring].T
             inner_horizon = torch.lerp(
                 horizon[:, first], horizon[:, second], self.fraction[ring]
             )
-            visible.append(ring_rise >= inner_horizon)
-            horizon = torch.maximum(ring_rise, inner_horizon)
+            visible.append(ring_gradient >= inner_horizon)
+            horizon = torch.maximum(ring_gradient, inner_horizon)
         return torch.cat(visible, 1)
 
 
@@ -202,20 +205,20 @@ def _rings(n_rings: int, device: torch.device) -> _Rings:
     steps = torch.arange(-n_rings, n_rings + 1)
     offsets = torch.meshgrid(steps, steps, indexing="ij")
     row, column = (values.flatten() for values in offsets)
-    number = torch.maximum(row.abs(), column.abs())
+    ring_number = torch.maximum(row.abs(), column.abs())
     # A stable sort by ring keeps the order of rows and columns within each ring.
-    order = number.argsort(stable=True)
+    order = ring_number.argsort(stable=True)
     row = row[order]
     column = column[order]
-    number = number[order]
-    ring_start = (2 * number - 1).clamp(min=0) ** 2
+    ring_number = ring_number[order]
+    ring_start = (2 * ring_number - 1).clamp(min=0) ** 2
     index_in_ring = torch.empty(len(steps), len(steps), dtype=torch.int64)
     index = torch.arange(len(order)) - ring_start
     index_in_ring[row + n_rings, column + n_rings] = index
-    # The ray crosses the next inner ring at the fraction (number − 1) / number, where
-    # one of its two coordinates is an integer.
-    scaled = torch.stack((row, column)) * (number - 1)
-    divisor = number.clamp(min=1)
+    # The ray crosses ring n − 1 at the fraction (n − 1) / n of the way to a cell of
+    # ring n. One of the two coordinates of that point is an integer.
+    scaled = torch.stack((row, column)) * (ring_number - 1)
+    divisor = ring_number.clamp(min=1)
     lower = scaled.div(divisor, rounding_mode="floor")
     remainder = scaled % divisor
     upper = lower + (remainder > 0)
@@ -223,8 +226,8 @@ def _rings(n_rings: int, device: torch.device) -> _Rings:
     rings = _Rings(
         row=row,
         column=column,
-        number=number,
-        inner=torch.stack(inner_cells, 1),
+        ring_number=ring_number,
+        inner_cells=torch.stack(inner_cells, 1),
         fraction=remainder.sum(0) / divisor.double(),
     )
     return rings.to(device)

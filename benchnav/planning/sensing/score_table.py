@@ -1,8 +1,8 @@
-"""Tables of λ by normal score: fast distributions of cells after conditioning.
+"""Tables of normal scores by λ: fast distributions of cells after conditioning.
 
-A row belongs to one cell and contains the normal scores of `VALUES` under the cell's
-prediction. From them follows P(λ ≤ value) for a posterior of the score. Rows are
-computed only for requested cells, and are cached.
+A row of a table belongs to one cell and contains the normal scores of `VALUES` under
+the cell's prediction. With a posterior of the score, P(λ ≤ value) follows from these.
+Rows are computed only for requested cells, and are cached.
 Letters in shapes: B episodes, H×W cells, *B any leading dimensions, K values of λ, R
 rows, N cells.
 """
@@ -23,19 +23,19 @@ VALUES: tuple[float, ...] = (
     *(round(0.2 + 0.02 * step, 2) for step in range(41)),
 )
 """Values of λ between which a belief's CDF is linear, denser in the lower tail."""
-_MAX_SCORE = 9.0  # float64 cannot distinguish ranks beyond it
+_MAX_SCORE = 9.0  # beyond it, Φ equals 1 in float64
 _MIN_STD = 1e-9
-_CHUNK_SIZE = 512  # cells, so that intermediate results fit the CPU cache
+_CHUNK_SIZE = 512  # in cells; intermediate results then fit the CPU cache
 
 
 @dataclass(frozen=True)
 class TabulatedDistribution(TraversabilityDistribution):
-    """Distribution of λ by its CDF at `VALUES`, linear in between.
+    """Distribution of λ whose CDF is given at `VALUES` and linear between them.
 
-    Atoms are only at 0 and 1.
+    It may have atoms at 0 and 1 only.
 
     Args:
-        below: P(λ ≤ value), and at 1 P(λ < 1), shape [*B, K, H, W].
+        below: P(λ ≤ value) at each of `VALUES`, but P(λ < 1) at 1, shape [*B, K, H, W].
     """
 
     below: Tensor
@@ -51,21 +51,23 @@ class TabulatedDistribution(TraversabilityDistribution):
 
     def cdf_limits(self, value: Tensor | float) -> tuple[Tensor, Tensor]:
         """Return P(λ < value) and P(λ ≤ value), each of shape [*B, H, W]."""
-        at = torch.as_tensor(value, dtype=self.dtype, device=self.device)
+        requested = torch.as_tensor(value, dtype=self.dtype, device=self.device)
         values = self._values()
-        upper = torch.searchsorted(values, at.contiguous()).clamp(1, len(VALUES) - 1)
+        upper = torch.searchsorted(values, requested.contiguous()).clamp(
+            1, len(VALUES) - 1
+        )
         lower = upper - 1
         low = values[lower]
         high = values[upper]
-        fraction = ((at - low) / (high - low)).clamp(0, 1)
+        fraction = ((requested - low) / (high - low)).clamp(0, 1)
         inside = torch.lerp(self._below_at(lower), self._below_at(upper), fraction)
-        strictly_below = torch.where(at <= 0, 0.0, inside)
-        at_most = torch.where(at < 1, inside, 1.0)
-        at_most = torch.where(at < 0, 0.0, at_most)
+        strictly_below = torch.where(requested <= 0, 0.0, inside)
+        at_most = torch.where(requested < 1, inside, 1.0)
+        at_most = torch.where(requested < 0, 0.0, at_most)
         return strictly_below, at_most
 
     def _below_at(self, index: Tensor) -> Tensor:
-        """Return `below` at an index of `VALUES` in each cell, shape [*B, H, W]."""
+        """Return `below` in each cell at that cell's index of `VALUES`, [*B, H, W]."""
         cell_index = index.expand(self.shape).unsqueeze(-3)
         return self.below.gather(-3, cell_index).squeeze(-3)
 
@@ -83,7 +85,7 @@ class TabulatedDistribution(TraversabilityDistribution):
     def cvar(self, level: float) -> Tensor:
         """Return the mean of λ over its worst 1 − level fraction, shape [*B, H, W].
 
-        For p = 1 − level it is 1/p ∫₀¹ max(p − F, 0).
+        With p = 1 − level and the CDF F, it is 1/p ∫₀¹ max(p − F(λ), 0) dλ.
         """
         tail = tail_of(level)
         below = self.below.movedim(-3, -1)
@@ -92,9 +94,9 @@ class TabulatedDistribution(TraversabilityDistribution):
         low = remaining[..., :-1]
         high = remaining[..., 1:]
         mean_remaining = (low + high) / 2
-        if tail == 1:  # F does not exceed it
+        if tail == 1:  # F never exceeds p
             return (mean_remaining @ step).clamp(max=1)
-        # Only the part of an interval up to the crossing of F and p counts.
+        # In the interval in which F crosses p, only the part below p counts.
         rise = below.diff(dim=-1).clamp(min=1e-30)
         is_before = high > 0
         fraction = low / torch.where(is_before, 1.0, rise)
@@ -105,7 +107,7 @@ class TabulatedDistribution(TraversabilityDistribution):
     def expected_time(self, floor: float) -> Tensor:
         """Return E[1 / max(λ, floor)], shape [*B, H, W].
 
-        It is 1 + ∫ F / λ² from the floor to 1.
+        With the CDF F, it is 1 + ∫ F(λ) / λ² dλ from the floor to 1.
         """
         check_floor(floor)
         low = np.array(VALUES[:-1])
@@ -131,7 +133,7 @@ class TabulatedDistribution(TraversabilityDistribution):
         high = values[1:].clamp(min=floor)
         slope = below.diff(dim=-1) / values.diff()
         below_low = below[..., :-1]
-        # The CDF of the tail is linear up to the crossing of F and p, and 1 above it.
+        # The CDF of the tail is F/p up to the λ at which F = p, and 1 above it.
         remaining = (tail - below_low).clamp(min=0)
         crossing = low + remaining / slope.clamp(min=1e-30)
         split = torch.minimum(crossing.clamp(min=floor), high)
@@ -147,13 +149,14 @@ class TabulatedDistribution(TraversabilityDistribution):
 
 
 def value_at(rows: Tensor, levels: Tensor) -> Tensor:
-    """Return λ at which a function that increases with λ reaches levels.
+    """Return the λ at which increasing functions of λ reach given levels.
 
-    It is 0 for levels below the first value of a row and 1 for levels above the last.
+    The result is 0 for levels below the first value of a row and 1 for levels above the
+    last.
 
     Args:
-        rows: the function of each cell at `VALUES`, shape [*B, K].
-        levels: levels, shape [*B, N].
+        rows: each cell's function at `VALUES`, shape [*B, K].
+        levels: N levels for each cell, shape [*B, N].
 
     Returns:
         λ, shape [*B, N].
@@ -173,9 +176,13 @@ def value_at(rows: Tensor, levels: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class _Rows:
-    """Scores of `VALUES`, float32, shape [R, K].
+    """Rows of a table.
 
-    The rows of all episodes are stored together, so that `select` does not copy them.
+    The rows of all episodes are stored together, so that `Batch.select` does not copy
+    them.
+
+    Args:
+        scores: scores of `VALUES`, float32, shape [R, K].
     """
 
     scores: Tensor
@@ -183,10 +190,10 @@ class _Rows:
 
 @dataclass(frozen=True)
 class ScoreTable(Batch):
-    """Scores of `VALUES` of the requested cells.
+    """Table with a row of scores for each cell that was requested so far.
 
     Args:
-        row_index: row of each cell, −1 if it has none, int64, shape [B, H, W].
+        row_index: index of each cell's row; −1 without a row, int64, shape [B, H, W].
         rows: rows of all episodes.
     """
 
@@ -201,7 +208,7 @@ class ScoreTable(Batch):
         return cls(row_index, _Rows(scores_of(no_cells)))
 
     def put(self, members: Tensor, others: "ScoreTable") -> "ScoreTable":
-        """Replace episodes; see `Batch`."""
+        """Return the table with some episodes replaced; see `Batch.put`."""
         offset = len(self.rows.scores)
         has_row = others.row_index >= 0
         new_index = torch.where(has_row, others.row_index + offset, -1)
@@ -209,11 +216,13 @@ class ScoreTable(Batch):
         rows = torch.cat((self.rows.scores, others.rows.scores))
         return ScoreTable(row_index, _Rows(rows))
 
-    def without(self, cells: Tensor) -> "ScoreTable":
-        """Return the table without the rows of some cells, bool, [B, H, W]."""
+    def without_rows(self, cells: Tensor) -> "ScoreTable":
+        """Return the table without the rows of the cells of a mask, bool, [B, H, W]."""
         return replace(self, row_index=self.row_index.masked_fill(cells, -1))
 
-    def having(self, prior: TraversabilityDistribution, cells: Tensor) -> "ScoreTable":
+    def with_rows(
+        self, prior: TraversabilityDistribution, cells: Tensor
+    ) -> "ScoreTable":
         """Return the table with a row for each requested cell.
 
         Args:
@@ -235,13 +244,13 @@ class ScoreTable(Batch):
         return ScoreTable(row_index, _Rows(rows))
 
     def below(self, cells: Tensor, mean: Tensor, std: Tensor, skew: Tensor) -> Tensor:
-        """Return P(λ ≤ value) of cells at `VALUES`, shape [N, K]; P(λ < 1) at 1.
+        """Return P(λ ≤ value) at each of `VALUES`, but P(λ < 1) at 1, shape [N, K].
 
         Args:
-            cells: mask of the cells, bool, shape [B, H, W]; each has a row.
-            mean: posterior mean of their scores, shape [N].
-            std: posterior standard deviation of their scores, shape [N].
-            skew: posterior skewness of their scores, shape [N].
+            cells: mask of N cells that have rows, bool, shape [B, H, W].
+            mean: posterior mean of the cells' scores, shape [N].
+            std: posterior standard deviation of the scores, shape [N].
+            skew: posterior skewness of the scores, shape [N].
         """
         scores = self.rows.scores[self.row_index[cells]]
         mean = mean.to(scores)
@@ -256,10 +265,13 @@ class ScoreTable(Batch):
 
 
 def scores_of(prior: TraversabilityDistribution) -> Tensor:
-    """Return normal scores of `VALUES` in each cell of a map of one row, [1, R].
+    """Return normal scores of `VALUES` in each cell of a map of one row.
 
-    An atom at 0 or 1 has an interval of scores; its end towards the other values is
-    returned.
+    The score of λ at an atom is an interval: its lower end is returned for λ = 1, and
+    its upper end for all other λ.
+
+    Args:
+        prior: the prediction, shape [1, R].
 
     Returns:
         Scores, float32, shape [R, K].
@@ -272,7 +284,7 @@ def scores_of(prior: TraversabilityDistribution) -> Tensor:
 
 
 def _scores_of(prior: TraversabilityDistribution, start: int, end: int) -> Tensor:
-    """Return the scores of a chunk of cells, all values at once."""
+    """Return the scores of `VALUES` in the cells from `start` to `end` (exclusive)."""
     n_values = len(VALUES)
 
     def repeat(parameter: Tensor) -> Tensor:

@@ -1,9 +1,9 @@
 """Sensors of appearance and of λ, and the input of a planner at each step.
 
 A sensor receives the truth and returns a measurement of it: the appearance of cells
-(kind `sensor`) or their λ (kind `ground`). Its noise is keyed by episode, cell and
-step, so that all planners and beliefs have common random numbers. Every robot has the
-sensor `contact`, which measures λ of the cell under it.
+(kind `sensor`) or their λ (kind `ground`). Its noise is a function of episode, cell and
+step, so that all planners and beliefs have common random numbers. By default, a robot
+has the sensor `contact`, which measures λ of the cell under it.
 Letters in shapes: B episodes, S state dimensions, H×W cells, N sensed cells.
 """
 
@@ -22,7 +22,8 @@ from benchnav.core.errors import expect
 from benchnav.core.specified import Specified
 from benchnav.core.terrain import Observation, Terrain
 
-MIN_STD = 1e-3  # of noise, in normal scores: keeps the equations of a belief solvable
+MIN_STD = 1e-3
+"""Minimum standard deviation of noise in normal scores, for which beliefs are solvable."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,8 +35,8 @@ class Step(Batch):
         traversability: λ observed under the robot in the last step; NaN in the first
             step, shape [B].
         time_s: time since the start of the episodes, in seconds.
-        draw: whether the plan will be drawn. If False, a planner may omit the layers of
-            its `Plan`.
+        draw: whether the plan will be shown in a figure. If False, a planner may omit
+            the layers of its `Plan`.
     """
 
     state: Tensor
@@ -50,10 +51,11 @@ class Appearance(Batch):
 
     Args:
         seen: mask of observed cells, bool, shape [B, H, W].
-        observation: colour, elevation and layers of the observed cells. All other cells
-            and the slopes are ignored; slopes are computed from observed elevation.
-        noise_level: observation noise of each cell, in any unit, shape [B, H, W]. The
-            memory keeps the least noisy observation of a cell.
+        observation: colour, elevation and layers of the observed cells. Values of other
+            cells are ignored. Slopes are ignored too, since they are computed from the
+            observed elevation.
+        noise_level: noise of each cell's observation, in any unit, shape [B, H, W]. The
+            memory keeps the observation of lowest noise level.
     """
 
     seen: Tensor
@@ -66,10 +68,10 @@ class Measurement(Batch):
     """Measurement of a sensor in a step.
 
     Args:
-        traversability: λ of the sensed cells, NaN in all others, shape [B, H, W].
-        std: standard deviation of the noise in normal scores, at least `MIN_STD`,
-            shape [B, H, W]; ignored for cells that are not sensed.
-        appearance: appearance of cells; None from a sensor of λ only.
+        traversability: measured λ; NaN in cells that are not measured, shape [B, H, W].
+        std: standard deviation of the noise in normal scores, at least `MIN_STD`, shape
+            [B, H, W]; ignored in cells that are not measured.
+        appearance: appearance of cells; None if the sensor measures only λ.
     """
 
     traversability: Tensor
@@ -88,7 +90,7 @@ class Measurement(Batch):
 
     @property
     def mask(self) -> Tensor:
-        """Mask of cells whose λ is sensed, bool, shape [B, H, W]."""
+        """Mask of cells whose λ is measured, bool, shape [B, H, W]."""
         return ~self.traversability.isnan()
 
 
@@ -97,8 +99,8 @@ class NoiseKey:
     """Key of a sensor's noise: common random numbers for all planners and beliefs.
 
     Args:
-        keys: a stream key for each of B episodes.
-        step: number of steps taken, one for all episodes or one for each.
+        keys: stream key of each episode, length B.
+        step: number of steps taken so far: one integer for all episodes, or B integers.
     """
 
     keys: Sequence[int]
@@ -110,22 +112,24 @@ class NoiseKey:
         The numbers of a cell do not depend on the other cells of the mask.
 
         Args:
-            name: name of the stream, for a sensor that draws more than once.
-            cells: mask of cells, bool, shape [B, H, W].
-            shape: shape of the draw of a cell; drawing four numbers is hardly slower
-                than drawing one.
+            name: name of the stream. If a sensor draws more than once in a step, each
+                draw needs its own name.
+            cells: mask of N cells, bool, shape [B, H, W].
+            shape: shape of the numbers of each cell; up to four numbers take about the
+                time of one.
 
         Returns:
-            Float64, in the order of `cells.nonzero()`, shape [N, *shape].
+            Standard normals, float64, in the order of `cells.nonzero()`, shape
+            [N, *shape].
         """
         indices = cells.flatten(1).nonzero().cpu().numpy()
-        member, cell = indices.T
+        episode, cell = indices.T
         steps = np.broadcast_to(np.array(self.step), len(self.keys))
         keys = [rng.stream_key(key, name) for key in self.keys]
         n_cells = cells[0].numel()
-        counters = steps[member] * n_cells + cell
+        counters = steps[episode] * n_cells + cell
         per_cell = int(np.prod(shape, dtype=int))
-        normals = rng.normal_of_each(keys, member, counters, per_cell)
+        normals = rng.normal_of_each(keys, episode, counters, per_cell)
         draws = normals.reshape(-1, *shape)
         return torch.from_numpy(draws).to(cells.device)
 
@@ -134,8 +138,8 @@ class Sensor(Specified, ABC):
     """Base class of sensors: parts of kind `sensor` (appearance) and `ground` (λ).
 
     Attributes:
-        sees_all: whether the sensor shows the whole map at the start. If True, `sense`
-            is not called during the episode.
+        sees_all: whether the sensor observes the whole map before the episode starts.
+            If True, `sense` is not called during the episode.
     """
 
     sees_all: ClassVar[bool] = False
@@ -147,14 +151,14 @@ class Sensor(Specified, ABC):
         """Return a measurement of the terrain.
 
         Args:
-            terrain: the true maps, B of them.
+            terrain: the B true maps.
             field: current λ of all cells, shape [B, H, W].
             robot_state: robot states that begin with (x, y, θ), shape [B, S].
             noise_key: key of the noise of this step.
 
         Returns:
-            The measurement. It may depend only on the truth of cells that it reports;
-            `check_sensor` tests this by changing all others.
+            The measurement. It may depend only on the truth of the cells that it
+            contains; `check_sensor` tests this by changing the truth of other cells.
         """
 
 
@@ -179,7 +183,7 @@ class Full(Sensor):
 
 @dataclass(frozen=True)
 class Contact(Sensor):
-    """Sensor of λ under the robot, without noise; every robot has it."""
+    """Sensor of λ under the robot, without noise; the default sensor of λ."""
 
     def sense(
         self, terrain: Terrain, field: Tensor, robot_state: Tensor, noise_key: NoiseKey
@@ -190,21 +194,21 @@ class Contact(Sensor):
         row, column = terrain.grid.cell_of(x, y)
         values = torch.full_like(field, torch.nan)
         on_map = terrain.grid.contains(x, y)
-        member = torch.arange(len(field), device=field.device)[on_map]
-        row = row[member]
-        column = column[member]
-        values[member, row, column] = field[member, row, column]
+        episode = torch.arange(len(field), device=field.device)[on_map]
+        row = row[episode]
+        column = column[episode]
+        values[episode, row, column] = field[episode, row, column]
         return Measurement(traversability=values, std=torch.full_like(field, MIN_STD))
 
 
 @dataclass(frozen=True)
 class Probe(Sensor):
-    """Sensor of λ of all cells with centres near the robot, with noise.
+    """Sensor of λ of all cells whose centre is near the robot, with noise.
 
     Noise is added to the normal score of a cell's λ. Hence a measurement lies in
-    [0, 1], and terrain with λ near an atom at 0 or 1 can be mistaken for the atom. The
-    atom itself is reported without noise, since its score is known only as an interval.
-    A score drawn from that interval would mislead beliefs about neighbouring cells.
+    [0, 1], and λ near an atom at 0 or 1 can be measured as 0 or 1. λ at an atom is
+    measured without noise, since the atom's score is an interval. A score drawn from
+    that interval would mislead beliefs about neighbouring cells.
 
     Args:
         radius_m: maximum distance from the robot to a cell centre, in metres.
@@ -218,12 +222,12 @@ class Probe(Sensor):
         """Validate the radius and the noise."""
         expect(
             0 < self.radius_m < float("inf"),
-            f"`radius_m` of the ground probe > 0 and finite, got {self.radius_m}.",
+            f"`radius_m` of sensor 'probe' > 0 and finite, got {self.radius_m}.",
         )
         expect(
             MIN_STD <= self.noise_std < float("inf"),
-            f"`noise_std` of the ground probe of at least {MIN_STD:g} and finite, "
-            f"got {self.noise_std}.",
+            f"`noise_std` of sensor 'probe' ≥ {MIN_STD:g} and finite, got "
+            f"{self.noise_std}.",
         )
 
     def sense(
@@ -232,16 +236,16 @@ class Probe(Sensor):
         """Return noisy λ of the cells near the robot."""
         in_range = self._in_range(terrain, robot_state)
         cells = in_range.nonzero(as_tuple=True)
-        truth = terrain.truth.at(in_range)
+        true_distribution = terrain.truth.at(in_range)
         value = field[cells]
-        interval = truth.to_normal(value[None])
+        interval = true_distribution.to_normal(value[None])
         lower, upper = (ends[0].double() for ends in interval)
         # An atom has no single score to which noise could be added.
         is_atom = upper > lower
         noise = noise_key.normal("noise", in_range)
         score = lower.masked_fill(is_atom, 0.0) + self.noise_std * noise
         noisy_score = score[None].to(value.dtype)
-        noisy = truth.from_normal(noisy_score)[0].to(field.dtype)
+        noisy = true_distribution.from_normal(noisy_score)[0].to(field.dtype)
         values = torch.full_like(field, torch.nan)
         values[cells] = torch.where(is_atom, value, noisy)
         std = torch.full_like(field, self.noise_std)
@@ -259,8 +263,7 @@ class Probe(Sensor):
         in_columns = dx.abs() <= self.radius_m
         in_rows = dy.abs() <= self.radius_m
         in_square = in_columns & in_rows
-        # Distances are computed only for the few cells that may be near. For all cells
-        # they would take as long as all other steps of a measurement.
-        member, row, column = in_square.nonzero(as_tuple=True)
-        distance = torch.hypot(dx[member, 0, column], dy[member, row, 0])
-        return in_square.index_put((member, row, column), distance <= self.radius_m)
+        # Distances of all cells would take as long as the rest of a measurement.
+        episode, row, column = in_square.nonzero(as_tuple=True)
+        distance = torch.hypot(dx[episode, 0, column], dy[episode, row, 0])
+        return in_square.index_put((episode, row, column), distance <= self.radius_m)

@@ -1,6 +1,6 @@
-"""Moments of truncated normals, also far out in a tail.
+"""Moments of truncated normals, accurate also far out in a tail.
 
-In NumPy and float64; all arrays have the shape [N] of the intervals.
+All arrays are NumPy arrays of float64 and shape [N]: one value per interval.
 """
 
 import math
@@ -10,7 +10,7 @@ from numpy import ndarray
 from scipy.special import log_ndtr
 
 MIN_FRACTION = 1e-9
-"""Minimum fraction of the variance that remains in an interval."""
+"""Minimum ratio of the variance after truncation to the variance before."""
 
 
 @np.errstate(over="ignore")
@@ -20,9 +20,9 @@ def interval_moments(
     """Return mean and variance of truncated normals.
 
     Args:
-        mean: mean before truncation, float64.
+        mean: mean before truncation.
         variance: variance before truncation, > 0.
-        lower: lower bound, −∞ if unbounded.
+        lower: lower bound; −∞ if unbounded.
         upper: upper bound, above `lower`; ∞ if unbounded.
     """
     low, high, log_mass, flipped = standardise(mean, variance, lower, upper)
@@ -43,7 +43,7 @@ def interval_moments(
 def third_cumulant(
     mean: ndarray, variance: ndarray, lower: ndarray, upper: ndarray
 ) -> ndarray:
-    """Return the third cumulant of truncated normals."""
+    """Return the third cumulant of truncated normals; see `interval_moments`."""
     low, high, log_mass, flipped = standardise(mean, variance, lower, upper)
     at_low = _density(low, log_mass)
     at_high = _density(high, log_mass)
@@ -55,7 +55,8 @@ def third_cumulant(
     low_third = (low**2 + 2) * at_low
     high_third = (high**2 + 2) * at_high
     third = low_third - high_third
-    # Far out in a tail all digits cancel. The limit is an exponential distribution.
+    # Far out in a tail all digits cancel. There the distribution tends to an
+    # exponential one, whose third cumulant is 2 σ³.
     bound = 2 * (second - first**2).clip(0) ** 1.5
     cumulant = third - 3 * first * second + 2 * first**3
     cumulant = cumulant.clip(-bound, bound)
@@ -66,9 +67,19 @@ def third_cumulant(
 def standardise(
     mean: ndarray, variance: ndarray, lower: ndarray, upper: ndarray
 ) -> tuple[ndarray, ndarray, ndarray, ndarray]:
-    """Return an interval in standard deviations, its log probability, and a flip mask.
+    """Return intervals in standard deviations from the mean, and their probability.
 
-    Flipped intervals are mirrored to the lower tail, where Φ loses no digits.
+    Intervals in the upper tail are mirrored to the lower tail, where Φ loses no digits.
+
+    Args:
+        mean: mean before truncation.
+        variance: variance before truncation, > 0.
+        lower: lower bound; −∞ if unbounded.
+        upper: upper bound, above `lower`; ∞ if unbounded.
+
+    Returns:
+        Lower bounds, upper bounds, log probabilities of the intervals, and a mask of
+        mirrored intervals (bool).
     """
     std = np.sqrt(variance)
     low = (lower - mean) / std
@@ -83,12 +94,12 @@ def standardise(
 
 
 def _finite(ends: ndarray) -> ndarray:
-    """Replace infinite ends of intervals by 0."""
+    """Replace infinite ends of intervals by 0: their terms vanish."""
     return np.where(np.isinf(ends), 0.0, ends)
 
 
 def _density(z: ndarray, log_mass: ndarray) -> ndarray:
-    """Return φ(z) divided by the probability of the interval."""
+    """Return φ(z) divided by the probability of the interval; 0 for infinite z."""
     half_log_tau = 0.5 * math.log(2 * math.pi)
     log_density = -0.5 * np.square(z) - half_log_tau
     return np.exp(log_density - log_mass)

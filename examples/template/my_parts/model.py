@@ -7,7 +7,7 @@ from benchnav.models import TraversabilityModel
 
 
 class SlopeModel(TraversabilityModel):
-    """Model in which λ falls linearly with the slope, whatever the image shows.
+    """Model in which λ falls linearly with the slope; the image is ignored.
 
     Args:
         fall: decrease of λ per degree of slope.
@@ -18,7 +18,7 @@ class SlopeModel(TraversabilityModel):
         self.fall, self.std = fall, std
 
     def predict(self, observation: Observation) -> TraversabilityMixture:
-        """Return one Gaussian per cell, clipped to [0, 1], parameters [B, K = 1, H, W]."""
+        """Return a Gaussian per cell, clipped to [0, 1]; parameters are [B, 1, H, W]."""
         mean = (1 - self.fall * observation.slope_deg).unsqueeze(1)
         return TraversabilityMixture(
             torch.ones_like(mean), mean, torch.full_like(mean, self.std)

@@ -441,7 +441,7 @@ def test_an_own_part_that_fails_ends_its_episodes_with_its_name(
         ),
         (
             ("--grounds", "['probe:-1']", "--beliefs", "[copula]"),
-            "`radius_m` of the ground probe > 0",
+            "`radius_m` of sensor 'probe' > 0",
         ),
         (("--grounds", "['probe:-1']"), "`radius_m`"),  # which `static` does not ask
         (

@@ -13,7 +13,7 @@ from benchnav.datagen.files.stored_terrain import terrain_of
 from benchnav.datagen.recipe.load import load_recipe
 from benchnav.datagen.synth import elevation
 from benchnav.datagen.synth.generate import generate
-from benchnav.planning.sensing.appearance import Memory, masked, remember
+from benchnav.planning.sensing.appearance import Memory, model_input, remember
 from benchnav.planning.sensing.near import Near
 from benchnav.planning.sensing.sensor import Appearance, Full, NoiseKey
 
@@ -52,7 +52,7 @@ def test_what_was_all_seen_without_noise_is_the_observation_bit_for_bit(
         terrain, terrain.traversability, states, NoiseKey((1, 2, 3), 0)
     )
     assert sensed.appearance is not None
-    known = masked(remember(Memory.none(terrain), sensed.appearance), MEANS)
+    known = model_input(remember(Memory.empty(terrain), sensed.appearance), MEANS)
     truth = terrain.observe()
     for name in ("rgb", "elevation_m", "slope_deg"):
         assert torch.equal(getattr(known, name), getattr(truth, name))
@@ -67,14 +67,14 @@ def test_a_clear_look_near_the_robot_is_the_observation_there() -> None:
     terrain = terrain_from("vegetation-v1")
     near = Near(range_m=4.0, colour_noise=0, elevation_noise=0)
     states = torch.tensor([[9.0, 9.0, 0.0], [1.0, 9.0, 0.0], [0.3, 0.2, 0.0]])
-    memory = Memory.none(terrain)
+    memory = Memory.empty(terrain)
     for step in range(3):
         looked = near.sense(
             terrain, terrain.traversability, states + step, NoiseKey((1, 2, 3), step)
         ).appearance
         assert looked is not None
         memory = remember(memory, looked)
-    known, truth, seen = masked(memory, MEANS), terrain.observe(), memory.seen
+    known, truth, seen = model_input(memory, MEANS), terrain.observe(), memory.seen
     assert 0.01 < seen.double().mean() < 0.5
     assert torch.equal(known.layers["seen"], seen.float())
     assert torch.equal(known.rgb.movedim(1, -1)[seen], truth.rgb.movedim(1, -1)[seen])
@@ -103,7 +103,7 @@ def test_where_nothing_was_seen_are_the_training_means(seed: int, share: float) 
         noise_level=ground,
         grid=grid,
     )
-    known = masked(memory, MEANS)
+    known = model_input(memory, MEANS)
     # halves go to the even number
     expected = torch.tensor([10, 100, 200], dtype=torch.uint8)
     assert (known.rgb.movedim(1, -1)[~seen] == expected).all()
@@ -149,7 +149,7 @@ def test_of_two_looks_the_one_with_less_doubt_is_kept_and_of_equal_ones_the_earl
             noise_level=torch.full(shape, noise_level),
         )
 
-    memory = before = Memory.none(terrain)
+    memory = before = Memory.empty(terrain)
     for value, cells, noise_level in (
         (1, slice(0, 4), 2.0),
         (2, slice(2, 6), 1.0),
@@ -173,14 +173,14 @@ def test_memories_are_of_their_own_episodes() -> None:
     seen = torch.zeros_like(terrain.elevation_m, dtype=torch.bool)
     for own in range(3):
         seen[own, : 4 * own + 4] = True
-    memory = remember(Memory.none(terrain), appearance_of(terrain, seen, 1.0))
+    memory = remember(Memory.empty(terrain), appearance_of(terrain, seen, 1.0))
     order = torch.tensor([2, 0])
     alone = remember(
-        Memory.none(terrain.select(order)),
+        Memory.empty(terrain.select(order)),
         appearance_of(terrain.select(order), seen[order], 1.0),
     )
-    some, same = masked(memory.select(order), MEANS), masked(alone, MEANS)
+    some, same = model_input(memory.select(order), MEANS), model_input(alone, MEANS)
     for name in ("rgb", "elevation_m", "slope_deg"):
         assert torch.equal(getattr(some, name), getattr(same, name))
     kept = replace(memory, seen=torch.zeros_like(seen))
-    assert (masked(kept, MEANS).slope_deg == 12.5).all()
+    assert (model_input(kept, MEANS).slope_deg == 12.5).all()

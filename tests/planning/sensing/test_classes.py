@@ -87,7 +87,7 @@ def test_cells_for_themselves_follow_bayes_rule() -> None:
     covariance = covariance_of(12, 14, 0.0, 0.0)
     values = {(3, 3): 0.62, (4, 4): 0.3, (5, 5): 0.0, (3, 10): 0.8, (4, 10): 1.0}
     state = after(Classes(), prior, covariance, looked((2, 12, 14), values, std=1e-3))
-    wanted = state.odds.clone()
+    wanted = state.log_odds.clone()
     for (row, column), value in values.items():
         likely = [
             look.prior.log_prob(torch.full(prior.shape, value).double())[:, row, column]
@@ -112,7 +112,7 @@ def test_further_looks_at_a_cell_count_with_their_own_noise() -> None:
         for value, std in zip(values, stds, strict=True)
     ]
     state = after(Classes(), prior, covariance, *looks)
-    log_odds = float(state.odds[0, 3, 3])
+    log_odds = float(state.log_odds[0, 3, 3])
     for sign, look in zip((1, -1), state.per_class, strict=True):
         own = [torch.full(prior.shape, value).double() for value in values]
         scores = np.array(
@@ -209,7 +209,7 @@ def test_an_update_changes_nothing_that_it_was_given() -> None:
     state = after(Classes(), mixed(2, 12, 14), covariance_of(12, 14), LOOKS[0])
     kept = state.clone()
     Classes().update(state, LOOKS[1], mixed(2, 12, 14, seed=2))
-    for name in ("p_first", "labels", "density", "sweeps", "odds"):
+    for name in ("p_first", "labels", "density", "sweeps", "log_odds"):
         assert torch.equal(getattr(state, name), getattr(kept, name))
     assert torch.equal(state.copula.mean, kept.copula.mean)
 
@@ -289,7 +289,7 @@ def test_of_a_new_prediction_the_cells_count_that_are_others() -> None:
         first, looked((2, 12, 14), {}), prior.replaced(anew, even(2, 12, 14))
     )
     assert torch.equal(state.pair, torch.where(anew, 1, first.pair))
-    assert torch.equal(state.odds, torch.where(anew, 0.0, first.odds))
+    assert torch.equal(state.log_odds, torch.where(anew, 0.0, first.log_odds))
     # In the other episode, and of seen ground far from λ that was scored anew, all is
     # as it was.
     for name in ("labels", "p_first", "density"):

@@ -630,7 +630,7 @@ def test_another_prediction_of_some_cells_is_conditioned_on_the_same_λ(
         looked({(10, 12): 0.4, (4, 4): 0.45}, 0.1, 2),
     ]
     state = after(Copula(), prior, *looks)
-    state = replace(state, table=state.table.having(prior, torch.ones_like(anew)))
+    state = replace(state, table=state.table.with_rows(prior, torch.ones_like(anew)))
     found, wanted = (
         Copula().update(state, looked({}, batch=2), other),
         after(Copula(), other, *looks),

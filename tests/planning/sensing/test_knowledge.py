@@ -22,8 +22,8 @@ from benchnav.planning.sensing.knowledge import (
     Knowledge,
     KnowledgeError,
     Truth,
-    nothing_sensed,
-    unseen_ground,
+    no_measurement,
+    prior_of_unobserved,
 )
 from benchnav.planning.sensing.learner import Learner
 from benchnav.planning.sensing.near import Near
@@ -205,7 +205,7 @@ def test_privileged_models_tell_of_seen_ground_alone() -> None:
 @pytest.mark.parametrize("unseen", ["prior", "optimistic", "pessimistic"])
 def test_unseen_ground_is_believed_to_be_what_the_rules_say(unseen: str) -> None:
     like = torch.zeros(2, 4, 5)
-    found = unseen_ground(STATISTICS, unseen, like.shape, like)
+    found = prior_of_unobserved(STATISTICS, unseen, like.shape, like)
     assert found.shape == (2, 4, 5)
     assert found.dtype == like.dtype
     prior = STATISTICS.mixture(like.shape, like)
@@ -327,7 +327,7 @@ def test_sensors_are_asked_when_it_is_due_and_where_robots_are(belief: Any) -> N
     looked = how.sense(known, TRUTH, START + 2, 1, two, torch.ones_like(two))
     assert asked == ["Near", *ground, "Near", *ground]
     more = (looked.seen & ~known.seen).flatten(1).any(1)
-    assert more.tolist() == two.tolist() == looked.has_news.tolist()
+    assert more.tolist() == two.tolist() == looked.has_new_appearance.tolist()
     wanted = known.seen | near(START + 2) & two[:, None, None]
     assert torch.equal(looked.seen, wanted)
     # In a later step that tells nothing new, all is as it was.
@@ -389,13 +389,13 @@ def test_episodes_are_kept_and_take_the_places_of_others() -> None:
 def test_without_statistics_nothing_is_known_of_unseen_ground() -> None:
     with pytest.raises(
         ConfigError,
-        match=r"`CovarianceModel\.statistics` for a sensor that does not show the whole map, got None",
+        match=r"`CovarianceModel\.statistics`, which a sensor that does not observe the whole map needs, got None",
     ):
         begin(learner(covariance=made.covariance(SIZE, SIZE)))
 
 
 def test_nothing_is_sensed_where_nothing_was() -> None:
-    nothing = nothing_sensed(torch.ones(2, 3, 4))
+    nothing = no_measurement(torch.ones(2, 3, 4))
     assert not nothing.mask.any()
     assert nothing.mask.shape == (2, 3, 4)
 

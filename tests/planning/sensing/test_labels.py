@@ -8,12 +8,12 @@ from torch import Tensor
 
 from benchnav.planning.sensing.labels import (
     CHAINS,
-    Lattice,
+    Couplings,
     connected_to_evidence,
     count_bits,
-    fair,
-    noise,
+    fair_labels,
     packed,
+    sweep_bits,
     sweep_labels,
     unpacked,
 )
@@ -29,7 +29,7 @@ def test_bits_are_packed_counted_and_unpacked() -> None:
     assert torch.equal(count_bits(words), bits.sum(-1))
     whole = torch.tensor([-1, 0])
     assert count_bits(whole).tolist() == [64, 0]
-    assert abs(count_bits(fair(20, 20)).double().mean() - 32) < 1
+    assert abs(count_bits(fair_labels(20, 20)).double().mean() - 32) < 1
 
 
 def enumerated() -> np.ndarray:
@@ -56,23 +56,25 @@ def sampled(members: Tensor, sweeps: int) -> tuple[Tensor, Tensor, Tensor]:
     row, column = torch.broadcast_tensors(
         row + torch.arange(3)[:, None], column + torch.arange(3) + 0 * row
     )
-    lattice = Lattice.of(torch.from_numpy(PAIR).expand(len(members), 3, 3), STRENGTH)
+    couplings = Couplings.of(
+        torch.from_numpy(PAIR).expand(len(members), 3, 3), STRENGTH
+    )
     known = torch.zeros(len(members), 3, 3, dtype=torch.int64)
     known[:, 0, 0] = -1
-    labels, even = fair(SIZE, SIZE)[row, column] | known, -((row + column) % 2)
+    labels, even = fair_labels(SIZE, SIZE)[row, column] | known, -((row + column) % 2)
     shares = clusters = torch.zeros(3, 3, dtype=torch.float64)
     for sweep in range(sweeps):
-        drawn = noise(
+        bits = sweep_bits(
             torch.full_like(members, sweep),
             row,
             column,
-            lattice.degree(),
+            couplings.degree(),
             STRENGTH,
             SIZE,
         )
-        labels = sweep_labels(labels, lattice, ~known, even, drawn)
+        labels = sweep_labels(labels, couplings, ~known, even, bits)
         if sweep >= 10:
-            tied = connected_to_evidence(labels, lattice, known, drawn)
+            tied = connected_to_evidence(labels, couplings, known, bits)
             shares = shares + count_bits(labels).double().mean(0) / CHAINS / (
                 sweeps - 10
             )
