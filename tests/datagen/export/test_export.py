@@ -468,7 +468,7 @@ def test_maps_of_others_are_never_ours(
     assert datagen(*changed) == 0
     for half in (OWN[:2], OWN[2:], ()):
         assert datagen("export", "mine.h5", "--out", "theirs", *half) == 2
-        assert "Expected `license` and `creator`" in capsys.readouterr().err
+        assert "Expected both `license` and `creator`" in capsys.readouterr().err
     assert datagen("export", "mine.h5", "--out", "theirs", *OWN) == 0
     assert datagen("export", own, "--out", "ours") == 0
     ours, theirs = (metadata(Path(name)) for name in ("ours", "theirs"))

@@ -135,7 +135,7 @@ def test_other_code_than_was_recorded_is_rejected(
     recipe = TerrainDataset(folder / "one.h5").recipe
     with pytest.raises(
         ConfigError,
-        match="Expected the code of layer 'wetness' that the dataset records",
+        match="Expected the code of layer 'wetness' to have the digest",
     ):
         generate(recipe, "train", np.arange(1))
     # With the code as it was, the maps are made again, bit for bit.

@@ -267,7 +267,8 @@ def test_synthesis_1_has_no_vegetation() -> None:
         "colour": [40, 90, 20],
     }
     with pytest.raises(
-        ConfigError, match="`synthesis: 2` with `layer vegetation_m`, got 1"
+        ConfigError,
+        match="`synthesis: 2` with `layer vegetation_m`, got `synthesis: 1`",
     ):
         recipe_from_dict(
             tiny_recipe().to_dict() | {"classes": classes, "vegetation_period_m": 4},
