@@ -290,14 +290,14 @@ def test_the_page_on_real_ground_is_right_to_the_letter(
     call("datagen", *words)
     said, _ = capfd.readouterr()
     origin = f"[{WEST:.10g},{SOUTH:.10g}]"
-    begins_there = f"from the south-west corner {origin} on" in said
+    begins_there = f"from the south-west corner {origin} (" in said
     assert begins_there == (cell == 0.8)
     assert set(re.findall(r"--origin '(.*?)'", said)) == (
         set() if begins_there else {origin}
     )
     assert call("datagen", *words, "--origin", origin, "--overwrite") == 0
     said, _ = capfd.readouterr()
-    assert f"from the south-west corner {origin} on" in said
+    assert f"from the south-west corner {origin} (" in said
     dataset = TerrainDataset("datasets/site-v1.h5")
     names = [kind.name for kind in dataset.recipe.classes]
     indices = {1: names.index("gravel"), 2: names.index("scree"), 9: UNLABELLED}

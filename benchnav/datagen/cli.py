@@ -18,7 +18,7 @@ from benchnav.core.store import check_workers, read_shard, replacing, write_text
 from benchnav.core.tables import Table, print_table
 from benchnav.datagen.import_commands import import_dem, import_drives
 
-# A larger dataset is a folder of files.
+# Maximum number of cells of a dataset that is one file by default.
 _MAX_CELLS_PER_FILE = 2**28
 
 
@@ -35,24 +35,24 @@ def create(
     scheduler: str = "",
     overwrite: bool = False,
 ) -> None:
-    """Make a dataset from a recipe.
+    """Create a dataset from a recipe.
 
     Args:
         recipe: Id of a shipped recipe, such as paper-v1, or path of a YAML file.
-        overrides: Changes to it, such as id=mine splits.train.maps=50
+        overrides: Changes to the recipe, such as id=mine splits.train.maps=50
             scenarios.hs.severity=0.5.
-        out: File .h5, or a folder for many files. If empty, datasets/ID.h5, or
-            datasets/ID for many maps.
-        jobs: Number of worker processes on this machine; a cluster has its own. The
-            result does not depend on it.
-        seed: Root seed instead of the recipe's, for other maps of the same classes;
-            their id is ID-seedN.
-        splits: Only these splits, for example [test/std,test/hg]; their maps are the
-            same as in the complete dataset.
-        first: Only the first N maps of each split; 0 for all.
-        shard: Only this shard of the maps, such as 2/5; other machines may make the
-            others.
-        backend: Worker processes on this machine, or those of a Dask cluster.
+        out: Path of the .h5 file to write, or of a folder for many files. If empty,
+            datasets/ID.h5, or datasets/ID for many maps.
+        jobs: Number of worker processes on this machine, unless a Dask cluster is used.
+            The maps do not depend on this number.
+        seed: Root seed that replaces the recipe's, for other maps of the same classes.
+            The dataset's id is then ID-seedN.
+        splits: Splits to create, for example [test/std,test/hg]. Their maps are the
+            same as in the complete dataset. If not given, all.
+        first: Number of maps of each split to create, from the first; 0 for all.
+        shard: Part of the maps to create, such as 2/5 for the second of five parts. If
+            empty, all.
+        backend: local for worker processes on this machine, dask for a Dask cluster.
         scheduler: Address of the Dask cluster's scheduler, tcp://HOST:PORT.
         overwrite: Replace an existing dataset.
     """
@@ -82,13 +82,13 @@ def create(
     steps = datagen.create_dataset(loaded, path, jobs, scheduler, requested, overwrite)
     done, total = next(steps)
     if done:
-        tell(f"{done} of {total} maps exist already")
+        tell(f"{done} of {total} maps already exist")
     show_progress(chain([(done, total)], steps), "maps")
     if not is_dataset(path):
         print(
-            f"{path}: shard {requested} is made\n"
-            "The last shard made in this folder finishes the dataset. Join shards of "
-            "several folders with\n"
+            f"{path}: shard {requested} is complete\n"
+            "The dataset is finished when all shards in this folder are complete. "
+            "Merge shards in several folders with\n"
             f"benchnav-datagen merge {path} OTHER … --out OUT"
         )
         return
@@ -99,7 +99,7 @@ def list_datasets(folder: str = "") -> None:
     """List the shipped recipes and the local datasets.
 
     Args:
-        folder: Folder to search. If empty, all folders in which ids are looked up.
+        folder: Folder to search. If empty, the folders that are searched for ids.
     """
     from benchnav.datagen.files.describe import widest
     from benchnav.datagen.files.find import dataset_folders
@@ -107,7 +107,7 @@ def list_datasets(folder: str = "") -> None:
     from benchnav.datagen.recipe.load import shipped_sizes
 
     is_valid = not folder or Path(folder).is_dir()
-    expect(is_valid, f"`folder` as a folder that exists, got {folder!r}.")
+    expect(is_valid, f"`folder` as an existing folder, got {folder!r}.")
     print("recipes:")
     recipes = datagen.shipped_recipes()
     width = widest(recipes)
@@ -139,7 +139,7 @@ def show(file: str, json: bool = False) -> None:
 
     Args:
         file: Path or id of a dataset.
-        json: Print it as JSON.
+        json: Print the description as JSON.
     """
     from json import dumps
 
@@ -157,7 +157,7 @@ def show(file: str, json: bool = False) -> None:
 
 
 def validate(file: str) -> int:
-    """Check a complete dataset; the exit status is 1 if it has faults.
+    """Check all data of a dataset; the exit status is 1 if the dataset has faults.
 
     Args:
         file: Path or id of a dataset.
@@ -184,13 +184,13 @@ def validate(file: str) -> int:
         remedy = "import its maps again."
     elif files:
         names = " ".join(files)
-        remedy = f"remove {names} in {path} and repeat the command that made it."
+        remedy = f"remove {names} in {path} and run the command that created it again."
     else:
         remedy = (
-            "make the file again with --overwrite. The same recipe and version give "
+            "create the file again with --overwrite. The same recipe and version yield "
             "the same digests."
         )
-    print(f"To repair it, {remedy}")
+    print(f"To repair the dataset, {remedy}")
     return 1
 
 
@@ -198,10 +198,11 @@ def merge(files: list[str], out: str, id: str = "", overwrite: bool = False) -> 
     """Merge datasets of the same grid and classes; splits of the same name are joined.
 
     Args:
-        files: Paths or ids of two or more datasets, or folders with the shards of one.
-        out: File .h5 to write, or a folder for many files.
-        id: Id of the new dataset. If empty, the name of the file, or for shards, the id
-            of their recipe.
+        files: Paths or ids of two or more datasets, or folders with the shards of one
+            dataset.
+        out: Path of the .h5 file to write, or of a folder for many files.
+        id: Id of the new dataset. If empty, the name of the output. Not used for
+            shards, which keep the id of their recipe.
         overwrite: Replace an existing dataset.
     """
     from benchnav.datagen.files.describe import written
@@ -221,19 +222,19 @@ def merge(files: list[str], out: str, id: str = "", overwrite: bool = False) -> 
 def ground(file: str, out: str = "", overwrite: bool = False) -> None:
     """Write terrain statistics over all maps of the split train.
 
-    Beliefs need them for unobserved cells and for look-alike classes.
+    Beliefs use these statistics for unobserved cells and for look-alike classes.
 
     Args:
         file: Path or id of a dataset with a split train.
-        out: File .json to write. If empty, DATASET.ground.json next to the dataset,
-            where models without their own statistics find it.
+        out: Path of the .json file to write. If empty, DATASET.ground.json next to the
+            dataset, where it is found for models without statistics.
         overwrite: Replace an existing file.
     """
     from benchnav.datagen.ground import fit_ground, ground_file
 
     dataset = _opened(file)
     path = Path(out) if out else ground_file(dataset.path)
-    expect(path.suffix == ".json", f"`out` as a file .json, got {out!r}.")
+    expect(path.suffix == ".json", f"`out` to end in .json, got {out!r}.")
     may_write = overwrite or not path.exists()
     expect(
         may_write,
@@ -246,10 +247,13 @@ def ground(file: str, out: str = "", overwrite: bool = False) -> None:
     look_alikes = ""
     if pairs:
         strength = f"{statistics.potts_strength:.2f}"
-        look_alikes = f"; {pairs} look alike, strength of the field {strength}"
+        look_alikes = f"; {pairs} look alike, coupling of neighbours {strength}"
     n_maps = dataset.map_count("train")
     n_gaussians = len(statistics.weights)
-    print(f"wrote {path}: λ of {n_maps} maps by {n_gaussians} Gaussians{look_alikes}")
+    print(
+        f"wrote {path}: λ of {n_maps} maps, a mixture of {n_gaussians} "
+        f"Gaussians{look_alikes}"
+    )
 
 
 def export(
@@ -269,12 +273,12 @@ def export(
     Args:
         file: Path or id of a dataset.
         out: Folder to write.
-        splits: Only these splits, for example [test/std,test/hg].
-        fields: Only these fields, for example [rgb,class_id].
-        maps_per_file: Maximum number of maps of a file; if 0, files have up to a few
+        splits: Splits to export, for example [test/std,test/hg]. If not given, all.
+        fields: Fields to export, for example [rgb,class_id]. If not given, all.
+        maps_per_file: Maximum number of maps in a file; if 0, files have up to a few
             hundred MB.
-        license: Name in the SPDX list, such as CC-BY-4.0, or a URL. If empty, MIT for
-            maps of a shipped recipe.
+        license: Identifier from the SPDX list, such as CC-BY-4.0, or a URL. If empty,
+            MIT for maps of a shipped recipe.
         creator: Creator of the maps. If empty, the BenchNav authors for maps of a
             shipped recipe.
         url: Address at which the dataset will be published.
@@ -291,9 +295,9 @@ def export(
     has_origin = bool(license and creator) or is_ours(dataset, chosen)
     expect(
         has_origin,
-        f"`license` and `creator` of {dataset.id}, whose maps are not of a shipped "
-        "recipe, got none. Pass yours; for imported maps, those of the elevation "
-        "model, its classes and photo.",
+        f"both `license` and `creator` for {dataset.id}, whose maps are not of a "
+        f"shipped recipe, got {license!r} and {creator!r}. Pass your own. For imported "
+        "maps, pass those of the elevation model, classes and photo.",
     )
     license = license or "MIT"
     creator = creator or AUTHORS
@@ -323,9 +327,11 @@ def preview(
 
     Args:
         file: Path or id of a dataset.
-        split: Split to draw. If empty, test/std, or the first if there is no test/std.
+        split: Split to draw. If empty, test/std, or the first split if test/std does
+            not exist.
         maps: Indices of the maps. If not given, [0, 1, 2].
-        out: Image file to write. If empty, preview-SPLIT.png or contact-SPLIT.png.
+        out: Path of the image file to write. If empty, preview-SPLIT.png or
+            contact-SPLIT.png.
         contact_sheet: Draw thumbnails of up to 100 maps of the split instead.
     """
     from benchnav.datagen.preview import contact_sheet_figure, preview_figure
@@ -342,8 +348,11 @@ def preview(
         path.suffix in (".png", ".pdf", ".svg", ".jpg"),
         f"`out` to end in .png, .pdf, .svg or .jpg, got {str(path)!r}.",
     )
-    expect(maps is None or not contact_sheet, "`maps` or `contact-sheet`, got both.")
-    expect(maps is None or maps, "`maps` with at least one index, got none.")
+    expect(
+        maps is None or not contact_sheet,
+        "either `maps` or `contact-sheet`, got both. Leave one out.",
+    )
+    expect(maps is None or maps, "`maps` with at least one index, got [].")
     if contact_sheet:
         figure = contact_sheet_figure(dataset, split)
     else:
@@ -357,7 +366,7 @@ def preview(
 
 
 def _opened(file: str) -> "datagen.TerrainDataset":
-    """Return the dataset of a path or an id."""
+    """Return the dataset with a path or an id."""
     return datagen.TerrainDataset(datagen.find_dataset(file))
 
 
@@ -380,7 +389,7 @@ COMMANDS = {
 def main() -> None:
     """Entry point of `benchnav-datagen`."""
     description = (
-        "Make, list, show, check, combine, import, export and draw terrain datasets."
+        "Create, list, show, check, merge, import, export and draw terrain datasets."
     )
     status = run("benchnav-datagen", description, COMMANDS)
     if status == INTERRUPTED and sys.argv[1] == "create":

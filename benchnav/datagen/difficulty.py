@@ -21,21 +21,21 @@ _HEADINGS = (
     "soft\nspots %",
     "time s,\nmedian",
     "time s,\nrange",
-    "straight\nfree",
+    "straight\nline free",
 )
 _NOTES = (
-    "stuck: true mean λ ≤ λ_stuck. soft ground: classes with soft spots, which no "
-    "colour shows. soft spots: of all.",
-    "time s: fastest path around stuck cells (solvable splits). straight free: maps "
-    "with no stuck cell on the line.",
+    "stuck: cells with true mean λ ≤ λ_stuck. soft ground: classes with soft spots. "
+    "soft spots: expected cells.",
+    "time s: fastest path around stuck cells, in solvable splits. straight line free: "
+    "maps with no stuck cell on it.",
 )
 
 
 def of_split(dataset: TerrainDataset, split: str) -> Maps:
-    """Return the difficulty of all maps of a split, measured in chunks; see `measure`.
+    """Return the results of `measure` for all maps of a split, read in chunks.
 
     Raises:
-        DatasetError: If there is no such split, or its data are damaged.
+        DatasetError: If the dataset has no such split, or its data are damaged.
     """
     fields = (
         "class_id",
@@ -51,26 +51,28 @@ def of_split(dataset: TerrainDataset, split: str) -> Maps:
 
 
 def measure(maps: Maps, recipe: Recipe) -> Maps:
-    """Return the difficulty of some maps.
+    """Return measures of the difficulty of maps.
 
     Args:
-        maps: `class_id`, `slope_deg`, `start_m`, `goal_m` and `reference_time_s`, as
-            stored, and the fields of `schema.TRUTH`, if the dataset has them.
-        recipe: class table, resolution and λ_stuck.
+        maps: stored fields `class_id`, `slope_deg`, `start_m`, `goal_m` and
+            `reference_time_s`, and the fields of `schema.TRUTH`, if the dataset has
+            them.
+        recipe: recipe of the maps, with the class table, resolution and λ_stuck.
 
     Returns:
-        Arrays of shape [B]; fractions are relative to all labelled cells of a map:
+        Arrays of shape [B] by name; fractions are of all labelled cells of a map:
             stuck: fraction of cells whose true E[λ] is at most λ_stuck.
             soft_ground: fraction of cells whose class has soft spots.
             soft_spots: expected fraction of soft spots over all draws of λ.
             straight: whether all cells of the straight line from start to goal have a
                 true E[λ] above λ_stuck.
-            reference_times_s: grid reference time, non-finite if it is missing.
+            reference_times_s: grid reference time in seconds, non-finite if missing.
     """
     truth = latent.stored_truth(maps, recipe.classes)
     expected = latent.expected_of(truth)
     stuck = expected <= recipe.stuck_threshold  # False at NaN
     weights = truth[0]
+    # The first component is firm terrain; a second one is soft spots.
     soft_weight = weights[:, 1:].sum(axis=1)
     labelled = maps["class_id"] != UNLABELLED
     n_labelled = labelled.sum(axis=(1, 2))
@@ -94,9 +96,9 @@ def measure(maps: Maps, recipe: Recipe) -> Maps:
 def crossed_cells(grid: Grid, start_m: ndarray, goal_m: ndarray) -> ndarray:
     """Return a mask of the cells that straight lines cross.
 
-    A line along a border between two cells belongs to the cell with the larger index,
-    as a position on the border does. A cell is not crossed if a line only touches its
-    corner.
+    A line along the border of two cells crosses the cell with the larger index, since
+    a position on the border belongs to that cell. A line that only touches a cell's
+    corner does not cross the cell.
 
     Args:
         grid: size and resolution of the maps.
@@ -109,14 +111,14 @@ def crossed_cells(grid: Grid, start_m: ndarray, goal_m: ndarray) -> ndarray:
     start = start_m.astype(np.float64) / grid.resolution_m
     goal = goal_m.astype(np.float64) / grid.resolution_m
     along = goal - start
-    # Cuts with the borders of rows and columns, as fractions of the line's length. A
-    # line along a border counts as beyond it: 0/0 becomes −∞.
+    # Intersections of the lines with the borders of rows and columns, as fractions of
+    # a line's length. A line along a border counts as beyond it: 0/0 becomes −∞.
     borders = np.arange(max(grid.shape) + 1)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        cuts = (borders - start[..., None]) / along[..., None]
-    cuts = np.nan_to_num(cuts, nan=-np.inf)
-    lower = cuts[..., :-1]
-    upper = cuts[..., 1:]
+        crossings = (borders - start[..., None]) / along[..., None]
+    crossings = np.nan_to_num(crossings, nan=-np.inf)
+    lower = crossings[..., :-1]
+    upper = crossings[..., 1:]
     first = np.minimum(upper, lower).clip(0, 1)
     last = np.maximum(upper, lower).clip(0, 1)
     x_in, y_in = np.moveaxis(first, 1, 0)
@@ -125,7 +127,8 @@ def crossed_cells(grid: Grid, start_m: ndarray, goal_m: ndarray) -> ndarray:
     rows = np.s_[:, : grid.height, None]
     enter = np.maximum(x_in[columns], y_in[rows])
     leave = np.minimum(x_out[columns], y_out[rows])
-    # At a corner, the cuts with its row and its column may differ in their last bits.
+    # At a cell's corner, the intersections with the borders of the row and the column
+    # may differ by a rounding error.
     return leave - enter > 1e-12
 
 

@@ -1,7 +1,7 @@
-"""Terrain statistics over all training maps: fitting, and lookup.
+"""Terrain statistics over all training maps: fitting, and search for files.
 
-The statistics describe unobserved cells by one mixture of λ over all environments, and
-by the mean of each layer. They also contain the coupling of neighbouring cells of
+The statistics describe unobserved cells by a mixture of λ over all environments, and by
+the mean of each layer. They also contain the coupling of neighbouring cells of
 look-alike classes. Letters in shapes: B maps, H×W cells, N bins, K components, P pairs
 of classes.
 
@@ -32,16 +32,16 @@ TRAIN = "train"
 
 # Layers of an `Observation` in addition to those of the dataset.
 _OBSERVED_LAYERS = ("rgb", "elevation_m", "slope_deg")
-_BINS = 1024  # of λ between 0 and 1
-_COMPONENTS = 8
-_STEPS = 1000  # of EM
+_BINS = 1024  # number of bins of λ between 0 and 1
+_COMPONENTS = 8  # number of fitted components
+_STEPS = 1000  # number of steps of EM
 _MIN_STD = 2 / _BINS
-# Atoms at 0 and 1 that the tails do not explain: two components far outside [0, 1],
-# which are clipped completely.
+# (mean, std) of two components far outside [0, 1]. They are clipped completely and
+# represent atoms at 0 and 1 that the other components do not explain.
 _ATOMS = ((-1.0, 0.1), (2.0, 0.1))
-_DIGITS = 6
-# Settings of recipes that determine the terrain. Scenarios are not among them, since
-# that of `train` is std in all shipped recipes.
+_DIGITS = 6  # decimals of stored statistics
+# Settings of recipes that determine the terrain. Scenarios are omitted, since the split
+# `train` has the scenario `std` in all shipped recipes.
 _TERRAIN_SETTINGS = (
     "synthesis",
     "classes",
@@ -52,19 +52,17 @@ _TERRAIN_SETTINGS = (
     "correlation_m",
     "layers",
 )
-# Standard deviation of the Gaussian prior of h and β. The prior keeps both finite even
-# if classes are never neighbours.
+# Standard deviation of the Gaussian prior of h and β in `fit_potts_strength`. With the
+# prior, h and β are finite even if look-alike classes are never neighbours.
 _PRIOR_STD = 10.0
 
 
 def fit_ground(dataset: TerrainDataset) -> GroundStatistics:
-    """Return the statistics of a dataset's split `train`, fitted in chunks.
-
-    Args:
-        dataset: the maps.
+    """Return the statistics of a dataset's split `train`, which is read in chunks.
 
     Raises:
-        DatasetError: If there is no such split, or λ of all its cells is missing.
+        DatasetError: If the dataset has no split `train`, or λ is missing in all cells
+            of the split.
     """
     pairs = look_alike_pairs(dataset.recipe)
     inner = np.zeros(_BINS)
@@ -81,7 +79,7 @@ def fit_ground(dataset: TerrainDataset) -> GroundStatistics:
     if not inner.sum() + ends.sum():
         raise DatasetError(
             f"Expected cells with traversability in split {TRAIN} of {dataset.path}, "
-            "got only NaN. Terrain statistics need them."
+            "for terrain statistics, got only NaN. Use a dataset with traversability."
         )
     weights, means, stds = fit_mixture(inner, ends)
     potts_strength = 0.0
@@ -100,11 +98,11 @@ def fit_ground(dataset: TerrainDataset) -> GroundStatistics:
 
 
 def layer_means(dataset: TerrainDataset) -> dict[str, tuple[float, ...]]:
-    """Return the means of the layers of `train` over all cells that are not missing.
+    """Return the means of the layers over all cells of `train` with a value.
 
     Returns:
-        Means by name of the layer: three numbers for `rgb`, one for each other layer,
-        in its unit. The mean of directions is a direction.
+        Means by name of the layer, in its unit: three numbers for `rgb`, one number for
+        any other layer. The mean of an azimuth is a circular mean.
     """
     names = (*_OBSERVED_LAYERS, *dataset.layer_names)
     sums = {}
@@ -118,7 +116,7 @@ def layer_means(dataset: TerrainDataset) -> dict[str, tuple[float, ...]]:
 
 
 def look_alike_pairs(recipe: Recipe) -> list[tuple[int, int]]:
-    """Return the pairs of classes of one colour, by their ids."""
+    """Return the pairs of class indices of the same colour."""
     units = dict.fromkeys(look_alike_classes(recipe.classes))
     pairs: list[tuple[int, int]] = []
     for unit in units:
@@ -129,8 +127,8 @@ def look_alike_pairs(recipe: Recipe) -> list[tuple[int, int]]:
 def fit_mixture(inner: ndarray, ends: ndarray) -> tuple[ndarray, ndarray, ndarray]:
     """Fit a Gaussian mixture, clipped to [0, 1], to counts of λ by EM.
 
-    Values at 0 and 1 are clipped; the moments of the components beyond each end account
-    for them. Two more components, far outside, explain the remaining atoms.
+    Values at 0 and 1 are clipped values of the components' tails below 0 and above 1.
+    Two more components, far outside [0, 1], explain the remaining atoms at 0 and 1.
 
     Args:
         inner: counts of bins of equal width between 0 and 1, shape [N].
@@ -166,7 +164,8 @@ def fit_mixture(inner: ndarray, ends: ndarray) -> tuple[ndarray, ndarray, ndarra
         total_clipped = (clipped.sum(0) + atoms).clip(min=1e-300)
         beyond = ends * clipped / total_clipped
         atom_counts = ends - beyond.sum(0)
-        # E[Z] and E[Z²] beyond an end; Z points outwards.
+        # E[Z] and E[Z²] of a component's standardised variable beyond an end, with Z
+        # positive outwards.
         first = _density(to_end) / tail.clip(min=1e-300)
         second = 1 + to_end * first
         counts = inside.sum(1) + beyond.sum(1)
@@ -194,11 +193,12 @@ def count_neighbours(class_id: ndarray, pair: tuple[int, int]) -> ndarray:
 
     Args:
         class_id: class indices, shape [B, H, W].
-        pair: ids of the classes a and b.
+        pair: indices of the classes a and b.
 
     Returns:
         Counts, int64, shape [9, 2]. The first index is n_a − n_b + 4, where n_a and n_b
-        are numbers of neighbours; the second is 1 if the cell is of class a.
+        are the numbers of neighbours of classes a and b. The second index is 1 for
+        cells of class a, 0 for cells of class b.
     """
     a, b = pair
     is_a = class_id == a
@@ -268,8 +268,8 @@ def ground_file(path: Path) -> Path:
 def find_ground(dataset: TerrainDataset) -> GroundStatistics | None:
     """Return terrain statistics for a dataset; None if no file fits.
 
-    A file next to the dataset comes first. Without it, statistics of a shipped recipe
-    with the same terrain are used.
+    The statistics are read from the file next to the dataset. If this file does not
+    exist, those of a shipped recipe with the same terrain are used.
 
     Args:
         dataset: dataset with any splits; it need not have `train`.
@@ -286,12 +286,16 @@ def find_ground(dataset: TerrainDataset) -> GroundStatistics | None:
 
 
 def _has_same_terrain(a: Recipe, b: Recipe) -> bool:
-    """Return whether recipes differ only in size, number or light of their maps."""
+    """Return whether all settings that determine the terrain are equal."""
     return all(getattr(a, name) == getattr(b, name) for name in _TERRAIN_SETTINGS)
 
 
 def _sums_of(name: str, maps: Maps) -> ndarray:
-    """Return sums of a layer's channels over its finite cells, and their number."""
+    """Return sums of a layer's channels over cells with a value, then their number.
+
+    An azimuth has two channels, its cosine and sine. Other layers except `rgb` have a
+    second sum of 0.
+    """
     values = maps[name]
     if name == "rgb":
         sums = values.sum((0, 2, 3), dtype=np.float64)
@@ -308,7 +312,7 @@ def _sums_of(name: str, maps: Maps) -> ndarray:
 
 
 def _mean_of(name: str, sums: ndarray) -> ndarray:
-    """Return the means of a layer from `_sums_of`."""
+    """Return the means of a layer from its sums by `_sums_of`."""
     count = max(sums[-1], 1)
     if name == "rgb":
         return sums[:3] / count

@@ -18,22 +18,26 @@ from benchnav.datagen.dem.options import Cut, GroundOptions, Rasters
 if TYPE_CHECKING:
     from benchnav.datagen.dem.recipe_fit import GroundError
 
-_MAX_BACKWARD = 0.1  # of the rows (choice)
-_FEW_REVERSES = 0.01  # of the rows; noise may cause this fraction (choice)
-_COARSE_M = 0.2  # of positions; too coarse for speeds over 2 s (choice)
+# Thresholds that are a choice of this package are marked (choice).
+# Maximum fraction of rows in which a robot slides back (choice).
+_MAX_BACKWARD = 0.1
+# Maximum fraction of rows in which noise reverses positions (choice).
+_MAX_REVERSES = 0.01
+# Maximum resolution of positions that allows speeds over 2 s (choice).
+_MAX_RESOLUTION_M = 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImportOptions:
-    """Output of an import.
+    """Options of an import: output, recipe, and selection of maps.
 
     Args:
-        out: File .h5 to write, or a folder for many files.
+        out: Path of the .h5 file to write, or of a folder for many files.
         id: Id of the dataset. If empty, the name of the output.
-        recipe: Id or path of a recipe with size, resolution, start, goal, class table
-            and light.
-        stride: Metres from one map to the next; below a map's width, maps of a split
-            overlap. If not given, a map's width.
+        recipe: Id or path of the recipe with the maps' size, resolution, start, goal,
+            class table and light.
+        stride: Distance from one map to the next in metres. Below a map's width, maps
+            of a split overlap. If not given, a map's width.
         solvable: Keep only maps whose goal can be reached, and store the grid reference
             time.
         overwrite: Replace an existing dataset.
@@ -56,20 +60,20 @@ def import_dem(
     splits: str = "test/real",
     scenario: str = "std",
 ) -> None:
-    """Make a dataset from a real elevation model; needs the extra benchnav[geo].
+    """Create a dataset from a real elevation model; needs the extra benchnav[geo].
 
-    GDAL opens the rasters: files, https:// and s3:// addresses, zip:// archives,
-    mosaics (.vrt).
+    Rasters may be all that GDAL opens: files, https:// and s3:// addresses, zip://
+    archives, mosaics (.vrt).
 
     Args:
-        rasters: Further rasters of the terrain.
-        ground: Reading and cutting of the elevation model.
-        options: Output.
+        rasters: Rasters other than the elevation model.
+        ground: Options of the elevation model.
+        options: Output, recipe, and selection of maps.
         dem: Raster of elevations, in any coordinate reference system.
         overrides: Changes to the recipe, such as resolution_m=1 goal_m=[50,50].
         splits: Splits and their fractions of the maps, such as
-            train:0.7,valid:0.1,test/site:0.2; no two of them touch.
-        scenario: Scenario of the recipe that lights the maps.
+            train:0.7,valid:0.1,test/site:0.2. Maps of different splits do not touch.
+        scenario: Scenario of the recipe, whose light the maps get.
     """
     dataset = _import(
         options, overrides, splits, ground, scenario, dem=dem, rasters=rasters
@@ -103,40 +107,41 @@ def import_drives(
     speed: Literal["", "positions", "measured"] = "",
     splits: str = "train:0.6,valid:0.2,test/site:0.2",
 ) -> None:
-    """Make a dataset of traversability measured on drives; needs benchnav[geo].
+    """Create a dataset of traversability measured on drives; needs benchnav[geo].
 
-    Traversability of a cell is the mean of measured over commanded speed. Rasters are
-    as in import-dem.
+    Traversability of a cell is the mean ratio of measured to commanded speed. Rasters
+    are as in import-dem.
 
     Args:
-        ground: Reading and cutting of the elevation model.
-        options: Output.
-        drives: Log, a file .csv, .tsv, one of these with .gz, or .parquet, with the
-            columns time_s, x_m and y_m (in the coordinate reference system of the
-            elevation model) or longitude_deg and latitude_deg, commanded_m_s,
-            measured_m_s and, for several drives, drive.
+        ground: Options of the elevation model.
+        options: Output, recipe, and selection of maps.
+        drives: Path of the log, a .csv or .tsv file, one of these with .gz, or a
+            .parquet file. Its columns are time_s, x_m and y_m (in the coordinate
+            reference system of the elevation model) or longitude_deg and latitude_deg,
+            commanded_m_s, measured_m_s and, for several drives, drive.
         dem: Raster of elevations, in any coordinate reference system.
         overrides: Changes to the recipe, such as resolution_m=1 goal_m=[50,50].
         photo: Raster of red, green and blue. If empty, cells have the colours of their
             classes.
         classes: Raster of terrain classes. If empty, all cells are unlabelled.
-        class_ids: Class names by value of that raster, such as '{1: gravel, 9: null}',
-            null for no label. If not given, values are class indices.
-        layer: Optional fields as [NAME=RASTER, NAME=RASTER:UNIT], such as
-            [vegetation_m=canopy.tif].
+        class_ids: Class names by value of classes, such as '{1: gravel, 9: null}'; null
+            for no label. If not given, values are class indices.
+        layer: A layer as NAME=RASTER or NAME=RASTER:UNIT, such as
+            vegetation_m=canopy.tif; several as a list.
         least_speed: Minimum commanded speed of used rows, forward or backward [m/s].
-        speed: Source of the speed over ground: positions, or measured as logged. If
-            empty, measured speed, which must agree with positions.
-        splits: Splits and their fractions of the maps; no two of them touch, and each
-            drive belongs to one.
+        speed: Source of the speed over ground: positions, or measured for the logged
+            speed without a comparison with positions. If empty, measured speed, which
+            must agree with positions.
+        splits: Splits and their fractions of the maps. Maps of different splits do not
+            touch, and each drive belongs to one split.
     """
     from benchnav.datagen.dem.drive_log import Drives
     from benchnav.datagen.dem.importer import REASONS
 
     expect(
         photo or classes,
-        "`photo` or `classes` with `drives`, got neither, so that no input shows "
-        "where λ is low. Pass --photo RASTER.",
+        "`photo` or `classes` with `drives`, got neither, so that models have no input "
+        "that shows where λ is low. Pass --photo RASTER.",
     )
     rasters = Rasters(
         photo=photo,
@@ -154,10 +159,10 @@ def import_drives(
     }
     first_source = next(iter(sources.values()))
     entry = first_source["drives"]
-    print(_sum_up(entry))
+    print(_summary(entry))
     for split, source in sources.items():
         n_rows = entry["used"][split]
-        drive_names = _few(entry["drives"][split])
+        drive_names = _shown_drives(entry["drives"][split])
         print(f"  {split}: {n_rows} rows of {drive_names}")
         left_out = source["left_out"]
         reasons = []
@@ -172,7 +177,7 @@ def import_drives(
         _tell_groups(dataset, split)
 
 
-def _sum_up(entry: Mapping[str, Any]) -> str:
+def _summary(entry: Mapping[str, Any]) -> str:
     """Return a summary of the used and unused rows of a log, in sentences."""
     from benchnav.datagen.dem.drive_log import REASONS
 
@@ -181,85 +186,87 @@ def _sum_up(entry: Mapping[str, Any]) -> str:
     for reason, count in entry["left_out"].items():
         if count:
             lines.append(f"{count} rows are left out: they {REASONS[reason]}")
-    lines.append(_say_motion(entry))
+    lines.append(_motion_text(entry))
     beyond = entry["beyond"]
     if any(beyond.values()):
         lines.append(
             f"{beyond['below_0']} rows have λ below 0 (sliding back, or noise) and "
-            f"{beyond['above_1']} above 1 (faster than the command); they are stored "
-            "as 0 and 1"
+            f"{beyond['above_1']} rows have λ above 1 (faster than the command); they "
+            "are stored as 0 and 1"
         )
     n_fast = beyond["above_1.2"]
     if n_fast:
         lines.append(
-            f"{n_fast} rows exceed 1.2 times the command: if steady driving on flat, "
-            "firm terrain does, scale `commanded_m_s`"
+            f"{n_fast} rows are faster than 1.2 times the command: if this occurs in "
+            "steady driving on flat, firm terrain, calibrate `commanded_m_s`"
         )
     n_standing = entry["standing"]
     if n_standing:
         lines.append(
             f"{n_standing} rows have a position that stays the same under command, and "
-            "no measured speed; the robot counts as immobilised there"
+            "no measured speed; the robot is regarded as immobilised there"
         )
-    lines += _doubts(entry)
+    lines += _warnings(entry)
     return "\n  ".join(lines)
 
 
-def _doubts(entry: Mapping[str, Any]) -> list[str]:
-    """Return possible faults of a log's positions, in sentences."""
+def _warnings(entry: Mapping[str, Any]) -> list[str]:
+    """Return warnings of possible faults of a log's positions, in sentences."""
     from benchnav.datagen.dem.drive_velocity import MAX_PERIOD_S
 
-    doubts = []
+    warnings = []
     by_positions = entry["speed"] == "positions"
     below = entry["beyond"]["below_0"]
     period_s = entry["period_s"] or 0
     n_used = sum(entry["used"].values())
     slides_often = below > _MAX_BACKWARD * n_used
-    reverses_often = entry["reverses"] > _FEW_REVERSES * n_used
+    reverses_often = entry["reverses"] > _MAX_REVERSES * n_used
     if by_positions and slides_often:
-        doubts.append(
-            f"more than {_MAX_BACKWARD:.0%} of rows slide back by their positions, "
-            "which looks wrong: a robot that turned in place under its command looks "
-            "the same. Log a command of 0 there"
+        warnings.append(
+            f"in more than {_MAX_BACKWARD:.0%} of rows, the robot slides back "
+            "according to its positions, which is unlikely: a robot that turns in "
+            "place under a command looks the same. Log a command of 0 there"
         )
     if by_positions and period_s > MAX_PERIOD_S:
-        doubts.append(
-            f"positions come every {period_s:g} s, too seldom to distinguish sliding "
-            "back from turning, so that rows that slide back have λ above 0"
+        warnings.append(
+            f"positions are logged every {period_s:g} s, too rarely to distinguish "
+            "sliding back from turning, so that λ is above 0 where the robot slides "
+            "back"
         )
     if not by_positions and reverses_often:
-        doubts.append(
-            f"positions reverse in {entry['reverses']} rows, measured_m_s never does: "
-            "where the robot did not turn round, it slid back, and speed must be "
-            "negative"
+        warnings.append(
+            f"positions reverse in {entry['reverses']} rows, but measured_m_s never "
+            "does: where the robot did not turn round, it slid back, and measured_m_s "
+            "must be negative"
         )
     resolution_m = entry["resolution_m"]
-    if resolution_m > _COARSE_M:
-        doubts.append(
+    if resolution_m > _MAX_RESOLUTION_M:
+        warnings.append(
             f"positions are multiples of {resolution_m:g} m: log more decimals"
         )
-    return doubts
+    return warnings
 
 
-def _say_motion(entry: Mapping[str, Any]) -> str:
-    """Return a comparison of positions with both speeds, in a sentence."""
+def _motion_text(entry: Mapping[str, Any]) -> str:
+    """Return a comparison of distances by positions and by both speeds, as text."""
     columns = {"pace": "measured_m_s", "commanded_pace": "commanded_m_s"}
     ratios = []
     for name, column in columns.items():
         ratio = entry[name]
         if ratio is not None:
-            ratios.append(f"{ratio:g} times as far as {column} says")
+            ratios.append(f"{ratio:g} times as far as {column} implies")
     compared = " and ".join(ratios) or "too little to be compared with speeds"
     sources = {
         "": "",
-        "positions": "; speeds are those of positions",
-        "measured": "; speeds are as logged",
+        "positions": "; speeds are computed from positions",
+        "measured": "; speeds are used as logged",
     }
     source = sources[entry["speed"]]
     return f"positions move {compared}{source}"
 
 
-def _few(names: Sequence[str]) -> str:
+def _shown_drives(names: Sequence[str]) -> str:
+    """Return the number of drives and up to five of their names, as text."""
     shown = [*names[:5], "…"] if len(names) > 5 else names
     noun = "drive" if len(names) == 1 else "drives"
     return f"{len(names)} {noun} ({', '.join(shown)})"
@@ -273,7 +280,10 @@ def _import(
     scenario: str = "std",
     **settings: Any,
 ) -> "datagen.TerrainDataset":
-    """Import under the requested id, or the name of the output; return the dataset."""
+    """Import maps, and return the dataset.
+
+    Its id is the requested one, or the name of the output.
+    """
     from benchnav.datagen.dem.importer import import_dem as import_maps
     from benchnav.datagen.dem.recipe_fit import GroundError
     from benchnav.datagen.dem.tiling import read_shares
@@ -284,7 +294,8 @@ def _import(
     name = options.id or name_of(path)
     changes = []
     if overrides:
-        # Only the used scenario must fit the maps.
+        # Splits of the recipe are replaced, so that only the used scenario must fit
+        # the maps.
         splits_key = f"splits={{imported: {{scenario: {scenario}, maps: 1}}}}"
         changes = [f"id={name}", splits_key, *overrides]
     recipe = datagen.load_recipe(options.recipe, changes)
@@ -313,9 +324,9 @@ def _import(
 
 
 def _with_command(error: "GroundError", overrides: Sequence[str]) -> ConfigError:
-    """Return an error with the user's command, changed to settings that fit."""
+    """Return an error that contains the user's command with settings that fit."""
     if not error.settings and error.stride_m is None:
-        return ConfigError(f"{error.problem} Or take a larger raster.")
+        return ConfigError(f"{error.problem} Or use a larger raster.")
     unchanged = []
     for text in overrides:
         key, _, _ = text.partition("=")

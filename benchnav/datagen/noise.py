@@ -23,13 +23,13 @@ def fractal_perlin(
 ) -> ndarray:
     """Return the mean of octaves of Perlin noise, each weighted by its period.
 
-    Coarse octaves therefore dominate.
+    Because of these weights, coarse octaves dominate.
 
     Args:
-        seed: root of the random streams, one per octave.
-        names: names of the streams.
-        indices: index of each map, one element of every stream, shape [B].
-        shape: (H, W).
+        seed: root seed of the random streams, one stream per octave.
+        names: names of the streams, without the octave.
+        indices: index of each map's element of the streams, shape [B].
+        shape: number of rows and columns, (H, W).
         periods: lattice spacing of each octave in cells.
 
     Returns:
@@ -45,13 +45,14 @@ def fractal_perlin(
         draws = rng.uniform(key, indices, (n_draws,))
         lattice = draws[:, 2:].reshape(-1, n_rows, n_columns)
         angle = 2 * np.pi * lattice
-        # Random phases, so that the lattice has another position in each map.
+        # Random phases shift the lattice differently on each map.
         phase_y = draws[:, 0, None]
         phase_x = draws[:, 1, None]
         rows = (np.arange(height) + 0.5) / period + phase_y
         columns = (np.arange(width) + 0.5) / period + phase_x
-        # Σ over a cell's four corners of fade_y·fade_x·(g_y·Δy + g_x·Δx) is separable:
-        # the lattice's gradients are multiplied by weight matrices of rows and columns.
+        # The noise is Σ fade_y·fade_x·(g_y·Δy + g_x·Δx) over the four lattice points
+        # around a position, with gradients g. The sum is separable: gradients are
+        # multiplied by weight matrices of rows and columns.
         weight_y, offset_y = _corner_weights(rows, n_rows)
         weight_x, offset_x = _corner_weights(columns, n_columns)
         noise_y = offset_y @ (np.sin(angle) @ weight_x.swapaxes(1, 2))
@@ -69,7 +70,8 @@ def _corner_weights(position: ndarray, lattice: int) -> tuple[ndarray, ndarray]:
         lattice: L, number of lattice points.
 
     Returns:
-        Two arrays of shape [B, N, L], zero except at the two neighbours of a position.
+        Two arrays, float64, shape [B, N, L], 0 except at the two neighbours of a
+        position.
     """
     distance = position[..., None] - np.arange(lattice)
     fade = np.maximum(1 - np.abs(distance), 0)

@@ -1,9 +1,10 @@
 """Figures of maps: a sheet with a row for each map, and a contact sheet of a split.
 
-Lengths are in inches from the upper left corner. Text is in points, for a figure that
-spans two columns of a page. A class has the same colour in all maps and figures: that
-of the class table, lighter or darker for all look-alike classes except the first. If
-classes have soft spots, terrain that may hide them is hatched and outlined.
+Lengths are in inches, and positions are from the upper left corner. Sizes of text are
+in points, for a figure that spans two columns of a page. A class has the same colour in
+all maps and figures: the colour of the class table, made lighter or darker for all
+look-alike classes except the first. Terrain of classes with soft spots is hatched or
+outlined.
 """
 
 import textwrap
@@ -50,7 +51,7 @@ def preview_figure(
 ) -> Figure:
     """Return a figure of maps of a split, with a row for each map.
 
-    Layers are to the right. The panel of a field has the label `FIELD ROW`.
+    Layers are in the right columns. The panel of a field has the label `FIELD ROW`.
 
     Args:
         dataset: dataset of the maps.
@@ -58,10 +59,11 @@ def preview_figure(
         indices: indices of the maps.
 
     Returns:
-        A figure as wide as a page; narrower if panels shrink to fit a page.
+        A figure as wide as a page, or narrower if its panels are shrunk to the height
+        of a page.
 
     Raises:
-        DatasetError: If there is no such split or map, or its data are damaged.
+        DatasetError: If the split or a map does not exist, or its data are damaged.
     """
     layers = dataset.layer_names
     maps = dataset.read(split, indices, (*FIELDS, *layers, "start_m", "goal_m"))
@@ -75,8 +77,8 @@ def preview_figure(
     soft = soft_ground(class_id, classes)
     slope_deg = maps["slope_deg"]
     traversability = maps["traversability"]
-    # Heights above each map's lowest point are comparable between maps; heights above a
-    # datum often are not.
+    # Heights are relative to each map's lowest point, since elevations of different
+    # maps may differ too much for the same scale.
     elevation_m = maps["elevation_m"]
     elevation_m -= elevation_m.min((1, 2), keepdims=True)
     relief_m = float(elevation_m.max()) or 1.0
@@ -151,7 +153,7 @@ def preview_figure(
 def contact_sheet_figure(dataset: TerrainDataset, split: str) -> Figure:
     """Return a figure of thumbnails of up to 100 maps of a split, in order.
 
-    If classes have soft spots, terrain that may hide them is outlined, and the stored λ
+    If classes have soft spots, terrain of these classes is outlined, and the stored λ
     is drawn to the right of each image.
 
     Args:
@@ -162,7 +164,7 @@ def contact_sheet_figure(dataset: TerrainDataset, split: str) -> Figure:
         A figure about as wide as high; the thumbnails are the images of its only axes.
 
     Raises:
-        DatasetError: If there is no such split, or its data are damaged.
+        DatasetError: If the split does not exist, or its data are damaged.
     """
     n_maps = dataset.map_count(split)
     grid = dataset.grid
@@ -189,8 +191,8 @@ def contact_sheet_figure(dataset: TerrainDataset, split: str) -> Figure:
     lines = textwrap.wrap(title, int(width / LETTER / 1.25))
     top = 0.1 + LINE * len(lines)
     height = top + rows * (image_height + gap)
-    # With an integer number of dots per cell, all cells have one size. That number is
-    # not used if it requires too many dots.
+    # With an integer number of dots per cell, all cells have the same size. If this
+    # requires too high a resolution, the default resolution is used.
     dots_per_cell = max(1, round(_DPI * image_width / cells_across))
     dpi = dots_per_cell * cells_across / image_width
     if dpi > 2 * _DPI:
@@ -217,7 +219,7 @@ def contact_sheet_figure(dataset: TerrainDataset, split: str) -> Figure:
             image = np.concatenate([image, coloured[..., :3]], axis=1)
             soft = soft_ground(maps["class_id"][0], classes)
             edges = outline(soft, image_height / grid.height)
-            # Inches of the page increase downward.
+            # The axes of the page point downward.
             draw_lines(sheet, edges * (1, -1) + (x, lower), "black", 0.2, "white")
         box = (x, right, lower, y)
         sheet.imshow(
@@ -239,7 +241,7 @@ def soft_ground(class_id: np.ndarray, classes: Sequence[TerrainClass]) -> np.nda
 def class_colours(classes: Sequence[TerrainClass]) -> np.ndarray:
     """Return the colours in which classes are drawn, RGB in [0, 1], shape [C, 3].
 
-    They are the colours of the class table, except for look-alike classes.
+    They are the colours of the class table, made lighter or darker for look-alikes.
     """
     colours = np.array([item.colour for item in classes]) / 255
     for alike in set(look_alike_classes(tuple(classes))):
@@ -252,11 +254,11 @@ def class_colours(classes: Sequence[TerrainClass]) -> np.ndarray:
 
 
 def contact_columns(count: int, ratio: float) -> int:
-    """Return the number of columns of a grid about as wide as high with few gaps.
+    """Return the number of columns of a grid that is nearly square and has few gaps.
 
     Args:
         count: number of thumbnails.
-        ratio: height over width of a thumbnail.
+        ratio: ratio of height to width of a thumbnail.
     """
     columns = np.arange(count, 0, -1)
     rows = -(-count // columns)
@@ -272,8 +274,8 @@ def _hillshade(
 ) -> np.ndarray:
     """Return white and black overlays for a light in the north-west, [B, H, W, 4].
 
-    Level terrain has no overlay, so it has the colours of the scale. Heights are
-    exaggerated by one factor, which depends on the steepness of the maps.
+    Level terrain has no overlay, so it keeps the colours of the scale. Heights of all
+    maps are exaggerated by the same factor, which depends on their slopes.
     """
     steep_deg = np.percentile(slope_deg, 95) + 1e-3
     steep = np.tan(np.radians(steep_deg))

@@ -1,11 +1,12 @@
 """Dataset formats 1.0 to 1.4: fields, manifest and content digests.
 
-One HDF5 file is one dataset. Its groups are splits. Each split contains the fields that
-the manifest lists (those of `FIELDS`, and optional ones), and the SHA-256 of each
-entry. The manifest is JSON text in the HDF5 dataset `manifest`. A folder of such files
-is one dataset too; its own manifest lists the maps of each file. Digests cover logical
-arrays instead of the file's bytes, so they do not depend on compression, machine or
-number of workers. `docs/reference/format.md` describes the files for other readers.
+A dataset is an HDF5 file or a folder of such files. The groups of a file are splits.
+Each split contains the fields that the manifest lists (those of `FIELDS`, and optional
+ones), and the SHA-256 digest of each map's entry of each field. The manifest of a file
+is JSON text in the HDF5 dataset `manifest`. A folder has a manifest of its own, which
+lists the number of maps in each file. Digests are computed from array values instead of
+the file's bytes, so they do not depend on compression, machine or number of workers.
+`docs/reference/format.md` describes the files for other readers.
 """
 
 import hashlib
@@ -21,14 +22,14 @@ from numpy import ndarray
 from benchnav.core.errors import expect
 
 FORMAT = "benchnav-dataset"
-FORMAT_VERSION = (1, 4)  # the newest that can be read
+FORMAT_VERSION = (1, 4)  # newest version that can be read
 MANIFEST = "manifest"
 ENTRY_DIGESTS = "entry_digests"
 DIGEST_BYTES = 32
 UNLABELLED = 255  # `class_id` of a cell without a class, as in real data
 
-Json = dict[str, Any]  # a manifest, or a part of it
-Maps = dict[str, ndarray]  # some maps: arrays by field, each of shape [B, *entry shape]
+Json = dict[str, Any]  # manifest, or part of a manifest
+Maps = dict[str, ndarray]  # arrays of B maps by field, each of shape [B, *entry shape]
 
 
 @dataclass(frozen=True)
@@ -36,10 +37,10 @@ class Field:
     """Description of one array of a split.
 
     Args:
-        dtype: NumPy dtype in little-endian order.
+        dtype: NumPy dtype, in little-endian byte order.
         shape: shape of one map's entry; "H" and "W" are the numbers of rows and columns
             of the grid.
-        unit: SI unit, or "1".
+        unit: SI unit, "deg", or "1" for no unit.
         minimum: smallest valid value.
         maximum: largest valid value.
         meaning: description in one line.
@@ -58,9 +59,9 @@ class Field:
         return tuple(sizes[n] if isinstance(n, str) else n for n in self.shape)
 
 
-Fields = Mapping[str, Field]  # by name, in the order in which they are stored
+Fields = Mapping[str, Field]  # fields by name, in the order in which they are stored
 
-# Fields of every dataset. The texts are stored in manifests and never change.
+# Fields of each dataset. Their texts are stored in manifests and must not change.
 FIELDS: dict[str, Field] = {
     "rgb": Field("|u1", (3, "H", "W"), "1", 0, 255, "top-down colour image, shaded"),
     "class_id": Field("|u1", ("H", "W"), "1", 0, 255, "index into the class table"),
@@ -87,7 +88,7 @@ FIELDS: dict[str, Field] = {
 }
 
 
-# Fields that a dataset may have in addition.
+# Further fields that a dataset may have.
 OPTIONAL: dict[str, Field] = {
     "group": Field(
         "<i8",
@@ -97,7 +98,7 @@ OPTIONAL: dict[str, Field] = {
         2**53,
         "maps of one number overlap, directly or by others between them",
     ),
-    # They describe measured λ, so no model may use them.
+    # `drive_count` and `drive_std` describe measured λ, so no model may use them.
     "drive_count": Field(
         "<i4",
         ("H", "W"),
@@ -116,14 +117,15 @@ OPTIONAL: dict[str, Field] = {
     ),
 }
 
-# The true distribution of λ, if layers of the recipe change it; no model may use it.
+# Fields of the true distribution of λ, if layers of the recipe change λ. No model may
+# use them.
 TRUTH = ("truth_mean", "truth_std")
 
 KNOWN = FIELDS | OPTIONAL
 MAP_FIELDS = tuple(name for name, field in FIELDS.items() if "H" in field.shape)
 
-# Names that no layer may have: other arrays of a split, and other inputs of models and
-# observations of environments.
+# Names that no layer may have, since they are used for other arrays of a split, other
+# inputs of models, or observations of environments.
 _RESERVED = (
     *KNOWN,
     *TRUTH,
@@ -152,9 +154,10 @@ def truth_fields(components: int) -> dict[str, Field]:
 
 
 def layer_names(fields: Fields) -> tuple[str, ...]:
-    """Return the names of the layers among fields, which a model may use.
+    """Return the names of the layers among fields, which models may use.
 
-    Layers are all float32 maps that are not in `FIELDS` or `OPTIONAL`. NaN is missing.
+    Layers are all float32 fields of shape (H, W) that are not in `FIELDS` or
+    `OPTIONAL`. Their missing values are NaN.
     """
     names = []
     for name, field in fields.items():
@@ -164,30 +167,32 @@ def layer_names(fields: Fields) -> tuple[str, ...]:
     return tuple(names)
 
 
-def check_layer_name(what: str, name: str) -> None:
+def check_layer_name(description: str, name: str) -> None:
     """Check the name of a layer.
 
     Args:
-        what: argument that names the layer, for the message.
-        name: the name.
+        description: description of the name, for messages.
+        name: name to check.
 
     Raises:
         ConfigError: If the name is not an ASCII identifier, or is reserved.
     """
     expect(
         name.isidentifier() and name.isascii(),
-        f"{what} of letters, digits and '_', not beginning with a digit, got {name!r}.",
+        f"{description} of letters, digits and '_', not beginning with a digit, got "
+        f"{name!r}.",
     )
     expect(
         name not in _RESERVED,
-        f"{what} that is not reserved ({', '.join(_RESERVED)}), got {name!r}.",
+        f"{description} other than the reserved names {', '.join(_RESERVED)}, got "
+        f"{name!r}.",
     )
 
 
 def quantise(values: ndarray, bits: int) -> ndarray:
     """Return values rounded to multiples of 2^−bits.
 
-    Rounding removes differences between machines in the last bits of results.
+    Rounding removes small differences between the results of different machines.
     """
     steps = np.rint(values * 2.0**bits)
     return steps * 2.0**-bits
@@ -207,7 +212,10 @@ def join_maps(parts: Sequence[Maps]) -> Maps:
 def stored_arrays(
     fields: Fields, height: int, width: int
 ) -> dict[str, tuple[str, tuple[int, ...]]]:
-    """Return dtype and entry shape of each array of a split: fields, and digests."""
+    """Return (dtype, entry shape) by name of each array of a split.
+
+    The arrays are the fields and the digests of their entries.
+    """
     arrays: dict[str, tuple[str, tuple[int, ...]]] = {}
     for name, field in fields.items():
         arrays[name] = (field.dtype, field.entry_shape(height, width))
@@ -216,11 +224,13 @@ def stored_arrays(
 
 
 def entry_digests(maps: Maps, fields: Fields) -> ndarray:
-    """Return the SHA-256 of the little-endian bytes of each map's entry of each field.
+    """Return the SHA-256 digest of each map's entry of each field.
+
+    A digest is computed from the entry's bytes in little-endian order.
 
     Args:
         maps: arrays by field, each of shape [B, *entry shape].
-        fields: the F fields to digest.
+        fields: F fields.
 
     Returns:
         uint8, shape [B, F, 32].
@@ -235,13 +245,16 @@ def entry_digests(maps: Maps, fields: Fields) -> ndarray:
 
 
 def split_digest(digests: ndarray, height: int, width: int, fields: Fields) -> str:
-    """Return the SHA-256 over the field table and the entries' digests, map by map.
+    """Return the SHA-256 digest of a split.
+
+    It is computed from the names, dtypes and shapes of the fields, followed by the
+    digests of the entries, map by map.
 
     Args:
-        digests: digests of all entries, from `entry_digests`, shape [N, F, 32].
-        height: rows of a map.
-        width: columns of a map.
-        fields: the F fields.
+        digests: digests of all N maps from `entry_digests`, shape [N, F, 32].
+        height: number of rows of a map.
+        width: number of columns of a map.
+        fields: F fields.
     """
     table = []
     for name, field in fields.items():
@@ -264,7 +277,7 @@ def version_of(recipes: Sequence[Json], splits: Iterable[Json], fields: Fields) 
 
 
 def has_unlabelled(entry: Json) -> bool:
-    """Return whether a split has unlabelled cells, by its entry in the manifest."""
+    """Return whether a split with this manifest entry has unlabelled cells."""
     for part in entry["parts"]:
         source = part.get("source", {})
         counts = source.get("unlabelled", ())
@@ -289,22 +302,22 @@ def field_table(height: int, width: int, fields: Fields) -> Json:
 def read_field_table(
     table: Json, layers: Fields = MappingProxyType({})
 ) -> dict[str, Field]:
-    """Return the fields that a manifest describes, in its order.
+    """Return the fields that a manifest describes, in the manifest's order.
 
-    A field that this package does not define may have any values.
+    A field that is neither defined in this module nor in `layers` has no limits.
 
     Args:
-        table: fields by name, as in a manifest.
-        layers: fields of the recipe's layers, with their ranges.
+        table: descriptions of fields by name, from a manifest.
+        layers: fields of layers with known limits, by name.
 
     Raises:
-        KeyError, TypeError, ValueError: If one of `FIELDS` is missing, or a field is
-            invalid.
+        KeyError, TypeError, ValueError: If a field of `FIELDS` is missing, or a field
+            is invalid.
     """
     height, width = table["class_id"]["shape"]
     for name in FIELDS:
         if name not in table:
-            raise ValueError(f"field {name!r} is not listed")
+            raise ValueError(f"it does not list field {name!r}")
     fields = {}
     defined = {**layers, **KNOWN}
     for name, row in table.items():
@@ -335,10 +348,11 @@ _RECIPE = {"id": str, "seed": int, "scenarios": dict, "splits": dict}
 
 
 def check(manifest: Json) -> None:
-    """Check that a manifest contains what readers need.
+    """Check that a manifest contains the keys that readers need, with valid values.
 
     Raises:
-        AttributeError, KeyError, TypeError, ValueError: If it does not.
+        AttributeError, KeyError, TypeError, ValueError: If a key is missing, or a value
+            is invalid.
     """
     _check_kinds(manifest, _MANIFEST)
     read_field_table(manifest["fields"])
@@ -361,7 +375,8 @@ def check(manifest: Json) -> None:
             n_maps = sum(item["maps"] for item in items)
             if n_maps <= 0 or n_maps != entry["maps"]:
                 raise ValueError(
-                    f"the number of maps of split {name!r} is not that of its parts"
+                    f"the number of maps of split {name!r} is not the sum over its "
+                    "parts"
                 )
         for shard in shards:
             if "/" in shard.get("file", ""):
@@ -369,6 +384,7 @@ def check(manifest: Json) -> None:
 
 
 def _check_kinds(mapping: Any, kinds: Json) -> None:
+    """Check that a mapping has the keys of `kinds`, with values of their types."""
     for name, kind in kinds.items():
         value = mapping.get(name)
         if isinstance(kind, dict):

@@ -75,7 +75,7 @@ def test_a_dataset_from_making_to_mending(
     assert datagen("validate", "d.h5") == 1
     told = capsys.readouterr().out
     assert "test/hg: map 0: field 'elevation_m' is damaged" in told
-    assert "make the file again with --overwrite" in told
+    assert "create the file again with --overwrite" in told
 
 
 def test_damage_is_one_line_for_every_command(datagen: Call, capsys) -> None:  # type: ignore[no-untyped-def]
@@ -385,7 +385,7 @@ def test_faults_of_consecutive_maps_are_one_line(datagen: Call, capsys) -> None:
     assert capsys.readouterr().out.splitlines() == [
         "train: maps 0–2: field 'start_m' does not match its digest",
         "d.h5: 3 fault(s)",
-        "To repair it, make the file again with --overwrite. The same recipe and version give the same digests.",
+        "To repair it, create the file again with --overwrite. The same recipe and version give the same digests.",
     ]
 
 
@@ -407,7 +407,7 @@ def test_faults_of_consecutive_maps_are_one_line(datagen: Call, capsys) -> None:
         (
             "occupancy: [0.3, 0.3, 0.2, 0.2]",
             "occupancy: [0.3, 0.3, 0.2, 0.1]",
-            "summing to 1",
+            "that sum to 1",
         ),
         ("crater_count: [1, 2]", "crater_count: [30, 40]", "cover at most 40%"),
         (
@@ -432,13 +432,13 @@ def test_faults_of_consecutive_maps_are_one_line(datagen: Call, capsys) -> None:
         ("  train:", "  1:", "Put numbers in quotes"),
         ("  train:", "  test:", "not nested"),
         ("classes: default", "classes: []", "`classes`"),
-        ("goal_m: [12, 12]", "goal_m: [4.1, 4.1]", "another cell"),
-        ("stuck_threshold: 0.3", "stuck_threshold: 0.999", "goal can be reached"),
+        ("goal_m: [12, 12]", "goal_m: [4.1, 4.1]", "different cells"),
+        ("stuck_threshold: 0.3", "stuck_threshold: 0.999", "goal that can be reached"),
         ("class_periods_m: [6, 3]", "class_periods_m: [.nan, 3]", "class_periods_m"),
         ("{preset: hs, relief", "{preset: hs, severity: .nan, relief", "severity"),
         ("height: 32", "height: many", "height"),
         ("id: mine", "id: my maps", "my maps"),
-        ("environments: 5", "environments: 4", "unused `id`"),
+        ("environments: 5", "environments: 4", "an `id` in"),
         ("scenario: std", "scenario: dusk", "dusk"),
         ("splits:", "splits: []\nmore:", "splits"),
         (RECIPE, "[1, 2]", "mapping"),
@@ -658,7 +658,7 @@ def test_an_interrupted_create_goes_on_and_says_what_was_there(
         == "benchnav-datagen: finished maps are kept; to resume, run the same command again"
     )
     assert datagen(*asked) == 0
-    assert capsys.readouterr().err.splitlines()[0] == "10 of 14 maps exist already"
+    assert capsys.readouterr().err.splitlines()[0] == "10 of 14 maps already exist"
     assert datagen(*asked, "--overwrite") == 0
     assert "already" not in capsys.readouterr().err
 

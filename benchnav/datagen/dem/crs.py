@@ -1,6 +1,6 @@
 """Coordinate reference systems (CRS) of rasters, and positions in them.
 
-rasterio is an extra of this package, imported on first use.
+rasterio is an optional dependency of this package and imported on first use.
 """
 
 import json
@@ -26,15 +26,17 @@ def utm_of(crs: Any, x: float, y: float) -> Any:
 
 
 def local_crs(crs: Any, x: float, y: float) -> Any:
-    """Return a transverse Mercator projection of the same datum, true at a position.
+    """Return a transverse Mercator projection of the same datum, centred at a position.
+
+    Its scale is 1 at the position.
 
     Args:
         crs: CRS of the position, on any ellipsoid.
-        x: eastward, or longitude.
-        y: northward, or latitude.
+        x: eastward coordinate, or longitude, in the unit of `crs`.
+        y: northward coordinate, or latitude, in the unit of `crs`.
 
     Returns:
-        The CRS; None if there is no geographic CRS of the body.
+        The CRS; None if `crs` is not based on a geographic CRS of a body.
     """
     base = crs.to_dict(projjson=True)
     while inner := base.get("base_crs") or base.get("source_crs"):
@@ -74,9 +76,9 @@ def local_crs(crs: Any, x: float, y: float) -> Any:
 
 
 def stretch(crs: Any, x: float, y: float) -> float:
-    """Return |scale − 1| of a projection at a position, in the worst direction.
+    """Return the maximum |scale − 1| of a projection at a position, over directions.
 
-    It is infinite if the position is not on the body.
+    The result is infinite if the position is not on the body.
     """
     local = local_crs(crs, x, y)
     if local is None:
@@ -94,7 +96,15 @@ def stretch(crs: Any, x: float, y: float) -> float:
 def transformed(crs: Any, to: Any, x: Any, y: Any) -> np.ndarray:
     """Return N positions in another CRS, float64, shape [2, N].
 
-    They are non-finite if there is no transformation, for example between planets.
+    Args:
+        crs: CRS of the positions.
+        to: CRS of the result.
+        x: eastward coordinates or longitudes, N values.
+        y: northward coordinates or latitudes, N values.
+
+    Returns:
+        (x, y) of each position, non-finite if there is no transformation, for example
+        between planets.
     """
     try:
         return np.array(load_rasterio().warp.transform(crs, to, list(x), list(y)))
@@ -103,7 +113,7 @@ def transformed(crs: Any, to: Any, x: Any, y: Any) -> np.ndarray:
 
 
 def horizontal(crs: Any) -> Any:
-    """Return the horizontal component of a compound CRS; else the CRS itself."""
+    """Return the horizontal component of a compound CRS; any other CRS unchanged."""
     components = crs.to_dict(projjson=True).get("components")
     if components is None:
         return crs
@@ -119,7 +129,7 @@ def load_rasterio() -> Any:
     """Return rasterio, imported on first use.
 
     Raises:
-        ConfigError: If it is not installed.
+        ConfigError: If rasterio is not installed.
     """
     try:
         import rasterio.vrt

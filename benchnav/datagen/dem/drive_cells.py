@@ -1,9 +1,9 @@
 """Traversability of driven cells, and the split of each drive.
 
 Each split has a strip of the terrain; terrain between strips is in no map (`tiling`). A
-drive belongs to the split whose strip contains most of its rows. Its rows on other
-strips are left out, so no cell and no drive occurs in two splits. Letters in shapes: N
-rows, D drives, M driven cells.
+drive usually belongs to the split whose strip contains most of the drive's rows. Its
+rows on other strips are left out, so no cell and no drive occurs in two splits. Letters
+in shapes: N rows, D drives, M driven cells.
 """
 
 from collections.abc import Sequence
@@ -29,14 +29,14 @@ from benchnav.datagen.dem.tiling import Tiling
 from benchnav.datagen.schema import Json
 
 BANDS = ("traversability", "drive_count", "drive_std")
-RATIO_LIMITS = (0.0, 1.0)  # to which the ratio of a row is clipped when it is stored
+RATIO_LIMITS = (0.0, 1.0)  # limits to which the ratio of a row is clipped as stored λ
 _BLOCK_ROWS = 64  # rows of cells that are read at once
-_PROJECT = "Give x_m and y_m in that CRS, or longitude_deg and latitude_deg."
+_CRS_REMEDY = "Log x_m and y_m in that CRS, or longitude_deg and latitude_deg."
 
 
 @dataclass(frozen=True)
 class DrivenCells:
-    """Driven cells.
+    """Cells that drives crossed, and statistics of λ in each.
 
     Args:
         cells: index of each cell, row · width + column, ascending, int64, shape [M].
@@ -50,15 +50,15 @@ class DrivenCells:
     width: int
 
     def read(self, rows: range, columns: range) -> ndarray:
-        """Return the values of cells.
+        """Return the values of all cells in some rows and columns.
 
         Args:
-            rows: rows, counted northward.
-            columns: columns, counted eastward.
+            rows: indices of the rows, counted northward.
+            columns: indices of the columns, counted eastward.
 
         Returns:
-            `BANDS`, float64, shape [3, len(rows), len(columns)]; NaN, 0 and NaN in
-            cells that were not driven.
+            Values of `BANDS`, float64, shape [3, len(rows), len(columns)]; NaN, 0 and
+            NaN in cells that were not driven.
         """
         bands = np.full((3, len(rows), len(columns)), np.nan)
         bands[1] = 0
@@ -75,20 +75,20 @@ class DrivenCells:
 def to_map_crs(log: DriveLog, dem: Raster, crs: Any, bounds: Any) -> DriveLog:
     """Return a log with positions in the CRS of the maps.
 
-    They are in metres from the south-west corner of the elevation model.
+    Positions are in metres from the south-west corner of the elevation model.
 
     Args:
         log: log with positions as logged.
-        dem: the elevation model.
+        dem: elevation model.
         crs: CRS of the maps.
         bounds: bounds of the elevation model in `crs`.
 
     Returns:
-        The log with the rows on the elevation model.
+        The log without rows off the elevation model.
 
     Raises:
-        DatasetError: If no row lies on it, or positions are in its CRS and this is not
-            in metres.
+        DatasetError: If all rows lie off the elevation model, or positions are in the
+            CRS of the elevation model and this CRS is not in metres.
     """
     log_crs: Any = "EPSG:4326"
     if not log.is_geographic:
@@ -102,39 +102,38 @@ def to_map_crs(log: DriveLog, dem: Raster, crs: Any, bounds: Any) -> DriveLog:
     if is_off.all():
         swapped_m = transformed(log_crs, crs, y, x) - corner_m
         is_swapped = bool(_is_within(swapped_m, bounds).any())
-        raise _off_terrain(log, dem, is_swapped=is_swapped)
+        raise _off_terrain_error(log, dem, is_swapped=is_swapped)
     x_m, y_m = positions_m
     rows = log.rows.assign(x=x_m, y=y_m)
     return replace(log, rows=rows).without("off_dem", is_off)
 
 
 def _check_in_metres(log: DriveLog, dem: Raster) -> None:
-    """Check that the CRS of the elevation model, and so of the log, is in metres."""
+    """Check that the CRS of the elevation model and the log is in metres."""
     crs = dem.file.crs
     if is_in_metres(crs):
         return
     raise DatasetError(
-        f"Expected positions as longitude_deg and latitude_deg in {log.settings.file}, "
-        f"since the CRS of {dem.name}, "
-        f"{crs.to_string()[:80]}, is not in metres, got x_m and y_m. Log "
-        "them in WGS 84."
+        f"Expected columns `longitude_deg` and `latitude_deg` in {log.settings.file}, "
+        "got `x_m` and `y_m`, which require an elevation model in metres: the CRS of "
+        f"{dem.name} is {crs.to_string()[:80]}. Log the positions in WGS 84."
     )
 
 
-def _off_terrain(log: DriveLog, dem: Raster, *, is_swapped: bool) -> DatasetError:
+def _off_terrain_error(log: DriveLog, dem: Raster, *, is_swapped: bool) -> DatasetError:
     """Return an error on a log whose positions all lie off the elevation model.
 
     Args:
-        log: the log.
-        dem: the elevation model.
-        is_swapped: whether swapped coordinates lie on it.
+        log: log of the drives.
+        dem: elevation model.
+        is_swapped: whether some positions lie on `dem` if x and y are swapped.
     """
     covered = dem.file.bounds
     west, east = log.rows["x"].agg(["min", "max"])
     south, north = log.rows["y"].agg(["min", "max"])
     names = POSITION_COLUMNS["WGS 84" if log.is_geographic else "crs"]
     columns = " and ".join(f"`{name}`" for name in names)
-    remedy = _PROJECT
+    remedy = _CRS_REMEDY
     if log.is_geographic:
         remedy = f"Convert {columns} to degrees in WGS 84."
     if is_swapped:
@@ -156,8 +155,8 @@ def _is_within(positions_m: ndarray, bounds: Any) -> ndarray:
     return np.all(is_within, axis=0)
 
 
-def check_enough(log: DriveLog, splits: Sequence[str]) -> None:
-    """Check that there is a drive for each split.
+def check_drive_count(log: DriveLog, splits: Sequence[str]) -> None:
+    """Check that a log has at least as many drives as splits.
 
     Raises:
         DatasetError: If the log has fewer drives.
@@ -167,7 +166,7 @@ def check_enough(log: DriveLog, splits: Sequence[str]) -> None:
         raise DatasetError(
             f"Expected a drive for each of the {len(splits)} splits "
             f"{', '.join(splits)}, got {n_drives} in "
-            f"{log.settings.file}. Name drives in a column `drive`, or take fewer "
+            f"{log.settings.file}. Name drives in a column `drive`, or use fewer "
             "--splits."
         )
 
@@ -182,9 +181,9 @@ def elevation_under(layer: Layer, row: ndarray, column: ndarray) -> ndarray:
         column: column coordinate, eastward from the same centre, shape [N].
 
     Returns:
-        Elevation in metres, NaN off the cells, float64, shape [N].
+        Elevation in metres, NaN off the layer's cells, float64, shape [N].
     """
-    # Layers are padded by one cell.
+    # A layer is padded by one cell on each side.
     height = layer.warped.height - 2
     width = layer.warped.width - 2
     elevation_m = np.full(len(row), np.nan)
@@ -208,13 +207,14 @@ def aggregate_drives(
     """Assign drives to splits, and aggregate λ over the rows on each cell.
 
     Args:
-        log: the drives.
+        log: log with λ in each row.
         tiling: tiling of the terrain into maps and splits.
         row: row of the cell of each position, counted northward, int64, shape [N].
         column: column of the cell, counted eastward, int64, shape [N].
 
     Returns:
-        The log with the used rows, and the driven cells.
+        The log without rows that lie between maps or on another split's terrain, and
+        the driven cells.
 
     Raises:
         DatasetError: If a split gets no drive.
@@ -223,10 +223,10 @@ def aggregate_drives(
     rows = log.rows.assign(row=row, column=column, split=split_of_row)
     log = replace(log, rows=rows)
     log = log.without("between_maps", split_of_row < 0)
-    owner = _owners(log, list(tiling.strips))
-    split_of_drive = owner[log.rows["drive"]]
-    is_elsewhere = log.rows["split"].to_numpy() != split_of_drive
-    log = log.without("other_split", is_elsewhere)
+    split_by_drive = _split_by_drive(log, list(tiling.strips))
+    split_of_drive = split_by_drive[log.rows["drive"]]
+    is_on_other_split = log.rows["split"].to_numpy() != split_of_drive
+    log = log.without("other_split", is_on_other_split)
     width = tiling.cells[1]
     cell = log.rows["row"] * width + log.rows["column"]
     # Ratios below 0 or above 1 remain in the log, but stored λ is in [0, 1].
@@ -237,14 +237,14 @@ def aggregate_drives(
 
 
 def describe_drives(log: DriveLog, splits: Sequence[str]) -> Json:
-    """Return the manifest entry of a log from `aggregate_drives`: used and unused rows."""
+    """Return the manifest entry of a log from `aggregate_drives`."""
     used = {}
     drives = {}
     for index, split in enumerate(splits):
         rows = log.rows[log.rows["split"] == index]
         used[split] = len(rows)
         drives[split] = [log.names[drive] for drive in np.unique(rows["drive"])]
-    # `REASONS` has the order of the checks.
+    # Reasons are stored in the order of the checks, which is the order of `REASONS`.
     left_out = {
         reason: log.left_out[reason] for reason in REASONS if reason in log.left_out
     }
@@ -274,30 +274,29 @@ def describe_drives(log: DriveLog, splits: Sequence[str]) -> Json:
     }
 
 
-def _owners(log: DriveLog, splits: Sequence[str]) -> ndarray:
-    """Return the split of each drive, index into the splits, shape [D].
+def _split_by_drive(log: DriveLog, splits: Sequence[str]) -> ndarray:
+    """Return the index of each drive's split, int64, shape [D].
 
-    Each split gets one drive such that the fewest rows are lost. Any other drive
-    belongs to the split with most of its rows.
+    First, each split gets one drive, chosen so that the fewest rows are lost. Each
+    remaining drive belongs to the split with most of the drive's rows.
 
     Raises:
         DatasetError: If a split gets no drive.
     """
     counts = np.zeros((len(splits), len(log.names)))
     np.add.at(counts, (log.rows["split"], log.rows["drive"]), 1)
-    owner = counts.argmax(axis=0)
+    split_by_drive = counts.argmax(axis=0)
     n_lost = counts.max(axis=0) - counts
     impossible = 2.0 * counts.sum() + 1
     costs = np.where(counts > 0, n_lost, impossible)
     assigned, drives = linear_sum_assignment(costs)
-    owner[drives] = assigned
+    split_by_drive[drives] = assigned
     is_empty = counts[assigned, drives] == 0
     empty = [splits[split] for split in assigned[is_empty]]
     if empty:
         raise DatasetError(
-            "Expected a drive of its own on the terrain of each split, got none for "
-            f"{', '.join(empty)} in "
-            f"{log.settings.file}. Take fewer --splits, other fractions, smaller maps, "
-            "or drives over more terrain."
+            "Expected each split to have at least one drive of its own on its terrain, "
+            f"got none for {', '.join(empty)} in {log.settings.file}. Use fewer "
+            "--splits, other fractions, smaller maps, or drives over more terrain."
         )
-    return owner
+    return split_by_drive

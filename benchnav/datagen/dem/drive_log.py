@@ -1,13 +1,16 @@
 """Log of a robot's drives: positions, speeds, and the resulting λ.
 
-A row is a moment of a drive. Columns: `time_s`; the position, `x_m` and `y_m` in the
-coordinate reference system of the elevation model or `longitude_deg` and `latitude_deg`
-(WGS 84); `commanded_m_s` and `measured_m_s`, speeds forward over ground; optionally
-`drive`, its name. λ is the ratio of measured to commanded speed in rows with a command
-to move. The ratio of a row may lie beyond [0, 1], since robots slide back and run
-downhill. It is clipped only when it is stored.
+A row is a moment of a drive. Its columns are:
 
-Letters in shapes: N rows that are used.
+- `time_s`: time in seconds;
+- `x_m` and `y_m`: position in the coordinate reference system of the elevation model;
+  or `longitude_deg` and `latitude_deg`: position in WGS 84;
+- `commanded_m_s` and `measured_m_s`: forward speed over ground;
+- `drive`: name of the drive, optional.
+
+λ is the ratio of measured to commanded speed in rows with a command to move. The ratio
+of a row may lie outside [0, 1], since robots slide back and run downhill. It is clipped
+only when it is stored. Letters in shapes: N used rows.
 """
 
 from collections.abc import Mapping, Sequence
@@ -31,23 +34,25 @@ from benchnav.datagen.files.robot_logs import (
 
 # Thresholds that are a choice of this package are marked (choice).
 MIN_SPEED_M_S = 0.1
-# Off-road robots are slower, unless they are logged in km/h or cm/s.
+# Off-road robots are slower. A larger value indicates a speed in km/h or cm/s.
 MAX_SPEED_M_S = 15.0
-TOP_RATIO = 1.5  # times the top command, which no robot exceeds (choice)
-# Times the command, which noise and downhill driving seldom exceed (choice).
+# Ratio of speed to the top command that no robot exceeds (choice).
+TOP_RATIO = 1.5
+# Ratio of speed to command that is seldom exceeded, by noise or downhill (choice).
 OVER_SPEED = 1.2
-# Ratios of distances by positions and by measured speed that count as equal (choice).
+# Limits of the ratio of the distance by positions to the distance by measured speed,
+# within which the two count as equal (choice).
 PACE_LIMITS = (0.85, 1.15)
 MAX_FAULTY = 0.1  # maximum fraction of rows with faults of one kind (choice)
 POSITION_COLUMNS = {"crs": ("x_m", "y_m"), "WGS 84": ("longitude_deg", "latitude_deg")}
 _SPEED_COLUMNS = ("commanded_m_s", "measured_m_s")
-_METRES_PER_DEGREE = 111_320  # of latitude
+_METRES_PER_DEGREE = 111_320  # per degree of latitude
 _LIMITS = {"longitude_deg": (-180.0, 360.0), "latitude_deg": (-90.0, 90.0)}
-_CLOCK = "Convert clock times to seconds, such as those since the start of the drive."
+_TIME_REMEDY = "Convert clock times to seconds, such as since the start of the drive."
 
 # Reasons why rows are left out, in the order of the checks.
 REASONS = {
-    "missing": "lack a value, or neighbouring positions",
+    "missing": "lack a value or neighbouring positions",
     "off_dem": "lie off the elevation model",
     "doubled": "repeat another row",
     "restarted": "have a time before an earlier row of their drive",
@@ -55,7 +60,7 @@ REASONS = {
     "jumped": f"have a position out of reach at {TOP_RATIO:g} times the top command",
     "off_pace": "belong to a drive whose positions and measured speed disagree by more "
     "than 15 %",
-    "slow": "were commanded less than the least speed (standing, turning in place)",
+    "slow": "have a commanded speed below `least_speed` (standing, turning in place)",
     "implausible": f"have a speed above {MAX_SPEED_M_S:g} m/s or above {TOP_RATIO:g} "
     "times the top command",
     "between_maps": "lie between the maps",
@@ -68,11 +73,11 @@ class Drives:
     """File of a log of drives, and the selection of its rows.
 
     Args:
-        file: Table, CSV, TSV, one of these with .gz, or Parquet.
+        file: Path of the table: CSV, TSV, one of these with .gz, or Parquet.
         least_speed: Minimum commanded speed of used rows, forward or backward [m/s].
-        speed: Source of the speed over ground: `positions`, or `measured` as logged,
-            without comparison. If empty, measured speed, which must agree with the
-            positions.
+        speed: Source of the speed over ground: `positions`, or `measured` for the
+            logged speed without a comparison with positions. If empty, measured speed,
+            which must agree with the positions.
     """
 
     file: str
@@ -84,15 +89,15 @@ class Drives:
         expect(
             self.file.endswith(ENDINGS),
             f"`drives` to end in one of {', '.join(ENDINGS)}, got {self.file!r}. "
-            "Write such a table, with a header.",
+            "Save the log as a table in one of these formats, with a header.",
         )
         expect(
             0 < self.least_speed < np.inf,
-            f"`least_speed` above 0 m/s, got {self.least_speed:g}.",
+            f"`least_speed` above 0 m/s and finite, got {self.least_speed:g}.",
         )
         expect(
             self.speed in ("", "positions", "measured"),
-            f"`speed` to be 'positions' or 'measured', got {self.speed!r}.",
+            f"`speed` to be 'positions', 'measured' or empty, got {self.speed!r}.",
         )
 
 
@@ -101,17 +106,17 @@ class DriveLog:
     """Used rows of a log.
 
     Args:
-        settings: the file, and the selection of its rows.
-        sha256: digest of the file.
-        names: names of its drives.
+        settings: path of the file, and the selection of its rows.
+        sha256: SHA-256 digest of the file.
+        names: names of the drives.
         is_geographic: whether positions are longitude and latitude; else they are in
             the elevation model's CRS.
-        rows: a table of N rows: `x`, `y`, `time_s`, `commanded` and `speed` (m/s,
+        rows: table of N rows: `x`, `y`, `time_s`, `commanded` and `speed` (m/s,
             signed), `drive` (index into `names`) and, once speeds are compared with
-            positions, `traversability` (speed over commanded).
+            positions, `traversability` (ratio of `speed` to `commanded`).
         left_out: number of unused rows by reason.
-        motion: results of the comparison of positions with speeds, and the resolution
-            of positions, 0 if it is fine.
+        motion: results of the comparison of positions with speeds, and `resolution_m`,
+            the resolution of positions.
     """
 
     settings: Drives
@@ -129,48 +134,48 @@ class DriveLog:
 
     @property
     def resolution_m(self) -> float:
-        """Resolution of positions in metres; 0 if it is fine or unknown."""
+        """Resolution of positions in metres; 0 if below centimetres or unknown."""
         return float(self.motion.get("resolution_m", 0.0))
 
     def without(self, reason: str, mask: ndarray) -> "DriveLog":
         """Return the log without some rows.
 
         Args:
-            reason: reason, one of `REASONS`.
-            mask: rows to leave out, bool, shape [N].
+            reason: key of `REASONS`.
+            mask: mask of the rows to leave out, bool, shape [N].
 
         Raises:
             DatasetError: If no row remains.
         """
         left_out = {**self.left_out, reason: int(mask.sum())}
         if mask.all():
-            raise self._error_of_no_row(left_out)
+            raise self._no_row_error(left_out)
         rows = self.rows[~mask].reset_index(drop=True)
         return replace(self, rows=rows, left_out=left_out)
 
-    def _error_of_no_row(self, left_out: Mapping[str, int]) -> DatasetError:
+    def _no_row_error(self, left_out: Mapping[str, int]) -> DatasetError:
         counts = {name: count for name, count in left_out.items() if count}
         why = " below the header"
         if counts:
             reasons = [f"{count} {REASONS[name]}" for name, count in counts.items()]
-            why = f": of {sum(counts.values())}, {', '.join(reasons)}"
+            why = f": of {sum(counts.values())} rows, {', '.join(reasons)}"
         speeds = "both speeds"
         if self.settings.speed == "positions":
             speeds = "commanded speed"
         return DatasetError(
-            f"Expected rows of drives to learn from in {self.settings.file}, got "
-            f"none{why}. Log time, position and {speeds} on the move."
+            f"Expected usable rows of drives in {self.settings.file}, got "
+            f"none{why}. Log time, position and {speeds} while the robot moves."
         )
 
 
 def read_drives(drives: Drives) -> DriveLog:
     """Return a log of drives, without rows that lack a value.
 
-    If `speed` is `positions`, the log needs no measured speed.
+    If `drives.speed` is `positions`, the file need not contain measured speed.
 
     Raises:
         DatasetError: If the file is missing, cannot be read, lacks a column, contains
-            invalid numbers, has speeds in another unit, or no row remains.
+            invalid numbers or speeds that are not in m/s, or no row remains.
     """
     path = Path(drives.file)
     rows = read_log(path)
@@ -185,11 +190,11 @@ def read_drives(drives: Drives) -> DriveLog:
     for name in speed_names:
         speed = np.abs(values[name])
         moving = speed[speed >= drives.least_speed]
-        usual = pd.Series(moving).median()
-        if usual > MAX_SPEED_M_S:
+        median_speed = pd.Series(moving).median()
+        if median_speed > MAX_SPEED_M_S:
             raise DatasetError(
-                f"Expected `{name}` in m/s in {path}, got a median of {usual:.4g} "
-                "while moving, which looks like "
+                f"Expected `{name}` in m/s in {path}, got a median of "
+                f"{median_speed:.4g} while moving, which looks like "
                 "another unit. Divide km/h by 3.6, cm/s by 100 and mm/s by 1000."
             )
     drive_names = np.array([path.name])
@@ -200,7 +205,7 @@ def read_drives(drives: Drives) -> DriveLog:
     x, y = (values[name] for name in position_names)
     measured = values.get("measured_m_s", np.full(len(rows), np.nan))
     if by_positions and "measured_m_s" in rows:
-        # It only serves for the comparison with positions.
+        # Measured speed is only compared with positions here, so it has no limits.
         measured = read_numbers(rows, "measured_m_s", path, (-np.inf, np.inf))
     table = pd.DataFrame(
         {
@@ -226,7 +231,7 @@ def read_drives(drives: Drives) -> DriveLog:
 
 
 def _require_columns(rows: pd.DataFrame, columns: Sequence[str], path: Path) -> None:
-    """Check that a log has all columns, or raise an error with a remedy."""
+    """Raise an error with a remedy if a log lacks a column."""
     missing = set(columns) - set(rows)
     remedy = "Name positions x_m and y_m, or longitude_deg and latitude_deg for WGS 84."
     if missing.isdisjoint((*POSITION_COLUMNS["crs"], *POSITION_COLUMNS["WGS 84"])):
@@ -242,12 +247,15 @@ def _read_column(rows: pd.DataFrame, name: str, path: Path) -> ndarray:
     swapped = "Swap `longitude_deg` and `latitude_deg`, or convert to degrees."
     number = "Convert the column to numbers."
     if name == "time_s":
-        number = _CLOCK
+        number = _TIME_REMEDY
     return read_numbers(rows, name, path, limits, swapped, number)
 
 
 def _resolution_m(x: ndarray, y: ndarray, *, is_geographic: bool) -> float:
-    """Return the largest step that divides all positions; 0 below some centimetres."""
+    """Return the largest decimal step that divides all positions, in metres.
+
+    It is 0 if the step is below some centimetres.
+    """
     max_decimals = 6 if is_geographic else 2
     metres = _METRES_PER_DEGREE if is_geographic else 1
     for decimals in range(max_decimals):

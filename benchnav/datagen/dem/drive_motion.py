@@ -1,10 +1,11 @@
 """Comparison of a drive log's positions with its speeds, and detection of faults.
 
-λ follows from measured speed, which must therefore be the speed over ground. Positions
-confirm this: over spans of two seconds, they must move as far as the measured speed
-implies. The ratio of their distance to that of the command is λ, and not a fault. Rows
-with an impossible time or position are left out by kind. A log with many such rows is
-rejected, since its other rows are unreliable too.
+λ is computed from measured speed, which must therefore be the speed over ground. To
+confirm this, the distance between positions is compared with the distance at the
+measured speed, over spans of two seconds. The distance between positions need not equal
+the commanded distance, since their ratio is λ. Rows with an impossible time, position
+or speed are left out. A log with many such rows is rejected, since its other rows are
+unreliable too.
 """
 
 from collections.abc import Mapping
@@ -38,23 +39,25 @@ from benchnav.datagen.dem.drive_velocity import speed_of_positions, velocity_of
 from benchnav.datagen.dem.drive_wheels import check_wheels
 
 # Thresholds that are a choice of this package are marked (choice).
-# Quantile of commands that counts as the top command, since single commands may be
-# wrong (choice).
+# Quantile of commanded speeds that counts as the top command. The maximum is not used,
+# since single commands may be wrong (choice).
 _TOP_QUANTILE = 0.99
-# Maximum climb per distance. Steeper cells of a surface model are trees and walls
-# (choice).
+# Maximum climb per horizontal distance. Steeper cells of a surface model are trees and
+# walls (choice).
 _MAX_CLIMB = 1.0
 
 _REMEDIES = {
     "restarted": "Sort the rows by time, or name each session in a column `drive`.",
     "frozen": "Leave out the rows in which the receiver had no fix.",
     "jumped": "Leave out those rows, or log filtered positions.",
-    "implausible": "Leave the value out where the robot measured none.",
+    "implausible": "Leave the speed empty in rows where it was not measured.",
 }
 
 
 def compare_motion(log: DriveLog) -> DriveLog:
-    """Return a log without faulty rows, with the ratio of measured to commanded speed.
+    """Return a log without faulty rows, with λ of each row.
+
+    λ is the ratio of measured speed (or of the speed from positions) to the command.
 
     Args:
         log: log with positions in metres.
@@ -68,7 +71,7 @@ def compare_motion(log: DriveLog) -> DriveLog:
     is_compared = log.settings.speed == ""
     by_positions = log.settings.speed == "positions"
     if by_positions:
-        # Measured speed only serves for the comparison, if it is plausible.
+        # Measured speed is only compared with positions, where it is plausible.
         measured = log.rows["speed"]
         comparable = measured.where(measured.abs() <= MAX_SPEED_M_S)
         log = replace(log, rows=log.rows.assign(speed=comparable))
@@ -98,7 +101,8 @@ def compare_motion(log: DriveLog) -> DriveLog:
         is_implausible |= np.abs(speed) > limit
     is_jumped = rows.index.isin(find_jumped(track_of(rows), limit))
     is_jumpy = bool(is_jumped.mean() > MAX_FAULTY)
-    # If many rows are faulty, the cause is a unit, which the spans of all rows show.
+    # If many rows seem faulty, the cause is probably a unit. The spans of all rows then
+    # show which unit, so faulty rows are not removed.
     is_faulty = np.zeros(len(rows), dtype=bool)
     if not is_jumpy:
         is_faulty |= is_jumped
@@ -114,10 +118,10 @@ def compare_motion(log: DriveLog) -> DriveLog:
     log = replace(log, motion=motion)
     check_pace(log, sound_rows, spans, is_jumpy=is_jumpy)
 
-    remedies = _remedies_of_scale(log)
+    remedies = _scale_remedies(log)
     if is_coarse(spans, log.resolution_m):
         remedies["jumped"] = (
-            "Log positions with more decimals: they are multiples of "
+            "Log positions with more decimals, since they are multiples of "
             f"{log.resolution_m:.2g} m."
         )
     masks = {"jumped": is_jumped}
@@ -144,14 +148,18 @@ def compare_motion(log: DriveLog) -> DriveLog:
 
 
 def compare_slopes(log: DriveLog, elevation_m: ndarray) -> DriveLog:
-    """Return a log with speeds of positions along the slope, after a check for wheels.
+    """Check measured speed for that of wheels; correct speed from positions for slope.
 
     Measured speed is that of wheels if its ratio to the command does not depend on the
-    slope, or if it equals the command where positions do not.
+    slope, or if it equals the command while positions move less far.
 
     Args:
         log: log from `compare_motion`.
-        elevation_m: elevation at each row in metres, NaN if unknown, shape [N].
+        elevation_m: elevation at each row's position in metres, NaN if unknown, shape
+            [N].
+
+    Returns:
+        The log. If its speed is from positions, speed and λ are along the slope.
 
     Raises:
         DatasetError: If measured speed is that of wheels.
@@ -177,12 +185,12 @@ def _leave_out(
 ) -> DriveLog:
     """Return a log without faulty rows; reject a log with too many of them.
 
-    A row is counted under its first reason.
+    A row with several reasons is counted under the first.
 
     Args:
-        log: the log.
-        masks: rows to leave out, by reason.
-        remedies: sentences by reason that replace those of `_REMEDIES`.
+        log: log of the drives.
+        masks: masks of the rows to leave out, by reason.
+        remedies: remedies by reason that replace those of `_REMEDIES`, each a sentence.
     """
     is_remaining = np.ones(len(log.rows), dtype=bool)
     for reason, mask in masks.items():
@@ -190,9 +198,9 @@ def _leave_out(
         remedy = remedies.get(reason) or _REMEDIES.get(reason)
         if remedy and count > MAX_FAULTY * len(mask):
             raise DatasetError(
-                f"Expected up to {MAX_FAULTY:.0%} of the rows of {log.settings.file} "
-                f"to be faulty, got {count} of "
-                f"{len(mask)} that {REASONS[reason]}. {remedy}"
+                f"Expected at most {MAX_FAULTY:.0%} of the rows of {log.settings.file} "
+                f"to be faulty, got {count} of {len(mask)} rows that "
+                f"{REASONS[reason]}. {remedy}"
             )
         before = log.left_out.get(reason, 0)
         log = log.without(reason, mask[is_remaining])
@@ -203,20 +211,22 @@ def _leave_out(
 
 
 def _check_rest(log: DriveLog, is_unknown: ndarray) -> None:
-    """Reject a log with many rows at rest, in which the receiver may have stopped."""
+    """Reject a log with many rows at rest in which the receiver may have had no fix."""
     if is_unknown.mean() > MAX_FAULTY:
         raise DatasetError(
-            "Expected positions that change to the end of the drives of "
+            "Expected positions that change until the end of each drive in "
             f"{log.settings.file}, got {is_unknown.sum()} of "
-            f"{len(is_unknown)} rows under command whose position stays the same to "
-            "the end. Log `measured_m_s` there, 0 "
-            "where the robot was immobilised, or leave the rows out where the "
-            "receiver had no fix."
+            f"{len(is_unknown)} rows under command whose position stays the same until "
+            "the end. Log `measured_m_s` in these rows, 0 where the robot was "
+            "immobilised, or leave out the rows in which the receiver had no fix."
         )
 
 
 def _pace_ratios(spans: pd.DataFrame) -> dict[str, float | None]:
-    """Return the ratio of positions to each speed, to three digits; None if unknown."""
+    """Return the ratio of distance by positions to distance by each speed, by name.
+
+    A ratio has three digits; it is None if it is unknown.
+    """
     paces = {}
     for name, speed in (("pace", "measured"), ("commanded_pace", "commanded")):
         ratio = median_ratio(spans, speed)
@@ -224,23 +234,23 @@ def _pace_ratios(spans: pd.DataFrame) -> dict[str, float | None]:
     return paces
 
 
-def _remedies_of_scale(log: DriveLog) -> dict[str, str]:
-    """Return remedies by reason if commands are logged too low."""
+def _scale_remedies(log: DriveLog) -> dict[str, str]:
+    """Return remedies by reason if commands are logged too low; else an empty dict."""
     ratio = log.motion["commanded_pace"]
     if ratio is None or ratio <= OVER_SPEED:
         return {}
     remedy = (
-        f"Since positions move {ratio:g} times as far as `commanded_m_s` says, scale "
-        "it by steady driving on flat, "
-        "firm terrain."
+        f"Positions move {ratio:g} times as far as `commanded_m_s` implies: calibrate "
+        "`commanded_m_s` by steady driving on flat, firm terrain."
     )
     return {"jumped": remedy, "implausible": remedy}
 
 
 def _n_reverses(log: DriveLog, positions_speed: ndarray, is_driven: ndarray) -> int:
-    """Return the number of rows in which only positions move against the command.
+    """Return the number of rows whose positions move opposite to the command.
 
-    It is 0 if measured speed is signed.
+    Measured speed does not show this motion. The result is 0 if measured speed is
+    signed.
     """
     commanded = log.rows["commanded"].to_numpy()
     speed = log.rows["speed"].to_numpy()

@@ -1,7 +1,7 @@
-"""Pace of a drive log: distances by its positions compared with those by its speeds.
+"""Pace of a drive log: ratio of the distance by positions to the distance by speed.
 
-If they disagree, the log is rejected, and the error names the unit or fault that
-explains it.
+If positions and speeds disagree, the log is rejected. The error names the unit or fault
+that explains the disagreement.
 """
 
 import math
@@ -15,7 +15,7 @@ from benchnav.datagen.dem.drive_log import PACE_LIMITS, DriveLog
 from benchnav.datagen.dem.drive_tracks import MIN_SPANS
 from benchnav.datagen.dem.drive_units import (
     median_ratio,
-    no_unit,
+    no_unit_text,
     unit_of,
     unit_of_command,
 )
@@ -33,14 +33,14 @@ def check_pace(
     """Reject a log whose positions and measured speed disagree.
 
     Args:
-        log: the log.
-        rows: its rows, without faulty ones.
+        log: log of the drives.
+        rows: rows of the log without faulty ones.
         spans: spans of these rows.
-        is_jumpy: whether positions jump so often that only a ratio that fits a unit is
-            reliable.
+        is_jumpy: whether positions jump so often that the log is rejected only if a
+            unit explains the ratio.
 
     Raises:
-        DatasetError: If they disagree, or nothing can be compared.
+        DatasetError: If positions and measured speed disagree, or cannot be compared.
     """
     path = log.settings.file
     speed = log.settings.speed
@@ -48,11 +48,10 @@ def check_pace(
         times = log.rows.groupby("drive")["time_s"]
         longest_s = (times.max() - times.min()).max()
         raise DatasetError(
-            f"Expected motion under one command in {path}, to compare positions with "
-            "`measured_m_s`, got none in "
+            f"Expected motion under a command in {path}, to compare positions with "
+            "`measured_m_s`, got no such motion in "
             f"drives of up to {longest_s:.3g} s. Log `time_s` "
-            "in seconds, or pass --speed "
-            "measured."
+            "in seconds, or pass --speed measured."
         )
     if speed == "positions" and spans["measured"].isna().all():
         _check_command(log, rows, spans)
@@ -72,14 +71,14 @@ def check_pace(
             unit = "wheel odometry, since it equals `commanded_m_s`"
             remedy = "Log the speed over ground"
         advice = (
-            f"{remedy}, or pass --speed positions; pass --speed measured if "
-            "measured_m_s is right and positions are not."
+            f"{remedy}, or pass --speed positions. If `measured_m_s` is right and "
+            "positions are not, pass --speed measured."
         )
-    reason = unit or no_unit(spans, log.resolution_m)
+    reason = unit or no_unit_text(spans, log.resolution_m)
     low, high = PACE_LIMITS
     raise DatasetError(
         f"Expected positions to move {low:g} to {high:g} times "
-        "as far as `measured_m_s` says, got "
+        "as far as `measured_m_s` implies, got "
         f"{ratio:.3g} times in {path}, which looks like "
         f"{reason}. {advice}"
     )
@@ -93,7 +92,7 @@ def _is_within_limits(ratio: float) -> bool:
 def _unit_of(
     log: DriveLog, rows: pd.DataFrame, spans: pd.DataFrame
 ) -> tuple[str, str, bool]:
-    """Return the unit that explains some rows of a log; see `unit_of`."""
+    """Return `drive_units.unit_of` for some rows of a log."""
     return unit_of(
         rows,
         spans,
@@ -104,29 +103,30 @@ def _unit_of(
 
 
 def _check_command(log: DriveLog, rows: pd.DataFrame, spans: pd.DataFrame) -> None:
-    """Reject positions whose ratio to the command is an implausible λ."""
+    """Reject a log whose distance by positions over the commanded one is no valid λ."""
     least_speed = log.settings.least_speed
     is_geographic = log.is_geographic
-    of_command = unit_of_command(rows, spans, least_speed, is_geographic=is_geographic)
-    if of_command is not None:
-        ratio, unit, remedy = of_command
+    result = unit_of_command(rows, spans, least_speed, is_geographic=is_geographic)
+    if result is not None:
+        ratio, unit, remedy = result
         raise DatasetError(
             "Expected positions in metres and times in seconds in "
             f"{log.settings.file}, got positions that move "
-            f"{ratio:.3g} times as far as `commanded_m_s` says, which looks like "
+            f"{ratio:.3g} times as far as `commanded_m_s` implies, which looks like "
             f"{unit}. {remedy}."
         )
 
 
 def check_sign(log: DriveLog, is_driven: ndarray) -> None:
-    """Reject measured speed of the opposite sign to the command.
+    """Reject measured speed whose sign is opposite to the command's sign.
 
     Args:
-        log: the log.
-        is_driven: rows that count, bool, shape [N].
+        log: log of the drives.
+        is_driven: mask of the rows to check, bool, shape [N].
 
     Raises:
-        DatasetError: If more than 5 % of the rows have the opposite sign.
+        DatasetError: If the signs differ in more than 5 % of the rows and in most rows
+            of a direction.
     """
     commanded = log.rows["commanded"].to_numpy()[is_driven]
     measured = log.rows["speed"].to_numpy()[is_driven]
@@ -137,12 +137,12 @@ def check_sign(log: DriveLog, is_driven: ndarray) -> None:
         against = int((ratios < 0).sum())
         if against > _MAX_AGAINST * len(ratio) and np.median(ratios) < 0:
             raise DatasetError(
-                "Expected `measured_m_s` of the sign of `commanded_m_s` in "
-                f"{log.settings.file}, got the other one in "
+                "Expected `measured_m_s` to have the sign of `commanded_m_s` in "
+                f"{log.settings.file}, got the opposite sign in "
                 f"{against} of {len(ratios)} rows commanded {direction}. Log "
-                "speed forward over ground, "
-                "negative backward, or pass --speed positions, or --speed measured to "
-                "take the rows as they are."
+                "the forward speed over ground, negative when the robot moves "
+                "backward, or pass --speed positions, or --speed measured to use the "
+                "rows unchanged."
             )
 
 
@@ -150,11 +150,11 @@ def off_pace(log: DriveLog, spans: pd.DataFrame) -> tuple[ndarray, str]:
     """Return a mask of rows of drives whose positions and measured speed disagree.
 
     Args:
-        log: the log.
-        spans: spans of its rows.
+        log: log of the drives.
+        spans: spans of the log's rows.
 
     Returns:
-        bool, shape [N], and a remedy, a sentence.
+        The mask, bool, shape [N]; and a remedy, in sentences.
     """
     is_off = np.zeros(len(log.names), dtype=bool)
     for drive, drive_spans in spans.groupby("drive"):
@@ -173,10 +173,10 @@ def off_pace(log: DriveLog, spans: pd.DataFrame) -> tuple[ndarray, str]:
     if len(names) > _SHOWN_DRIVES:
         names = [*names[:_SHOWN_DRIVES], "…"]
     ratio = median_ratio(off_spans, "measured")
-    reason = unit or no_unit(off_spans, log.resolution_m)
+    reason = unit or no_unit_text(off_spans, log.resolution_m)
     advice = (
-        f"Positions move {ratio:.3g} times as far as `measured_m_s` says, which looks "
-        f"like {reason} in {', '.join(names)}. {remedy} there, leave those drives out, "
-        "or pass --speed positions."
+        f"In {', '.join(names)}, positions move {ratio:.3g} times as far as "
+        f"`measured_m_s` implies, which looks like {reason}. {remedy} there, leave "
+        "those drives out, or pass --speed positions."
     )
     return is_off_row, advice

@@ -1,9 +1,10 @@
-"""Tracks of a drive log: positions over time, faults in them, and spans of motion.
+"""Tracks of a drive log: positions over time, faulty positions, and spans of motion.
 
 A *track* is the rows of a log, ordered by drive and time. A *segment* is a part of a
-track without a gap. A *fix* is consecutive rows of one position, since logs repeat a
-position until the receiver gives the next. Distances are horizontal, in metres.
-`drive_velocity` derives velocities from tracks.
+track without a gap in time. A *fix* is a group of consecutive rows with the same
+position, since logs repeat a position until the receiver determines the next. A *knot*
+is a row with a measured position. A *span* is the motion during about two seconds.
+Distances are horizontal, in metres. `drive_velocity` computes velocities from tracks.
 
 Letters in shapes: N rows.
 """
@@ -15,11 +16,13 @@ import pandas as pd
 from numpy import ndarray
 
 # Thresholds that are a choice of this package are marked (choice).
-# Over this time, the noise of positions is small compared with the distance.
+# Duration of a span, in which the distance is large compared with position noise.
 WINDOW_S = 2.0
 MIN_SPANS = 5  # minimum number of spans for a median (choice)
-GAP_S = 1.0  # a longer time without a row is a gap, in which motion is unknown
-_FREEZE_FIXES = 3  # periods for which a position may stay the same (choice)
+# Maximum time between rows in a segment. In a longer gap, motion is unknown.
+GAP_S = 1.0
+# Maximum number of periods of fixes for which a position may stay the same (choice).
+_FREEZE_FIXES = 3
 # Cosine of the angle between neighbouring spans above which they are straight: a chord
 # is then at most 1 % shorter than its arc.
 _STRAIGHT_COS = 0.9
@@ -30,8 +33,8 @@ _MAX_BEND = math.radians(150)
 def find_restarted(rows: pd.DataFrame) -> ndarray:
     """Return a mask of rows whose time is before that of an earlier row of their drive.
 
-    Rows that are only out of order are not a restart: sorted by time, their track is
-    shorter than in the order of the file.
+    If sorting a drive's rows by time shortens the track, the rows are only out of
+    order; no time restarted, and the mask is False.
 
     Returns:
         bool, shape [N].
@@ -48,7 +51,7 @@ def find_restarted(rows: pd.DataFrame) -> ndarray:
 
 
 def _length_m(rows: pd.DataFrame) -> pd.Series:
-    """Return the length of each drive, with its rows in their present order."""
+    """Return the length of each drive's track in metres, in the order of the rows."""
     by_drive = rows.groupby("drive")
     step_m = np.hypot(by_drive["x"].diff(), by_drive["y"].diff())
     return step_m.groupby(rows["drive"]).sum()
@@ -61,15 +64,16 @@ def track_of(rows: pd.DataFrame) -> pd.DataFrame:
         rows: rows of a log.
 
     Returns:
-        The rows with their index, and with the columns `step_s` (time since the row
-        before, 0 after a gap), `segment` and `fix`.
+        The ordered rows with their index, and with three more columns: `step_s` (time
+        since the previous row in seconds, 0 after a gap), and the numbers of their
+        `segment` and `fix`.
     """
     track = rows.sort_values(["drive", "time_s"], kind="stable")
     drive = track["drive"]
     step_s = track.groupby("drive")["time_s"].diff()
-    usual_s = step_s.groupby(drive).transform("median")
-    max_step_s = np.maximum(GAP_S, 3 * usual_s)
-    # NaN is the first row of a drive, which starts a segment too.
+    median_s = step_s.groupby(drive).transform("median")
+    max_step_s = np.maximum(GAP_S, 3 * median_s)
+    # The first row of a drive, whose step is NaN, also starts a segment.
     starts = ~(step_s <= max_step_s)
     changes = (track[["drive", "x", "y"]].diff() != 0).any(axis=1)
     step_s = step_s.where(~starts, 0.0)
@@ -77,13 +81,13 @@ def track_of(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def _fixes(track: pd.DataFrame) -> pd.DataFrame:
-    """Return the first row of each fix, with its number of `rows`, by `fix`."""
+    """Return a table by `fix`: the first row of the fix, and its number of `rows`."""
     grouped = track.groupby("fix")
     return grouped.first().assign(rows=grouped.size())
 
 
 def _period_s(fixes: pd.DataFrame) -> pd.Series:
-    """Return the median time between fixes of each fix's drive; 0 for one fix."""
+    """Return for each fix the median time between fixes of its drive; 0 for one fix."""
     step_s = fixes.groupby("drive")["time_s"].diff()
     by_drive = step_s.groupby(fixes["drive"])
     return by_drive.transform("median").fillna(0)
@@ -96,10 +100,11 @@ def period_of(track: pd.DataFrame) -> float:
 
 
 def knots_of(track: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows with a measured position: starts of fixes, and long repeats.
+    """Return the rows with a measured position, the knots.
 
-    If a position stays the same for more than three periods, the robot is at rest, and
-    its position is measured once per period.
+    These are the first rows of fixes. In addition, if a position stays the same for
+    more than three periods of fixes, the robot is at rest, and one row per period is a
+    knot.
 
     Args:
         track: track from `track_of`.
@@ -120,21 +125,23 @@ def knots_of(track: pd.DataFrame) -> pd.DataFrame:
 def find_standing(
     track: pd.DataFrame, least_speed: float, *, by_positions: bool
 ) -> pd.DataFrame:
-    """Return masks of rows whose position does not change for more than three fixes.
+    """Return masks of rows whose position stays the same for over three periods.
 
-    Only rows under a command count. If the robot moves, the receiver is frozen: either
-    the measured speed or a distant next position shows this. A robot that stands still
-    under its command is immobilised, which is not a fault.
+    Only rows under a command are used. If the robot moves meanwhile, the receiver is
+    frozen: either the measured speed or a distant next position indicates this. A robot
+    that stands still under its command is immobilised, which is not a fault.
 
     Args:
         track: track from `track_of`; `speed` is NaN where it was not measured.
-        least_speed: minimum speed of commands that count, and of a moving robot [m/s].
+        least_speed: minimum speed of used commands and of a moving robot [m/s].
         by_positions: whether a frozen position also requires a distant next position.
 
     Returns:
-        Masks by the track's index, False in the first row of each fix: `is_frozen`;
-        `is_unmeasured`, immobilised according to positions only; `is_unknown`, those of
-        them without a next position.
+        A table by the track's index, False in the first row of each fix:
+            is_frozen: whether the receiver is frozen.
+            is_unmeasured: whether the robot is immobilised and measured speed is
+                missing.
+            is_unknown: whether measured speed and a next position are missing.
     """
     fix = track["fix"]
     fixes = _fixes(track)
@@ -142,15 +149,15 @@ def find_standing(
     by_drive = fixes.groupby("drive")
     step_m = np.hypot(by_drive["x"].diff(), by_drive["y"].diff())
     steps_by_drive = step_m.groupby(fixes["drive"])
-    usual_m = steps_by_drive.transform("median").fillna(0)
+    median_m = steps_by_drive.transform("median").fillna(0)
     next_m = steps_by_drive.shift(-1)
     is_repeat = fix.diff() == 0
     is_commanded = track["commanded"].abs() >= least_speed
-    counts = is_repeat & is_commanded
-    still_s = track["step_s"].where(counts, 0).groupby(fix).sum()
-    distance_m = (track["speed"] * track["step_s"]).where(counts)
+    is_used = is_repeat & is_commanded
+    still_s = track["step_s"].where(is_used, 0).groupby(fix).sum()
+    distance_m = (track["speed"] * track["step_s"]).where(is_used)
     measured_m = distance_m.groupby(fix).sum(min_count=1).abs()
-    moving_m = np.maximum(_FREEZE_FIXES * usual_m, least_speed * still_s)
+    moving_m = np.maximum(_FREEZE_FIXES * median_m, least_speed * still_s)
     is_still = still_s > np.maximum(_FREEZE_FIXES * period_s, GAP_S)
     is_unmeasured = is_still & measured_m.isna()
     is_unknown = is_unmeasured & next_m.isna()
@@ -169,15 +176,16 @@ def find_standing(
 
 
 def find_jumped(track: pd.DataFrame, limit_m_s: float) -> pd.Index:
-    """Return the labels of rows whose position cannot be reached from the others.
+    """Return the labels of rows whose position cannot be reached from correct ones.
 
-    The longest stretch of a drive without a jump is correct. From there, forward and backward, a
-    position is correct if it is in reach of the last correct one. Within less than a
-    second, noise may exceed the reach, so times count as at least a second.
+    The longest stretch of a drive without a jump is correct. From there, forward and
+    backward, a position is correct if the robot can reach it from the last correct
+    position. Over short times, noise may exceed the distance that a robot can move, so
+    a time below a second is replaced by a second.
 
     Args:
         track: track from `track_of`.
-        limit_m_s: speed that a robot cannot exceed.
+        limit_m_s: maximum speed of the robot in m/s.
     """
     fixes = _fixes(track)
     jumped = [fixes.index[:0]]  # for a track without drives
@@ -189,7 +197,7 @@ def find_jumped(track: pd.DataFrame, limit_m_s: float) -> pd.Index:
 
 
 def _is_reached(fixes: pd.DataFrame, limit_m_s: float) -> ndarray:
-    """Return a mask of the fixes of a drive that are in reach of each other."""
+    """Return a mask of the fixes with a correct position, as in `find_jumped`."""
     time_s = fixes["time_s"].to_numpy()
     x_m = fixes["x"].to_numpy()
     y_m = fixes["y"].to_numpy()
@@ -219,18 +227,25 @@ def spans_of(
 ) -> pd.DataFrame:
     """Return the motion under command, summed over spans of time.
 
-    If fixes are rarer than spans, a span reaches from one fix to the next.
+    If the time between fixes is longer than `span_s`, a span lasts from one fix to the
+    next.
 
     Args:
         track: track from `track_of`; for slopes, with elevation `z` in metres.
-        least_speed: minimum commanded speed of spans that count [m/s].
+        least_speed: minimum commanded speed of returned spans [m/s].
         span_s: duration of a span in seconds.
 
     Returns:
-        A table with a row for each span: `drive`, `duration_s`, `moved` (metres along
-        the arc between positions), `measured` and `commanded` (metres by speed),
-        `is_moving`, `is_straight`, `is_steady` (one command), and `slope_deg` along the
-        track if it has `z`.
+        A table with a row for each span:
+            drive: index of the drive.
+            duration_s: duration in seconds.
+            moved: distance along the arc between positions, in metres.
+            measured: distance at the measured speed, in metres.
+            commanded: distance at the commanded speed, in metres.
+            is_moving: whether positions or measured speed show motion.
+            is_straight: whether the track is straight.
+            is_steady: whether the command is constant.
+            slope_deg: slope along the track in degrees, if the track has `z`.
     """
     knots = knots_of(track)
     span = _span_of(track, knots, span_s)
@@ -239,7 +254,7 @@ def spans_of(
         distance_m = track[column] * track["step_s"]
         sums[name] = distance_m.groupby(track["segment"]).cumsum()
     table = track.assign(span=span, command=track["commanded"], **sums)
-    # A span reaches from its first measured position to that of the next span.
+    # A span lasts from its first measured position to the first one of the next span.
     firsts = table.loc[knots.index].groupby(["segment", "span"]).first()
     commands = table.groupby(["segment", "span"])["command"].agg(["min", "max"])
     columns = [*sums, "x", "y", "time_s"]
@@ -247,7 +262,7 @@ def spans_of(
         columns.append("z")
     steps = firsts[columns].groupby("segment").diff(-1)
     chord_m = np.hypot(steps["x"], steps["y"])
-    # On an arc, neighbouring chords differ in direction by the angle of one chord's arc.
+    # On an arc, the angle between neighbouring chords is the angle of a chord's arc.
     next_steps = steps.groupby("segment").shift(-1)
     after = angle_between(steps, next_steps)
     before = after.groupby("segment").shift(1)
@@ -272,12 +287,13 @@ def spans_of(
 
 
 def _span_of(track: pd.DataFrame, knots: pd.DataFrame, span_s: float) -> pd.Series:
-    """Return the index of each row's span, given by the last measured position."""
+    """Return the number of each row's span, that of the last measured position."""
     period_s = knots.groupby("segment")["time_s"].diff().median()
     times = track.groupby("drive")["time_s"]
     longest_s = (times.max() - times.min()).max()
     window_s = np.fmax(span_s, period_s)
-    # If times are in hours, the log seems short; its spans' ratio then shows the unit.
+    # If times are logged in hours, the log seems short. Its shortened spans then allow
+    # `drive_units` to find this unit.
     if 0 < longest_s < MIN_SPANS * window_s:
         window_s = longest_s / MIN_SPANS
     span = np.floor(knots["time_s"] / window_s)
@@ -285,7 +301,10 @@ def _span_of(track: pd.DataFrame, knots: pd.DataFrame, span_s: float) -> pd.Seri
 
 
 def angle_between(vectors: pd.DataFrame, others: pd.DataFrame) -> pd.Series:
-    """Return signed angles in (-π, π] from vectors to others, in columns `x`, `y`."""
+    """Return signed angles in (−π, π] from `vectors` to `others`, row by row.
+
+    Both tables have the columns `x` and `y`.
+    """
     cross = vectors["x"] * others["y"] - vectors["y"] * others["x"]
     dot = vectors["x"] * others["x"] + vectors["y"] * others["y"]
     # Adding 0.0 turns -0.0 into 0.0: a zero vector has the angle 0 instead of π.

@@ -7,18 +7,20 @@ import pandas as pd
 from benchnav.datagen.dem.drive_tracks import MIN_SPANS, spans_of, track_of
 
 # Thresholds are choices of this package.
-_UNIT_TOLERANCE = 0.08  # relative error of a ratio that counts as that of a unit
-_MIN_LAMBDA = 0.05  # minimum and maximum λ of a whole log
-_MAX_LAMBDA = 1.3
-# A larger ratio of positions to the command shows that a time is in another unit.
+_UNIT_TOLERANCE = 0.08  # maximum relative difference of a ratio from that of a unit
+_MIN_LAMBDA = 0.05  # minimum median λ of a log
+_MAX_LAMBDA = 1.3  # maximum median λ of a log
+# A larger ratio of distance by positions to commanded distance indicates a wrong unit.
 _MAX_COMMAND_RATIO = 5.0
-# Quantile of a log's spans, since some may show an immobilised robot.
-_FASTEST = 0.95
-# Below this ratio of measured to commanded speed, measured speed is not that of wheels.
-_SLIPS = 0.9
-_COARSE = 0.25  # maximum resolution of positions over the distance of a span
+# Quantile of λ over spans that counts as the maximum. A median could be that of an
+# immobilised robot.
+_FAST_QUANTILE = 0.95
+# If the ratio of measured to commanded speed is lower, measured speed is over ground.
+_MIN_WHEEL_RATIO = 0.9
+# Maximum ratio of the resolution of positions to the distance of a span.
+_COARSE = 0.25
 
-# Ratio of positions to measured speed, by the unit of speed.
+# Ratio of distance by positions to distance by measured speed, by the unit of speed.
 _SPEEDS = {
     "knots": 0.5144,
     "km/h": 1 / 3.6,
@@ -37,13 +39,13 @@ _TIMES = {
 # Units of length per metre.
 _LENGTHS = {"feet": 3.281, "centimetres": 100.0, "millimetres": 1000.0}
 _NO_UNIT = "no known unit"
-_METRES = "Bring speeds to m/s, times to s and positions to m"
+_CONVERT = "Convert speeds to m/s, times to s and positions to m"
 
 
 def median_ratio(spans: pd.DataFrame, speed: str) -> float:
-    """Return the median ratio of distances by positions and by a speed.
+    """Return the median ratio of distance by positions to distance by a speed.
 
-    If there are enough straight spans, only these count.
+    If there are enough straight spans, only these are used.
 
     Args:
         spans: spans from `drive_tracks.spans_of`.
@@ -56,8 +58,8 @@ def median_ratio(spans: pd.DataFrame, speed: str) -> float:
     return float(ratio.median())
 
 
-def no_unit(spans: pd.DataFrame, resolution_m: float) -> str:
-    """Return the text of messages if no unit fits, with the reason."""
+def no_unit_text(spans: pd.DataFrame, resolution_m: float) -> str:
+    """Return the words "no known unit", with a reason if one is found."""
     if is_coarse(spans, resolution_m):
         return f"{_NO_UNIT}, since positions are multiples of {resolution_m:.2g} m"
     if _is_winding(spans):
@@ -70,7 +72,7 @@ def _n_straight(spans: pd.DataFrame) -> int:
 
 
 def _is_winding(spans: pd.DataFrame) -> bool:
-    """Return whether the track winds between positions, which shortens distances."""
+    """Return whether the track winds, so that positions show too short distances."""
     min_straight = min(MIN_SPANS, len(spans))
     return _n_straight(spans) < min_straight and median_ratio(spans, "measured") < 1
 
@@ -98,17 +100,18 @@ def unit_of(
     Args:
         rows: rows of a log.
         spans: spans of these rows.
-        least_speed: minimum commanded speed of spans that count [m/s].
-        is_geographic: whether positions are angles, which have no other unit.
+        least_speed: minimum commanded speed of used spans [m/s].
+        is_geographic: whether positions are longitudes and latitudes, always in
+            degrees.
         resolution_m: resolution of positions in metres.
 
     Returns:
-        The unit, empty if no unit fits; the remedy without a full stop; whether it is a
-        unit of times or positions.
+        The unit, empty if no unit fits; the remedy without a full stop; whether the
+        unit is that of times or positions instead of speeds.
     """
     ratio = median_ratio(spans, "measured")
     for name, seconds in _TIMES.items():
-        # In another unit, a span of 2 s has other rows and arcs.
+        # Spans are computed again, since 2 s in another unit contain other rows.
         in_unit = _in_seconds(rows, seconds, least_speed)
         if _is_close(median_ratio(in_unit, "measured"), 1):
             return name, f"Multiply `time_s` by {seconds:.4g}", True
@@ -122,7 +125,7 @@ def unit_of(
     if is_coarse(spans, resolution_m):
         return "", "Log positions with more decimals", False
     if _is_winding(spans):
-        return "", f"{_METRES}, log positions more often", False
+        return "", f"{_CONVERT}, log positions more often", False
     if _n_straight(spans) >= MIN_SPANS:
         errors = {name: abs(ratio / value - 1) for name, value in _SPEEDS.items()}
         name = min(errors, key=errors.__getitem__)
@@ -130,7 +133,7 @@ def unit_of(
             value = _SPEEDS[name]
             also = f" (`commanded_m_s` too, if it is in {name})"
             return name, f"Multiply `measured_m_s` by {value:.4g}{also}", False
-    return "", _METRES, False
+    return "", _CONVERT, False
 
 
 def _is_close(ratio: float, expected: float) -> bool:
@@ -138,7 +141,7 @@ def _is_close(ratio: float, expected: float) -> bool:
 
 
 def _in_seconds(rows: pd.DataFrame, seconds: float, least_speed: float) -> pd.DataFrame:
-    """Return the spans of rows whose unit of time lasts `seconds`."""
+    """Return the spans of rows whose times are in a unit of `seconds`."""
     in_seconds = rows.assign(time_s=rows["time_s"] * seconds)
     return spans_of(track_of(in_seconds), least_speed)
 
@@ -148,25 +151,27 @@ def unit_of_command(
 ) -> tuple[float, str, str] | None:
     """Return the unit that explains the ratio of positions to the command.
 
-    The ratio is λ. Only an implausible λ indicates another unit.
+    The ratio of the distance by positions to the commanded distance is λ if units are
+    right. Only an implausible λ indicates another unit.
 
     Args:
         rows: rows of a log.
         spans: spans of these rows.
-        least_speed: minimum commanded speed of spans that count [m/s].
-        is_geographic: whether positions are angles, which have no other unit.
+        least_speed: minimum commanded speed of used spans [m/s].
+        is_geographic: whether positions are longitudes and latitudes, always in
+            degrees.
 
     Returns:
-        The ratio, the units that explain it, and the remedy; None if the ratio may be
-        λ.
+        The ratio, the units that explain it, and the remedy, without a full stop; None
+        if the ratio is a plausible λ.
     """
     ratios = spans["moved"] / spans["commanded"]
     ratio = float(ratios.median())
-    fastest = float(ratios.quantile(_FASTEST))
+    fast_ratio = float(ratios.quantile(_FAST_QUANTILE))
     measured_ratio = (spans["measured"] / spans["commanded"]).median()
-    if measured_ratio < _SLIPS:  # measured speed confirms that the robot was slow
-        fastest = ratio
-    is_slow = fastest < _MIN_LAMBDA
+    if measured_ratio < _MIN_WHEEL_RATIO:  # measured speed shows that the robot slipped
+        fast_ratio = ratio
+    is_slow = fast_ratio < _MIN_LAMBDA
     is_fast = ratio > _MAX_COMMAND_RATIO
     if math.isnan(ratio) or not (is_slow or ratio > _MAX_LAMBDA):
         return None

@@ -1,8 +1,9 @@
-"""Layout of maps on an elevation model, described and checked before it is read.
+"""Layout of maps on an elevation model, described and checked before values are read.
 
-The maps start at the south-west corner of the elevation model, around the drives, or at
-the origin that the user sets. Pairs of metres are northward and eastward, shape [2],
-from the south-west corner of the elevation model, unless they are named (x, y).
+The first map lies at the south-west corner of the elevation model, of the terrain
+around the drives, or at the origin that the user sets. Unless they are named (x, y),
+positions are (y, x) in metres from the south-west corner of the elevation model, shape
+[2].
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -27,10 +28,10 @@ from benchnav.datagen.dem.tiling import (
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.datagen.schema import Fields
 
-_KERNEL_CELLS = 2.0  # half width of cubic convolution
-# Text on each resampling of elevation.
+_KERNEL_CELLS = 2.0  # half width of the kernel of cubic convolution, in cells
+# Description of each resampling of elevation.
 _RESAMPLED = {
-    "nearest": "taken as they are",
+    "nearest": "not resampled",
     "average": "averaged",
     "cubic": "interpolated",
 }
@@ -56,10 +57,10 @@ class Extent:
 
     Args:
         raster: The elevation model.
-        unit: Its unit of elevation, and the unit's source, as text.
+        unit: Unit of elevation, and the unit's source, as text.
         crs: CRS of the maps, in metres.
         bounds: Bounds of the elevation model in `crs`.
-        cell_m: Size of its cells in `crs`.
+        cell_m: Size of the elevation model's cells in `crs`, northward and eastward.
         shares: Fraction of the maps of each split.
         origin_m: (x, y) of the south-west corner of the first map in `crs`; None for
             the default.
@@ -83,19 +84,19 @@ class Extent:
 
     @property
     def size_m(self) -> ndarray:
-        """Size of the elevation model, shape [2]."""
+        """Size of the elevation model in metres, northward and eastward, shape [2]."""
         return np.array([self.bounds.top, self.bounds.right]) - self.corner_m
 
     def lay(self, grid: Grid, stride: Shape) -> Layout:
-        """Lay maps on the terrain.
+        """Return the layout of maps on the terrain.
 
         Args:
             grid: Size and resolution of a map.
             stride: Cells from one map to the next, northward and eastward.
 
         Raises:
-            ConfigError: If the origin lies off the elevation model, or too far
-                north-east on it.
+            ConfigError: If the origin lies off the elevation model, or so far
+                north-east that not each split gets a map.
             DatasetError: If the terrain is too small.
         """
         step = grid.resolution_m
@@ -114,14 +115,14 @@ class Extent:
             self._check_room(start_m, end_m, grid, stride)
         resampling, reach_m = self._resample(step, start_m)
         size_m = end_m - start_m
-        cells = _whole_cells(size_m, step)
+        cells = _cells_within(size_m, step)
         if np.less(cells, grid.shape).any():
             wide, high = grid.extent_m
             raise DatasetError(
                 f"Expected `dem` to cover at least one map of {wide:g} m × {high:g} m, "
                 f"got {self.raster.name} of "
-                f"{self.size_m[1]:g} m × {self.size_m[0]:g} m. Take a larger raster "
-                "or a recipe of smaller maps."
+                f"{self.size_m[1]:g} m × {self.size_m[0]:g} m. Use a larger raster "
+                "or a recipe with smaller maps."
             )
         tiling = cut(cells, grid.shape, stride, self.shares)
         # Margins keep the maps off the raster's edges, where interpolation lacks
@@ -147,16 +148,16 @@ class Extent:
     ) -> None:
         """Reject an origin too far north-east for a map of each split.
 
-        It is only rejected if another origin leaves room for them.
+        The origin is only rejected if another origin has room for these maps.
 
         Args:
-            start_m: The origin.
+            start_m: Origin.
             end_m: North-east corner of the terrain.
             grid: Size and resolution of a map.
-            stride: Cells from one map to the next.
+            stride: Cells from one map to the next, northward and eastward.
 
         Raises:
-            ConfigError: If it is, with the largest origin that fits.
+            ConfigError: If the origin is rejected, with the largest origin that fits.
         """
         if self._has_room(start_m, end_m, grid, stride):
             return
@@ -174,13 +175,13 @@ class Extent:
             f"Expected `origin` from which {maps} of {wide:g} m × {high:g} m fit up to "
             f"the north-east corner {end}, got {list(self.origin_m or ())}. "
             "The largest that fits: "
-            f"--origin '{_origin(self.corner_m + largest_m)}'"
+            f"--origin '{_origin_text(self.corner_m + largest_m)}'"
         )
 
     def _largest_origin(
         self, start_m: ndarray, end_m: ndarray, grid: Grid, stride: Shape
     ) -> ndarray | None:
-        """Return the largest origin with room for each split; None without one."""
+        """Return the largest origin with room for a map of each split, or None."""
         for cells in fewest_cells(grid.shape, stride, len(self.shares)):
             last_m = end_m - np.multiply(cells, grid.resolution_m)
             for corner_m in (np.minimum(start_m, last_m), last_m):
@@ -193,7 +194,7 @@ class Extent:
         self, start_m: ndarray, end_m: ndarray, grid: Grid, stride: Shape
     ) -> bool:
         """Return whether a map of each split fits between two corners."""
-        cells = _whole_cells(end_m - start_m, grid.resolution_m)
+        cells = _cells_within(end_m - start_m, grid.resolution_m)
         if np.less(cells, grid.shape).any():
             return False
         try:
@@ -203,7 +204,7 @@ class Extent:
         return True
 
     def _resample(self, step: float, start_m: ndarray) -> tuple[str, float]:
-        """Return the resampling of elevation on cells of a width, and its reach."""
+        """Return the resampling of elevation, and its kernel's half width in metres."""
         offset = start_m / self.cell_m
         is_aligned = np.abs(offset - np.rint(offset)).max() < SLACK
         is_same_width = np.allclose(self.cell_m, step, rtol=1e-9)
@@ -215,7 +216,7 @@ class Extent:
         return "cubic", _KERNEL_CELLS * max(*self.cell_m, step)
 
     def describe(self, layout: Layout, recipe: Recipe, fields: Fields) -> str:
-        """Return a paragraph on the cells, the maps, their size in bytes, and the unit.
+        """Return a description of cells, unit, maps and their size in bytes.
 
         Args:
             layout: Layout of the maps.
@@ -234,19 +235,19 @@ class Extent:
         high, wide = (f"{value:.4g}" for value in self.cell_m)
         maps = f"{tiling.maps:,} map{'s' * (tiling.maps > 1)}"
         stride_m = tiling.stride[1] * grid.resolution_m
-        corner = _origin(self.corner_m + layout.offset_m)
+        corner = _origin_text(self.corner_m + layout.offset_m)
         origin_hint = "set by `origin`" if self.origin_m else "set it by `origin`"
         return (
             f"{self.raster.name}: {file.height} × {file.width} cells of {wide} m × "
             f"{high} m on the terrain, elevations "
             f"in {self.unit}, {_RESAMPLED[layout.resampling]}. {maps} of {grid.height} × "
             f"{grid.width} cells of {grid.resolution_m:g} m, one every {stride_m:g} m "
-            f"from the south-west corner {corner} on ({origin_hint}), in "
+            f"from the south-west corner {corner} ({origin_hint}), in "
             f"{_name_of(self.crs)}; {gigabytes} GB before compression."
         )
 
     def frame(self, layout: Layout, step: float) -> dict[str, Any]:
-        """Return the cells of all maps, padded by one, as an argument of `Raster.resampled`.
+        """Return the cells of all maps, padded by one, for `Raster.resampled`.
 
         Args:
             layout: Layout of the maps.
@@ -272,13 +273,13 @@ class Extent:
         step: float,
         announce: Callable[[str], object],
     ) -> None:
-        """Announce the corner of another raster as an origin, if it lies within a map.
+        """Suggest another raster's corner as the origin if it lies within a map.
 
         Args:
             raster: A raster other than the elevation model.
             layout: Layout of the maps.
             step: Width of a map's cell in metres.
-            announce: Receives a sentence.
+            announce: Receives the suggestion, a sentence.
         """
         with raster.warped(self.crs) as warped:
             bounds = warped.bounds
@@ -290,15 +291,15 @@ class Extent:
         stride_m = np.multiply(layout.tiling.stride, step)
         n_strides = (start_m - layout.offset_m) / stride_m
         if is_on and np.abs(n_strides - np.rint(n_strides)).max() > SLACK:
-            corner = _origin((bounds.bottom, bounds.left))
+            corner = _origin_text((bounds.bottom, bounds.left))
             announce(
-                f"`{raster.argument}` begins within a map. To begin the maps where it "
-                f"does, pass --origin '{corner}'"
+                f"`{raster.argument}` begins within a map. To begin the maps at its "
+                f"corner, pass --origin '{corner}'"
             )
 
 
 def _name_of(crs: Any) -> str:
-    """Return the code of a CRS; if it has no code, its name."""
+    """Return the code or definition of a CRS; if it is long, the name of the CRS."""
     text = crs.to_string()
     if len(text) < 60:
         return text
@@ -307,12 +308,12 @@ def _name_of(crs: Any) -> str:
     return "a CRS without a name" if name == "unknown" else str(name)
 
 
-def _whole_cells(size_m: ndarray, step: float) -> list[int]:
-    """Return the number of cells of a width that fit into a size."""
+def _cells_within(size_m: ndarray, step: float) -> list[int]:
+    """Return the number of cells of width `step` within a size, in y and x."""
     return np.floor(size_m / step + SLACK).astype(int).tolist()
 
 
-def _origin(corner_m: Iterable[float]) -> str:
-    """Return (y, x) in metres in the form of `origin`, to a micrometre."""
+def _origin_text(corner_m: Iterable[float]) -> str:
+    """Return (y, x) in metres as text for the option `origin`, to a micrometre."""
     y, x = (f"{value:.6f}".rstrip("0").rstrip(".") for value in corner_m)
     return f"[{x},{y}]"

@@ -1,15 +1,16 @@
 """Import of real data: rasters become maps of the dataset schema.
 
-Slopes follow from the real elevation. For those at a map's edges, the surrounding
-elevation is read too. The recipe provides what the rasters do not contain. The true
-distribution of λ in real terrain is unknown, and the dataset records this;
+Slopes are computed from the real elevation. For slopes at a map's edges, the elevation
+around the map is read too. The recipe provides what the rasters do not contain. The
+true distribution of λ in real terrain is unknown, and the dataset records this;
 `Terrain.truth` is then the distribution of the recipe's class table.
 
-Overlapping maps contain the same cells. They are stored with a `group`, the statistical
-unit: maps of one group overlap, directly or through other maps, and maps of two groups
-do not. If all maps of a split are connected, it is one group, and statistics have one
-unit. To cut such terrain into smaller groups, maps between them must be omitted. This
-yields no more units than adjacent maps without overlap.
+Overlapping maps contain the same cells. Each of them is stored with the number of its
+`group`, the statistical unit. Maps of one group overlap, directly or through other
+maps; maps of different groups do not overlap. If all maps of a split overlap in this
+sense, the split is one group and one unit. To divide it into smaller groups, maps
+between the groups would have to be omitted. This would yield no more units than
+adjacent maps without overlap.
 """
 
 import hashlib
@@ -54,7 +55,7 @@ from benchnav.datagen.schema import (
 from benchnav.datagen.synth.generate import class_map, complete, reference_time_s
 
 _CELLS_AT_ONCE = 2**20
-# Cache of GDAL for rasters. Its default grows with the machine's memory.
+# Size of GDAL's cache of rasters. The default size grows with the machine's memory.
 _CACHE_BYTES = 2**29
 
 # Reasons why maps are left out, in the order of the checks.
@@ -69,10 +70,10 @@ REASONS = {
     "missing_colours": "have cells without colour",
     "not_solvable": "have a goal that cannot be reached",
 }
-# Records of each map: its index, its lowest elevation, and its number of unlabelled
-# cells.
+# Records of each map: index in the terrain, lowest elevation in metres, and number of
+# unlabelled cells.
 _RECORDS = ("kept", "lowest_m", "unlabelled")
-# Input without which a map is left out, by reason.
+# Input that a map must have, by the reason for which it is left out otherwise.
 _REQUIRED = {
     "not_driven": "drive_count",
     "missing_elevation": "dem",
@@ -95,12 +96,13 @@ def import_dem(
     """Create a dataset from rasters; yield (maps done, total maps).
 
     Iterate to the end. Maps are left out if elevation or colour is missing in some
-    cells. A class, measured λ or values of layers may be missing in cells. A map's
-    random numbers depend on its index in the terrain, and not on omitted maps.
+    cells. Classes, measured λ and values of layers may be missing in some cells. A
+    map's random numbers depend only on the map's index in the terrain.
 
     Args:
         dem: raster of elevations, by any name that rasterio opens.
-        out: file to write, of suffix `.h5` or `.hdf5`; else a folder.
+        out: path of the file to write, if its suffix is `.h5` or `.hdf5`; else path of
+            the folder to write.
         recipe: recipe with the id of the dataset, the maps' size, resolution, start and
             goal, the class table, the light and the seed.
         rasters: rasters of classes, colours, λ and layers.
@@ -118,12 +120,13 @@ def import_dem(
     """
     expect(
         drives is None or not rasters.traversability,
-        "λ from `drives` or from `traversability`, got both. Leave one out.",
+        "either `drives` or `traversability` as the source of λ, got both. Leave one "
+        "out.",
     )
     expect(
         not (cut.solvable and rasters.unlabelled),
-        "`classes` with `solvable`, which depends on the class table, got none. Leave "
-        "`solvable` out, or pass --classes.",
+        "`classes` with `solvable`, which depends on the classes of cells, got none. "
+        "Leave `solvable` out, or pass --classes.",
     )
     affecting = [spec.name for spec in recipe.layers if spec.affects]
     expect(
@@ -142,21 +145,21 @@ def import_dem(
         stack.enter_context(load_rasterio().Env(GDAL_CACHEMAX=_CACHE_BYTES))
         survey = Survey(stack, dem, rasters, recipe, cut, drives, announce)
         folder = stack.enter_context(building(out))
-        parts = {name: _Part(name, recipe, folder, survey) for name in splits}
+        writers = {name: _SplitWriter(name, recipe, folder, survey) for name in splits}
         done = 0
         for run in survey.tiling.runs(recipe.grid.maps_in(_CELLS_AT_ONCE)):
-            parts[run.split].add(run)
+            writers[run.split].add(run)
             done += len(run.columns)
             yield done, survey.tiling.maps
-        _check_valued(survey)
+        _check_layers(survey)
         sizes = {}
         entries = {}
         files = {}
-        for name, part in parts.items():
-            part.finish()
-            sizes[name] = replace(splits[name], maps=len(part.records["kept"]))
-            entries[name] = part.entry()
-            files[name] = [folder / shard.name for shard in part.shards]
+        for name, writer in writers.items():
+            writer.finish()
+            sizes[name] = replace(splits[name], maps=len(writer.records["kept"]))
+            entries[name] = writer.entry()
+            files[name] = [folder / shard.name for shard in writer.shards]
         contents = Contents(
             id=recipe.id,
             recipes=[replace(recipe, splits=sizes)],
@@ -167,17 +170,18 @@ def import_dem(
         assemble(contents, folder, out)
 
 
-def _check_valued(survey: Survey) -> None:
-    """Check that each layer has a value on some map."""
-    for name in set(survey.fields) - survey.valued:
+def _check_layers(survey: Survey) -> None:
+    """Check that each layer has a value in at least one cell of the maps."""
+    for name in set(survey.fields) - survey.layers_with_value:
         raster = survey.layers[f"layer {name}"].raster.name
         raise DatasetError(
-            f"Expected `layer {name}` with a value on some map, got none in {raster}."
+            f"Expected a value of `layer {name}` in at least one cell of the maps, got "
+            f"only missing values in {raster}. Pass a raster with values there."
         )
 
 
 def _fields_of(survey: Survey) -> Fields:
-    """Return the fields of the maps; groups are added when all maps exist."""
+    """Return the stored fields of the maps, by name."""
     names = []
     if survey.tiling.overlaps:
         names.append("group")
@@ -188,8 +192,8 @@ def _fields_of(survey: Survey) -> Fields:
 
 
 @dataclass
-class _Part:
-    """Maps of one split: shards, records of each stored map, and counts of others."""
+class _SplitWriter:
+    """Writer of one split's maps, with records of stored and counts of omitted maps."""
 
     name: str
     recipe: Recipe
@@ -203,7 +207,7 @@ class _Part:
     pending: list[Maps] = field(default_factory=list)
 
     def add(self, run: Run) -> None:
-        """Add the valid maps of a run, count the others, and write full shards."""
+        """Add the valid maps of a run, count invalid ones, and write full shards."""
         padded_m, inputs = self.survey.read(run)
         is_valid = self._count_invalid(padded_m, inputs)
         if not is_valid.any():
@@ -222,13 +226,14 @@ class _Part:
             self._flush()
 
     def _count_invalid(self, padded_m: ndarray, inputs: Maps) -> ndarray:
-        """Return a mask of valid maps, bool, shape [B]; count the others by reason."""
+        """Return a mask of valid maps, bool, shape [B]; count the reasons of others."""
         is_valid = np.ones(len(padded_m), dtype=bool)
-        lacking = _lacking(inputs)
+        missing_masks = _missing_masks(inputs)
         for reason, name in _REQUIRED.items():
-            if name in lacking:
-                self.left_out[reason] += int((is_valid & lacking[name]).sum())
-                is_valid &= ~lacking[name]
+            if name in missing_masks:
+                is_missing = missing_masks[name]
+                self.left_out[reason] += int((is_valid & is_missing).sum())
+                is_valid &= ~is_missing
         relief_m = np.ptp(padded_m[:, 1:-1, 1:-1], axis=(1, 2))
         is_rough = is_valid & (relief_m > MAX_RELIEF_M)
         if is_rough.any():
@@ -236,12 +241,12 @@ class _Part:
         return is_valid & ~is_rough
 
     def _maps_of(self, indices: ndarray, padded_m: ndarray, inputs: Maps) -> Maps:
-        """Return complete maps with their records, in the dtypes of the fields.
+        """Return the stored fields and the records of maps.
 
         Args:
             indices: indices of the maps in the terrain, shape [B].
-            padded_m: elevation, padded by one cell, shape [B, H + 2, W + 2].
-            inputs: values by the names of `Survey.read`, each of shape [B, K, H, W].
+            padded_m: elevation in metres, padded by one cell, shape [B, H + 2, W + 2].
+            inputs: inputs from `Survey.read` by name, each of shape [B, K, H, W].
         """
         recipe = self.recipe
         padded_m = quantise(padded_m, 13)
@@ -293,9 +298,10 @@ class _Part:
                     reasons.append(f"{count} {REASONS[reason]}")
             raise DatasetError(
                 f"Expected split {self.name!r} to get at least one map, got none from "
-                f"{self.survey.layers['dem'].raster.name}: of "
-                f"{self.left_out.total()}, {', '.join(reasons)}. Fill the gaps, or "
-                "take smaller maps, other fractions or a recipe of easier terrain."
+                f"{self.survey.layers['dem'].raster.name}. Of "
+                f"{self.left_out.total()} candidate maps, {', '.join(reasons)}. Fill "
+                "gaps in the rasters, or use smaller maps, other fractions or a recipe "
+                "with easier terrain."
             )
         if self.survey.tiling.overlaps:
             self._add_groups()
@@ -318,10 +324,11 @@ class _Part:
         (self.folder / shard.name).write_bytes(content)
 
     def _add_groups(self) -> None:
-        """Rewrite the shards with the group of each map, when all maps exist.
+        """Rewrite the shards with the group of each map; call it when all maps exist.
 
-        The number of a group is a digest of the terrain and its first map. Groups can
-        therefore be merged: numbers are equal only on the same terrain.
+        The number of a group is a digest of the terrain and of the group's first map.
+        Groups of different terrain therefore have different numbers in a merged
+        dataset.
         """
         source = self.survey.source
         keys = ("file", "sha256", "crs", "origin_m", "stride_m")
@@ -355,17 +362,18 @@ class _Part:
         }
 
 
-def _lacking(inputs: Maps) -> dict[str, ndarray]:
-    """Return masks of maps that lack an input, by its name, bool, shape [B]."""
-    lacking: dict[str, Any] = {}
+def _missing_masks(inputs: Maps) -> dict[str, ndarray]:
+    """Return masks of maps without a required input, by its name, bool, shape [B]."""
+    masks: dict[str, Any] = {}
     for name, values in inputs.items():
-        lacking[name] = np.isnan(values).any(axis=(1, 2, 3))
-    # Without a photo, a cell has the colour of its class.
+        masks[name] = np.isnan(values).any(axis=(1, 2, 3))
+    # With a photo, cells need no class for their colour, so some classes may be
+    # missing.
     if "classes" in inputs and "photo" in inputs:
         # Models can learn from measured λ without a class.
         measured = inputs.get("traversability", np.nan)
         is_useless = np.isnan(inputs["classes"]) & np.isnan(measured)
-        lacking["classes"] = is_useless.all(axis=(1, 2, 3))
+        masks["classes"] = is_useless.all(axis=(1, 2, 3))
     if "drive_count" in inputs:
-        lacking["drive_count"] = (inputs["drive_count"] == 0).all(axis=(1, 2, 3))
-    return lacking
+        masks["drive_count"] = (inputs["drive_count"] == 0).all(axis=(1, 2, 3))
+    return masks

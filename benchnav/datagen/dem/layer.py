@@ -34,12 +34,13 @@ class LayerRaster(NamedTuple):
 
 
 def read_layer(text: str) -> LayerRaster:
-    """Return the layer of a text `NAME=RASTER` or `NAME=RASTER:UNIT`.
+    """Return the layer that a text `NAME=RASTER` or `NAME=RASTER:UNIT` describes.
 
-    The text after the last colon is a unit, unless it looks like a path.
+    The text after the last colon is the unit, unless it looks like a path.
 
     Raises:
-        ConfigError: If it has another form, or the name is not valid for a layer.
+        ConfigError: If the text has another form, or the name or unit is not valid for
+            a layer.
     """
     name, equals, source = text.partition("=")
     raster, colon, unit = source.rpartition(":")
@@ -57,7 +58,7 @@ def read_layer(text: str) -> LayerRaster:
         field = schema.Field("<f4", ("H", "W"), unit, -np.inf, np.inf, "imported layer")
     expect(
         unit in ("", field.unit),
-        f"`layer` {name} in {field.unit}, got {unit!r}. Convert it or leave the unit "
-        "out.",
+        f"`layer` {name} in {field.unit}, got {unit!r}. Convert the raster, or leave "
+        "the unit out.",
     )
     return LayerRaster(name, raster, field)

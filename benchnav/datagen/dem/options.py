@@ -14,14 +14,14 @@ class GroundOptions:
     """Options of the elevation model, and of cutting it into maps.
 
     Args:
-        dem_unit: Unit of elevations: m, ft, us-ft, or metres in a unit. If empty, the
-            unit that the raster declares.
+        dem_unit: Unit of elevations: m, ft, us-ft, or the length of the unit in metres.
+            If empty, the unit that the raster declares.
         origin: South-west corner of the first map, [X,Y] in the coordinate reference
             system of the maps.
         max_maps: Maximum number of maps. If there are more, the import fails, and the
-            error states a command that makes fewer.
+            error contains a command that makes fewer.
         coarse: Allow an elevation model with cells at least three times as wide as the
-            maps'.
+            cells of the maps.
     """
 
     dem_unit: str = ""
@@ -39,8 +39,8 @@ class Cut:
     """Selection of the maps of an import.
 
     Args:
-        shares: fraction of the maps of each split.
-        scenario: scenario of the recipe that lights the maps.
+        shares: fraction of the maps by split.
+        scenario: name of the recipe's scenario, whose light the maps get.
         stride_m: distance from one map to the next in metres; None for adjacent maps.
         solvable: whether to keep only maps whose goal is reachable, and to store the
             grid reference time.
@@ -63,12 +63,12 @@ class Rasters:
 
     Args:
         classes: Raster of terrain classes. If empty, classes are random.
-        class_ids: Class names by value of that raster, such as '{1: gravel, 9: null}',
+        class_ids: Class names by value of `classes`, such as '{1: gravel, 9: null}';
             null for no label. If not given, values are class indices.
-        random_classes: Allow a photo or measured traversability without classes; these
-            are then random.
-        unlabelled: Allow a photo and measured traversability without classes; all cells
-            are unlabelled.
+        random_classes: Allow a photo or measured traversability without a raster of
+            classes; classes are then random.
+        unlabelled: Allow a photo and measured traversability without a raster of
+            classes; all cells are then unlabelled.
         photo: Raster of red, green and blue. If empty, cells have the colours of their
             classes.
         traversability: Raster of measured traversability in [0, 1]. If empty, it is
@@ -89,7 +89,8 @@ class Rasters:
         """Reject options that contradict each other."""
         expect(
             self.classes or self.class_ids is None,
-            "`classes` with `class_ids`, got none. Pass the raster with these values.",
+            "`classes` with `class_ids`, got only `class_ids`. Pass the raster of "
+            "classes with --classes.",
         )
         expect(
             not (self.classes and self.random_classes),
@@ -98,20 +99,23 @@ class Rasters:
         has_classes = bool(self.classes or self.random_classes)
         expect(
             not self.unlabelled or (self.photo and not has_classes),
-            "`unlabelled` with `photo` and without classes, got another combination: "
-            "without a class, only a photo gives a cell its colour. "
+            "`unlabelled` with `photo` and without `classes` or `random_classes`, got "
+            "another combination. Unlabelled cells take their colour from the photo. "
             "Pass --photo RASTER, or --classes RASTER instead of --unlabelled.",
         )
         for name in ("photo", "traversability"):
             expect(
                 not getattr(self, name) or has_classes or self.unlabelled,
-                f"`classes` with `{name}`, got none: real values would be joined to random "
-                "classes. Pass --classes RASTER, --unlabelled for models that need no "
-                "classes, or --random-classes to allow this.",
+                f"`classes` with `{name}`, got only `{name}`, which would be combined "
+                "with random classes. Pass --classes RASTER, --unlabelled for models "
+                "that need no classes, or --random-classes to allow this.",
             )
         names = [layer.name for layer in self.layers]
-        twice = sorted({name for name in names if names.count(name) > 1})
-        expect(not twice, f"each `layer` once, got {', '.join(twice)} more than once.")
+        repeated = sorted({name for name in names if names.count(name) > 1})
+        expect(
+            not repeated,
+            f"each `layer` once, got {', '.join(repeated)} more than once.",
+        )
 
     @property
     def layers(self) -> list[LayerRaster]:

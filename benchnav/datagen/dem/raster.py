@@ -23,9 +23,9 @@ from benchnav.datagen.dem.crs import (
     utm_of,
 )
 
-# |scale − 1| of a projection; within a UTM zone it is at most 0.001.
+# Maximum |scale − 1| of a projection. Within a UTM zone, it is at most 0.001.
 _MAX_STRETCH = 0.02
-_TOLERANCE = 0.01  # error of positions in another CRS, in cells of the raster
+_TOLERANCE = 0.01  # maximum error of positions in another CRS, in cells of the raster
 
 
 class Raster(NamedTuple):
@@ -33,9 +33,9 @@ class Raster(NamedTuple):
 
     Args:
         argument: name of the user's argument.
-        name: name of the raster.
+        name: path or URL of the raster.
         file: rasterio's reader.
-        metres: metres per unit of its values.
+        metres: metres per unit of the values.
     """
 
     argument: str
@@ -44,29 +44,32 @@ class Raster(NamedTuple):
     metres: float = 1.0
 
     def raw(self, value: float) -> float:
-        """Return a value of the first band in the form that the file stores."""
+        """Return the number that the file stores for a value of the first band."""
         scaled = value / self.metres - self.file.offsets[0]
         return float(scaled / self.file.scales[0])
 
     @property
     def mask_kinds(self) -> set[str]:
-        """GDAL's mask flags; only `all_valid` if the raster declares no missing cells."""
+        """GDAL's mask flags; only `all_valid` if no mark for missing cells exists."""
         return {flag.name for flags in self.file.mask_flag_enums for flag in flags}
 
     @property
     def declares_missing(self) -> bool:
-        """Whether some value, mask or band marks cells without a value."""
+        """Whether the raster declares a value, mask or band for missing cells."""
         return self.mask_kinds != {"all_valid"}
 
     def georeference(self) -> tuple[Any, Any, tuple[float, float]]:
-        """Return a CRS in metres, bounds in it, and cell size northward and eastward.
+        """Return a CRS in metres, and the raster's bounds and cell size in this CRS.
 
-        It is the raster's CRS if its metres are metres on the terrain everywhere in the
-        raster. Otherwise it is the CRS of its UTM zone; off the Earth, it is a
-        transverse Mercator projection at the raster's centre.
+        The CRS is the first of these with a scale of nearly 1 everywhere in the raster:
+        the raster's CRS, the CRS of the UTM zone, or a transverse Mercator projection
+        at the raster's centre.
+
+        Returns:
+            CRS; bounds; cell size northward and eastward in metres.
 
         Raises:
-            DatasetError: If there is no such CRS, for example for large areas.
+            DatasetError: If no CRS has such a scale, for example on a large area.
         """
         raster_crs = horizontal(self.file.crs)
         bounds = self.file.bounds
@@ -78,8 +81,8 @@ class Raster(NamedTuple):
         if local is None:
             raise DatasetError(
                 f"Expected `{self.argument}` in a CRS of the Earth or another body, "
-                f"got {raster_crs.to_string()[:80]} in {self.name}. If you know it, "
-                f"declare it: rio edit-info --crs EPSG:CODE {self.name}"
+                f"got {raster_crs.to_string()[:80]} in {self.name}. If you know its "
+                f"CRS, declare it: rio edit-info --crs EPSG:CODE {self.name}"
             )
         for crs in (raster_crs, utm_of(raster_crs, *middle), local):
             if crs is None or not is_in_metres(crs):
@@ -92,8 +95,8 @@ class Raster(NamedTuple):
         wide = bounds.right - bounds.left
         high = bounds.top - bounds.bottom
         raise DatasetError(
-            f"Expected `{self.argument}` of terrain small enough for a map whose "
-            "metres are metres on the terrain, got "
+            f"Expected `{self.argument}` of terrain small enough for a projection "
+            f"whose scale is within {_MAX_STRETCH:.0%} of 1, got "
             f"{self.name} of {wide:g} × {high:g} units of "
             f"{raster_crs.to_string()[:80]}. Cut out a part: rio clip {self.name} "
             "part.tif --bounds 'WEST SOUTH EAST NORTH'"
@@ -102,14 +105,14 @@ class Raster(NamedTuple):
     def warped(self, crs: Any, **settings: Any) -> Any:
         """Return the raster in another CRS, with missing cells marked.
 
-        An alpha band is added if the raster has no other mark.
+        An alpha band is added if the result would otherwise not mark missing cells.
         """
         is_float = np.dtype(self.file.dtypes[0]).kind == "f"
         if is_float and not self.declares_missing:
             settings |= {"src_nodata": np.nan, "nodata": np.nan}
         elif not self.mask_kinds & {"nodata", "alpha"}:
             settings |= {"add_alpha": True}
-        with _naming(self.argument, self.name):
+        with _named_errors(self.argument, self.name):
             return load_rasterio().vrt.WarpedVRT(
                 self.file,
                 src_crs=horizontal(self.file.crs),
@@ -121,16 +124,16 @@ class Raster(NamedTuple):
     def resampled(
         self, frame: Mapping[str, Any], bands: list[int], resampling: str
     ) -> "Layer":
-        """Return bands, resampled to cells.
+        """Return bands of the raster, resampled to the cells of all maps.
 
         Args:
-            frame: the cells of all maps, padded by one: `crs`, `transform`, `height`
-                and `width`.
-            bands: bands of the raster.
+            frame: cells of all maps, padded by one: `crs`, `transform`, `height` and
+                `width`.
+            bands: numbers of the bands, from 1.
             resampling: name of one of `rasterio.enums.Resampling`.
         """
         method = load_rasterio().enums.Resampling[resampling]
-        # GDAL requires the dtype of a photo if it has transparency.
+        # GDAL requires that a photo with transparency keeps its dtype.
         dtype = self.file.dtypes[0]
         if len(bands) == 1:
             dtype = "float64"  # means of integers need not be integers
@@ -139,18 +142,24 @@ class Raster(NamedTuple):
 
 
 class Layer(NamedTuple):
-    """Bands of a raster, resampled to the cells of all maps, padded by one."""
+    """Bands of a raster, resampled to the cells of all maps, padded by one cell.
+
+    Args:
+        raster: raster of the bands.
+        bands: numbers of the bands, from 1.
+        warped: rasterio's view of the resampled raster.
+    """
 
     raster: Raster
     bands: list[int]
     warped: Any
 
     def read(self, rows: range, columns: range) -> np.ndarray:
-        """Return cells of the maps, padded by one.
+        """Return the values of some rows and columns, padded by one cell.
 
         Args:
-            rows: rows, counted northward.
-            columns: columns, counted eastward.
+            rows: indices of the rows, counted northward.
+            columns: indices of the columns, counted eastward.
 
         Returns:
             Values, NaN if missing, float64, shape [K, len(rows) + 2, len(columns) + 2].
@@ -161,7 +170,7 @@ class Layer(NamedTuple):
         window_rows = (top, top + len(rows) + 2)
         window_columns = (columns.start, columns.stop + 2)
         window = (window_rows, window_columns)
-        with _naming(self.raster.argument, self.raster.name):
+        with _named_errors(self.raster.argument, self.raster.name):
             values = warped.read(self.bands, window=window).astype(np.float64)
             if warped.count > file.count:  # an alpha band was added
                 mask = warped.read(warped.count, window=window)
@@ -183,15 +192,16 @@ def open_raster(
 
     Args:
         argument: name of the user's argument.
-        name: name of the raster.
-        kinds: expected dtypes of its first bands; empty for one band of any dtype.
+        name: path or URL of the raster.
+        kinds: expected dtypes of the first bands; empty for exactly one band of any
+            real dtype.
 
     Raises:
-        DatasetError: If it cannot be read, has other bands, or lacks a CRS or a
-            geotransform.
+        DatasetError: If the raster cannot be read, does not have the expected bands, or
+            lacks a CRS or a geotransform.
     """
     # rasterio warns of a missing geotransform, which is an error below.
-    with warnings.catch_warnings(action="ignore"), _naming(argument, name):
+    with warnings.catch_warnings(action="ignore"), _named_errors(argument, name):
         note_file(name)
         file = load_rasterio().open(name)
     with file:
@@ -221,26 +231,25 @@ def _check_bands(argument: str, name: str, file: Any, kinds: tuple[str, ...]) ->
     if not kinds and file.count != 1:
         raise DatasetError(
             f"Expected one band in `{argument}`, got {file.count} in {name}. "
-            f"Take one out: rio stack --bidx 1 {name} one-band.tif"
+            f"Extract one band: rio stack --bidx 1 {name} one-band.tif"
         )
     if not kinds and file.dtypes[0].startswith("complex"):
         raise DatasetError(
             f"Expected real numbers in `{argument}`, got {file.dtypes[0]} in "
-            f"{name}. If the imaginary parts mean "
-            f"nothing, leave them out: rio convert --dtype float64 {name} real.tif"
+            f"{name}. If the imaginary parts have "
+            f"no meaning, drop them: rio convert --dtype float64 {name} real.tif"
         )
     if file.dtypes[: len(kinds)] != kinds:
         raise DatasetError(
             f"Expected `{argument}` with first bands {', '.join(kinds)}, got "
             f"{', '.join(file.dtypes)} in {name}. "
-            "Convert it: gdal_translate -expand rgb for a palette, rio convert "
-            "--dtype uint8 --scale-ratio RATIO "
-            "for numbers of more than 8 bits."
+            "Convert a palette with gdal_translate -expand rgb, and numbers of more "
+            "than 8 bits with rio convert --dtype uint8 --scale-ratio RATIO."
         )
 
 
 @contextmanager
-def _naming(argument: str, name: str) -> Iterator[None]:
+def _named_errors(argument: str, name: str) -> Iterator[None]:
     """Convert rasterio's errors to errors that name the raster."""
     try:
         yield

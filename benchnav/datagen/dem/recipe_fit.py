@@ -1,7 +1,7 @@
-"""Fit of a recipe's maps to an elevation model: checks, and settings that correct them.
+"""Check that a recipe's maps fit an elevation model, with settings that correct them.
 
-Maps must be neither too many nor much finer than the elevation model. If they are, the
-error names a resolution, a size or a stride that fits.
+Maps must not be too many, and their cells must not be much smaller than those of the
+elevation model. If they are, the error contains a resolution, size or stride that fits.
 """
 
 from collections.abc import Iterator, Mapping
@@ -19,33 +19,32 @@ from benchnav.datagen.dem.tiling import Run, Shape
 from benchnav.datagen.layers.spec import overrides_of
 from benchnav.datagen.recipe.recipe import Recipe
 
-# Maximum width of a raster's cell over that of a map's. Beyond it, maps show
-# interpolation instead of terrain.
+# Limit of the ratio of the raster's cell width to the maps' cell width. At larger
+# ratios, maps show interpolation instead of terrain.
 MAX_RATIO = 3.0
-# Maximum relief of a map: up to it, float32 represents the schema's steps of 2^-13 m.
+# Maximum relief of a map, up to which float32 represents the schema's steps of 2^-13 m.
 MAX_RELIEF_M = 2048.0
-_DIVISORS = (1, 2, 4)  # of the cells of a map's side in a suggested correction
-_MIN_SIDE = 8  # minimum cells of a map's side in a suggested correction
+_DIVISORS = (1, 2, 4)  # suggested divisors of the number of cells along a map's side
+_MIN_SIDE = 8  # minimum suggested number of cells along a map's side
 
-# Changed fields of a recipe, and the divisor of the cells of a map's side.
+# Changed fields of a recipe, and the divisor of the number of cells along a map's side.
 Scaling = tuple[dict[str, Any], int]
 
 
 class GroundError(ConfigError):
-    """Error of terrain that gives too many or too smooth maps.
+    """Error on terrain that yields too many or too smooth maps.
 
     Args:
-        problem: The problem in a sentence, with the option that allows it.
-        changes: Recipe settings by key that correct it; empty if only `stride_m` or
-            nothing does.
-        stride_m: Distance from one map to the next in metres, if it must change too;
-            else None.
+        problem: Problem as text, with the option that allows such maps.
+        changes: Changed recipe settings by key that solve the problem; may be empty.
+        stride_m: Changed distance from one map to the next in metres; None if it need
+            not change.
     """
 
     def __init__(
         self, problem: str, changes: Mapping[str, Any], stride_m: float | None
     ) -> None:
-        """Store the parts, from which callers can compose a command."""
+        """Store the arguments, from which callers can compose a command."""
         self.problem = problem
         self.changes = changes
         self.stride_m = stride_m
@@ -56,28 +55,29 @@ class GroundError(ConfigError):
 
     @property
     def settings(self) -> list[str]:
-        """The changes as words of a command."""
+        """The changes as arguments of a command, `key=value`."""
         return [f"{key}={_yaml(value)}" for key, value in self.changes.items()]
 
     def advise(self, remedy: str) -> str:
-        """Return the problem with settings or a command that correct it."""
+        """Return the problem followed by settings or a command that solve it."""
         return f"{self.problem} Or fit the maps to the raster: {remedy}"
 
 
 def check_fit(
     extent: Extent, layout: Layout, recipe: Recipe, options: GroundOptions
 ) -> None:
-    """Reject terrain that makes too many or too smooth maps.
+    """Reject terrain that yields too many or too smooth maps.
 
     Args:
         extent: Terrain.
-        layout: Layout of the maps on it.
+        layout: Layout of the maps on the terrain.
         recipe: Recipe of the maps.
         options: Maximum number of maps, and whether the elevation model may be much
             coarser than the maps.
 
     Raises:
-        GroundError: If it makes such maps, with settings that do not.
+        GroundError: If the terrain yields such maps. The error contains settings that
+            do not.
     """
     step = recipe.resolution_m
     cell_m = float(max(extent.cell_m))
@@ -88,8 +88,9 @@ def check_fit(
     if is_coarse:
         problem = (
             f"Expected cells of `dem` less than {MAX_RATIO:g} times as wide as the "
-            f"maps' {step:g} m, got {cell_m:.4g} m in {name}, which {n_maps:,} maps "
-            "would show as smooth terrain. Pass --coarse to allow it."
+            f"maps' cells of {step:g} m, got {cell_m:.4g} m in {name}, which "
+            f"{n_maps:,} maps would show as smooth terrain. Pass --coarse to "
+            "allow such cells."
         )
     elif n_maps > max_maps:
         problem = (
@@ -115,13 +116,13 @@ def _corrections(
 ) -> Iterator[tuple[dict[str, Any], float | None]]:
     """Yield recipe settings and a stride in metres that fit, in the order of scalings.
 
-    The stride is None if it is the default.
+    The stride is None if maps are adjacent, which is the default.
 
     Args:
         extent: Terrain.
-        layout: Layout of the recipe's maps on it.
+        layout: Layout of the recipe's maps on the terrain.
         recipe: Recipe of the maps.
-        scalings: Changes of the recipe to try.
+        scalings: Changes of the recipe to try, in order.
         max_maps: Maximum number of maps.
     """
     north, east = layout.tiling.stride
@@ -130,32 +131,32 @@ def _corrections(
         stride = (max(1, north // divisor), max(1, east // divisor))
         try:
             changed = replace(recipe, **changes)
-            fit, times = _thinned(extent, changed.grid, stride, max_maps)
-            if not _has_maps(extent, fit, changed.resolution_m):
+            thinned, factor = _thinned(extent, changed.grid, stride, max_maps)
+            if not _has_maps(extent, thinned, changed.resolution_m):
                 continue
         except BenchnavError:
             continue
         stride_m = None
-        if times > 1 or not is_adjacent:
-            stride_m = stride[1] * times * changed.resolution_m
-        yield _as_in_file(changes, recipe), stride_m
+        if factor > 1 or not is_adjacent:
+            stride_m = stride[1] * factor * changed.resolution_m
+        yield _file_settings(changes, recipe), stride_m
 
 
 def _thinned(
     extent: Extent, grid: Grid, stride: Shape, max_maps: int
 ) -> tuple[Layout, int]:
-    """Return up to `max_maps` maps, and the multiple of the stride between them."""
-    times = 1
+    """Return a layout of up to `max_maps` maps, and the factor of its longer stride."""
+    factor = 1
     layout = extent.lay(grid, stride)
     while layout.tiling.maps > max_maps:
         excess = layout.tiling.maps / max_maps
-        times += max(1, int(np.sqrt(excess)) - 1)
-        layout = extent.lay(grid, (stride[0] * times, stride[1] * times))
-    return layout, times
+        factor += max(1, int(np.sqrt(excess)) - 1)
+        layout = extent.lay(grid, (stride[0] * factor, stride[1] * factor))
+    return layout, factor
 
 
 def _has_maps(extent: Extent, layout: Layout, step: float) -> bool:
-    """Return whether each split has a map without missing elevation."""
+    """Return whether each split has a map with all elevations and an allowed relief."""
     frame = extent.frame(layout, step)
     layer = extent.raster.resampled(frame, [1], layout.resampling)
     without_map = set(extent.shares)
@@ -181,7 +182,10 @@ def _cells_of(run: Run, layout: Layout) -> tuple[range, range]:
 
 
 def _scalings(recipe: Recipe, cell_m: float) -> Iterator[Scaling]:
-    """Yield a recipe's scalings to the resolution of a raster, largest maps first."""
+    """Yield scalings of a recipe to a raster's cell width or half of it.
+
+    Scalings with more cells per map come first.
+    """
     for divisor in _DIVISORS:
         for width_m in (cell_m, cell_m / 2):
             step = float(f"{width_m:.3g}")
@@ -189,17 +193,19 @@ def _scalings(recipe: Recipe, cell_m: float) -> Iterator[Scaling]:
 
 
 def _scaled(recipe: Recipe, step: float, divisor: int) -> dict[str, Any]:
-    """Return fields of a recipe for another resolution, scaled with the map.
+    """Return changed fields of a recipe for another resolution and map size.
+
+    Lengths are scaled with the map.
 
     Args:
         recipe: Recipe of the maps.
-        step: Width of a cell in metres.
-        divisor: Divisor of the cells of a map's side.
+        step: New width of a cell in metres.
+        divisor: Divisor of the number of cells along a map's side.
     """
-    times = step / recipe.resolution_m / divisor
+    factor = step / recipe.resolution_m / divisor
 
     def scaled(value: float) -> float:
-        return float(f"{value * times:.6g}")
+        return float(f"{value * factor:.6g}")
 
     changes: dict[str, Any] = {"resolution_m": step}
     if divisor > 1:
@@ -217,7 +223,7 @@ def _scaled(recipe: Recipe, step: float, divisor: int) -> dict[str, Any]:
             changes[name] = tuple(scaled(value) for value in position)
     periods_m = [scaled(value) for value in recipe.class_periods_m]
     changes["class_periods_m"] = tuple(max(step, value) for value in periods_m)
-    changes["layers"] = tuple(spec.scaled(times, step) for spec in recipe.layers)
+    changes["layers"] = tuple(spec.scaled(factor, step) for spec in recipe.layers)
     extent_m = step * min(recipe.height // divisor, recipe.width // divisor)
     if recipe.correlation_m > LONGEST_CORRELATION * extent_m:
         correlation_m = 0.9 * LONGEST_CORRELATION * extent_m
@@ -225,8 +231,8 @@ def _scaled(recipe: Recipe, step: float, divisor: int) -> dict[str, Any]:
     return changes
 
 
-def _as_in_file(changes: Mapping[str, Any], recipe: Recipe) -> dict[str, Any]:
-    """Return changed fields of a recipe as its file contains them."""
+def _file_settings(changes: Mapping[str, Any], recipe: Recipe) -> dict[str, Any]:
+    """Return changed fields of a recipe under the keys of a recipe file."""
     plain = dict(changes)
     layers = plain.pop("layers", recipe.layers)
     places = plain.pop("places", None)

@@ -1,10 +1,11 @@
 """Reading of rasters, map by map.
 
 Elevation at the resolution of the maps is read without resampling. If the raster's
-cells are at most half as wide as the maps', elevation is averaged, since small bumps
-would alias into slopes. Otherwise, it is interpolated by cubic convolution. Colours and
-traversability are averaged; a cell gets the class that covers most of it. Letters in
-shapes: B maps, K bands, H×W cells of a map.
+cells are at most half as wide as the maps' cells, elevation is averaged, since
+otherwise small bumps would alias into slopes. In all other cases, elevation is
+interpolated by cubic convolution. Colours and traversability are averaged; a cell gets
+the class that covers most of the cell. Letters in shapes: B maps, K bands, H×W cells of
+a map.
 """
 
 import re
@@ -22,7 +23,7 @@ from benchnav.datagen.dem.drive_cells import (
     BANDS,
     DrivenCells,
     aggregate_drives,
-    check_enough,
+    check_drive_count,
     describe_drives,
     elevation_under,
     to_map_crs,
@@ -43,11 +44,11 @@ from benchnav.datagen.dem.value_checks import (
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.datagen.schema import FIELDS, OPTIONAL, Field, Maps
 
-# Tangent of 80°: natural terrain next to cells of height 0 is less steep.
+# Tangent of 80°. Natural terrain next to cells of height 0 is less steep.
 _CLIFF = 5.67
 _SHOWN_CLASSES = 10
-# Further rasters: argument, dtypes of their bands, and resampling.
-_OTHERS = (
+# Rasters other than the elevation model: argument, dtypes of the bands, and resampling.
+_FURTHER_RASTERS = (
     ("classes", (), "mode"),
     ("photo", ("uint8",) * 3, "average"),
     ("traversability", (), "average"),
@@ -63,14 +64,14 @@ class Survey:
             extremes of averaged cells.
         unlabelled: whether no cell has a class.
         driven: values of driven cells; None without a log of drives.
-        arguments: arguments of the rasters; that of a layer is `layer NAME`.
+        arguments: names of the user's arguments; `layer NAME` for a layer.
         fields: stored fields of layers, by name.
-        valued: names of layers with at least one value so far.
-        is_inside: rows and columns of all cells, padded by one, that lie completely on
-            the elevation model; two masks.
-        indices: index of the class of each raster value; NaN for no label.
-        cliff_m: difference of heights of neighbouring cells that no natural terrain
-            has.
+        layers_with_value: names of layers with at least one value so far.
+        is_inside: two masks, of the rows and of the columns that lie completely on the
+            elevation model, padded by one.
+        indices: class index by raster value; NaN for values without a label.
+        cliff_m: difference in height between neighbouring cells that natural terrain
+            does not exceed, in metres.
         source: manifest entry of the rasters.
     """
 
@@ -87,13 +88,13 @@ class Survey:
         """Open rasters and resample them to the cells of all maps.
 
         Args:
-            stack: context that closes them.
+            stack: context that closes the rasters.
             dem: raster of elevations, one band, by any name that rasterio opens.
-            rasters: further rasters.
-            recipe: size and resolution of the maps, class table.
+            rasters: rasters other than the elevation model.
+            recipe: recipe with the size and resolution of the maps and the class table.
             cut: selection of maps in the terrain.
-            drives: log of drives, around which maps are cut; None for all of the
-                elevation model.
+            drives: log of drives, around which maps are cut. If None, maps are cut from
+                the whole elevation model.
             announce: receives a description of the import, in sentences.
 
         Raises:
@@ -111,7 +112,7 @@ class Survey:
         positions_m = None
         if log is not None:
             log = compare_motion(to_map_crs(log, dem_raster, crs, bounds))
-            check_enough(log, list(cut.shares))
+            check_drive_count(log, list(cut.shares))
             positions_m = log.positions_m
         extent = Extent(
             raster=dem_raster,
@@ -137,7 +138,7 @@ class Survey:
         height, width = self.tiling.cells
         area = (west_m, south_m, west_m + width * step, south_m + height * step)
         sources = [(dem_raster, layout.resampling)]
-        for raster, resampling in _open_others(stack, rasters):
+        for raster, resampling in _open_further_rasters(stack, rasters):
             extent.suggest_origin(raster, layout, step, announce)
             if raster.argument.startswith("layer "):
                 _check_covers(raster, crs, area, step)
@@ -145,7 +146,7 @@ class Survey:
         frame = extent.frame(layout, step)
         self.layers: dict[str, Layer] = {}
         for raster, resampling in sources:
-            for name, layer in _resampled(raster, frame, resampling):
+            for name, layer in _resampled_layers(raster, frame, resampling):
                 self.layers[name] = layer
                 stack.enter_context(layer.warped)
         self.arguments = [raster.argument for raster, _ in sources]
@@ -165,15 +166,15 @@ class Survey:
             "tiles": list(self.tiling.tiles),
             "stride_m": [cells * step for cells in reversed(self.tiling.stride)],
         }
-        for argument, _, _ in _OTHERS:
+        for argument, _, _ in _FURTHER_RASTERS:
             self.source[argument] = origins.get(argument)
         if dem_raster.metres != 1:
             self.source["metres_per_unit"] = dem_raster.metres
         if self.fields:
             layer_origins = {name: origins[f"layer {name}"] for name in self.fields}
             self.source["layers"] = layer_origins
-        self.valued: set[str] = set()
-        self.is_inside = _inside(extent, layout, step)
+        self.layers_with_value: set[str] = set()
+        self.is_inside = _inside_masks(extent, layout, step)
         indices: dict[str | None, float] = {None: np.nan}
         for index, item in enumerate(recipe.classes):
             indices[item.name] = index
@@ -185,7 +186,7 @@ class Survey:
             self._add_drives(log, layout, step)
 
     def _add_drives(self, log: DriveLog, layout: Layout, step: float) -> None:
-        """Add the driven cells of a log, and its entry of the manifest."""
+        """Add the driven cells of a log, and the log's manifest entry."""
         positions = (log.positions_m - layout.offset_m) / step
         row, column = (positions - 0.5).T
         elevation_m = elevation_under(self.layers["dem"], row, column)
@@ -199,12 +200,12 @@ class Survey:
         }
 
     def read(self, run: Run) -> tuple[ndarray, Maps]:
-        """Return the inputs of some maps.
+        """Return the raster values of the maps of a run.
 
         Returns:
-            Elevation, padded by one cell of the surrounding terrain, shape [B, H + 2,
-            W + 2]; and values by the names in `arguments` and `BANDS`, each of shape
-            [B, K, H, W]. Missing values are NaN.
+            Elevation in metres, padded by one cell of the surrounding terrain, shape
+            [B, H + 2, W + 2]; and values by the names in `arguments` and `BANDS`, each
+            of shape [B, K, H, W]. Missing values are NaN.
 
         Raises:
             DatasetError: If a raster cannot be read, or contains invalid values.
@@ -215,7 +216,7 @@ class Survey:
         wests = [column * east for column in run.columns]
         strip_rows = range(south, south + height)
         strip_columns = range(wests[0], wests[-1] + width)
-        padded = Maps()  # by one cell around each map
+        padded = Maps()  # values of each map and of one cell around it
         for name, layer in self.layers.items():
             strip = layer.read(strip_rows, strip_columns)
             padded[name] = _cut_maps(strip, wests, width + 2)
@@ -233,7 +234,7 @@ class Survey:
         for name, field in self.fields.items():
             raster = self.layers[f"layer {name}"].raster
             if check_layer(raster, padded, field):
-                self.valued.add(name)
+                self.layers_with_value.add(name)
         inputs = {name: padded[name][:, :, 1:-1, 1:-1] for name in self.arguments}
         if "classes" in inputs:
             inputs["classes"] = self._classes(inputs["classes"])
@@ -247,7 +248,7 @@ class Survey:
         return padded["dem"][:, 0], inputs
 
     def _classes(self, values: ndarray) -> ndarray:
-        """Return the class indices of raster values, NaN for no label.
+        """Return the class indices of raster values; NaN for values without a label.
 
         Raises:
             DatasetError: If a value has no class.
@@ -263,16 +264,16 @@ class Survey:
             if len(unnamed) > _SHOWN_CLASSES:
                 shown.append("…")
             raise DatasetError(
-                f"Expected values of `classes` in {sorted(self.indices)}, got "
-                f"[{', '.join(shown)}] too in {name}. Name each by `class_ids`, null "
-                "for no label; or, if one marks missing cells, declare it: rio "
-                f"edit-info --nodata VALUE {name}"
+                f"Expected only the values {sorted(self.indices)} in `classes`, got "
+                f"also [{', '.join(shown)}] in {name}. Map each value to a class with "
+                "`class_ids`, or to null if it has no label. If a value marks missing "
+                f"cells, declare it: rio edit-info --nodata VALUE {name}"
             )
         return indices
 
 
 def _class_names(rasters: Rasters, recipe: Recipe) -> dict[int, str | None]:
-    """Return class names by raster value, None for no label, after a check."""
+    """Return checked class names by raster value; None for values without a label."""
     names = [item.name for item in recipe.classes]
     class_ids = rasters.class_ids
     if class_ids is None:
@@ -286,21 +287,23 @@ def _class_names(rasters: Rasters, recipe: Recipe) -> dict[int, str | None]:
 
 
 def _stride(cut: Cut, recipe: Recipe) -> Shape:
-    """Return the number of cells from one map to the next, after a check."""
+    """Return the checked number of cells from one map to the next, in y and x."""
     if cut.stride_m is None:
         return recipe.grid.shape
     n_cells = cut.stride_m / recipe.resolution_m
     expect(
         n_cells > 0.5 and abs(n_cells - round(n_cells)) < 1e-6,
         f"`stride` as a multiple of the maps' resolution, {recipe.resolution_m:g} m, "
-        f"got {cut.stride_m:g}.",
+        f"got {cut.stride_m:g} m.",
     )
     return round(n_cells), round(n_cells)
 
 
-def _open_others(stack: ExitStack, rasters: Rasters) -> Iterator[tuple[Raster, str]]:
-    """Open the rasters other than the elevation model; yield them with resampling."""
-    for argument, kinds, resampling in _OTHERS:
+def _open_further_rasters(
+    stack: ExitStack, rasters: Rasters
+) -> Iterator[tuple[Raster, str]]:
+    """Open the rasters other than the elevation model; yield (raster, resampling)."""
+    for argument, kinds, resampling in _FURTHER_RASTERS:
         name = getattr(rasters, argument)
         if name:
             yield stack.enter_context(open_raster(argument, name, kinds)), resampling
@@ -311,10 +314,10 @@ def _open_others(stack: ExitStack, rasters: Rasters) -> Iterator[tuple[Raster, s
         yield raster, layer.resampling
 
 
-def _resampled(
+def _resampled_layers(
     raster: Raster, frame: Mapping[str, Any], resampling: str
 ) -> Iterator[tuple[str, Layer]]:
-    """Yield a raster's layers by name: its values, and the extremes of their means."""
+    """Yield (name, layer) of a raster's values, and of extremes of averaged cells."""
     is_photo = raster.argument == "photo"
     bands = [1, 2, 3] if is_photo else [1]
     yield raster.argument, raster.resampled(frame, bands, resampling)
@@ -323,7 +326,7 @@ def _resampled(
             yield f"{raster.argument} {end}", raster.resampled(frame, bands, end)
 
 
-def _inside(extent: Extent, layout: Layout, step: float) -> list[ndarray]:
+def _inside_masks(extent: Extent, layout: Layout, step: float) -> list[ndarray]:
     """Return masks of rows and columns, padded by one, inside the elevation model."""
     slack = SLACK * step
     masks = []
@@ -339,7 +342,7 @@ def _cut_maps(strip: ndarray, wests: Sequence[int], width: int) -> ndarray:
 
     Args:
         strip: values of neighbouring maps, shape [K, H, columns].
-        wests: first column of each map, ascending; the strip begins at the first.
+        wests: first column of each map, ascending; the strip begins at `wests[0]`.
         width: number of columns of a map.
     """
     offsets = [west - wests[0] for west in wests]
@@ -349,7 +352,7 @@ def _cut_maps(strip: ndarray, wests: Sequence[int], width: int) -> ndarray:
 def _check_covers(
     raster: Raster, crs: Any, area: tuple[float, float, float, float], step: float
 ) -> None:
-    """Check that a raster covers all maps to within a cell, perhaps without values.
+    """Check that a raster covers all maps to within a cell; values may be missing.
 
     Args:
         raster: raster of a layer.
@@ -358,28 +361,28 @@ def _check_covers(
         step: cell width of the maps in metres.
 
     Raises:
-        DatasetError: If it covers only a part of them, or nothing.
+        DatasetError: If the raster does not cover all maps.
     """
     with raster.warped(crs) as warped:
         bounds = warped.bounds
         slack = max(step, *warped.res)
-    lacking = np.subtract(bounds, area) * (1, 1, -1, -1)
-    if (lacking > slack).any():
-        ours = " ".join(f"{value:.10g}" for value in area)
-        theirs = " ".join(f"{value:.10g}" for value in bounds)
+    uncovered_m = np.subtract(bounds, area) * (1, 1, -1, -1)
+    if (uncovered_m > slack).any():
+        expected = " ".join(f"{value:.10g}" for value in area)
+        covered = " ".join(f"{value:.10g}" for value in bounds)
         raise DatasetError(
-            f"Expected `{raster.argument}` over all of the terrain, WEST SOUTH EAST "
-            f"NORTH {ours} in {crs.to_string()[:80]}, got {raster.name} over {theirs}. "
-            "Take a raster that covers it, with a declared value for missing cells, "
-            "or cut `dem` out: rio clip DEM part.tif --bounds 'WEST SOUTH EAST "
-            "NORTH'"
+            f"Expected `{raster.argument}` to cover all of the terrain, WEST SOUTH "
+            f"EAST NORTH {expected} in {crs.to_string()[:80]}, got {raster.name}, "
+            f"which covers {covered}. Use a raster that covers the terrain, with a "
+            "declared value for missing cells, or cut a part out of `dem`: rio clip "
+            "DEM part.tif --bounds 'WEST SOUTH EAST NORTH'"
         )
 
 
 def provenance(name: str) -> dict[str, str | None]:
-    """Return the name of a raster, and the SHA-256 of a file.
+    """Return the name of a raster, and its SHA-256 digest if it is a file.
 
-    Credentials and queries of addresses are removed, since they may be secret.
+    Credentials and queries are removed from URLs, since they may be secret.
     """
     path = Path(name)
     if path.is_file():

@@ -1,10 +1,10 @@
 """Tiling of terrain into maps, and assignment of maps to splits.
 
 Maps are cut from the south-west corner of the terrain, a stride apart. Their indices
-run row by row, northward, and eastward within a row. Each split gets one strip across
-the longer side of the terrain, in the order of the splits. Between two strips, terrain
-of at least a map's width is in no map. Maps of different splits therefore neither
-overlap nor touch.
+increase eastward within a row of maps, and from row to row northward. Each split gets
+one strip across the longer side of the terrain, in the order of the splits. Between two
+strips, terrain of at least a map's width is in no map. Maps of different splits
+therefore neither overlap nor touch.
 """
 
 import math
@@ -17,7 +17,7 @@ from scipy import ndimage
 
 from benchnav.core.errors import DatasetError, expect
 
-Shape = tuple[int, int]  # along y and along x
+Shape = tuple[int, int]  # numbers of cells or maps along y and along x
 
 SLACK = 1e-3  # tolerance of positions, in cells
 
@@ -27,7 +27,7 @@ class Run(NamedTuple):
 
     Args:
         split: name of the split.
-        row: row of maps that contains them.
+        row: index of the row of maps.
         columns: indices of the maps in this row.
     """
 
@@ -42,9 +42,9 @@ class Tiling(NamedTuple):
     Args:
         shape: cells of a map, (H, W).
         stride: cells from one map to the next, northward and eastward.
-        tiles: rows and columns of maps.
-        strips: range of each split, in rows of maps if there are more rows than
-            columns, else in columns.
+        tiles: numbers of rows and columns of maps.
+        strips: range of rows of maps by split; if there are no more rows than columns,
+            range of columns of maps.
     """
 
     shape: Shape
@@ -54,7 +54,7 @@ class Tiling(NamedTuple):
 
     @property
     def cells(self) -> list[int]:
-        """Cells of all maps together, northward and eastward."""
+        """Number of cells of the area of all maps, northward and eastward."""
         last_map = np.subtract(self.tiles, 1) * self.stride
         return (last_map + self.shape).tolist()
 
@@ -69,21 +69,21 @@ class Tiling(NamedTuple):
         """Whether neighbouring maps overlap."""
         return bool(np.less(self.stride, self.shape).any())
 
-    def groups(self, numbers: Sequence[int]) -> np.ndarray:
-        """Return groups of maps that overlap, directly or through other maps.
+    def groups(self, map_indices: Sequence[int]) -> np.ndarray:
+        """Return the group of each map. Maps of a group overlap, also through others.
 
         Args:
-            numbers: indices of some maps in the terrain.
+            map_indices: indices of the maps in the terrain.
 
         Returns:
-            Lowest index in each map's group, int64, shape of `numbers`.
+            Lowest map index in each map's group, int64, shape of `map_indices`.
         """
-        # On a lattice of twice the resolution, each map is a block that reaches to the
-        # last map that it overlaps. Blocks intersect exactly if maps overlap, and do
-        # not touch otherwise.
+        # On a lattice with two points per stride, each map is a block that extends to
+        # the last map that it overlaps. Two blocks intersect if and only if the maps
+        # overlap; otherwise, they do not touch.
         n_strides = np.ceil(np.divide(self.shape, self.stride)).astype(int)
         reach = 2 * n_strides - 2
-        indices = np.asarray(numbers, dtype=np.int64)
+        indices = np.asarray(map_indices, dtype=np.int64)
         row, column = np.divmod(indices, self.tiles[1])
         corners = (2 * row, 2 * column)
         lattice = np.zeros(2 * np.array(self.tiles) + reach, dtype=np.uint8)
@@ -97,11 +97,11 @@ class Tiling(NamedTuple):
         return indices[firsts][inverse]
 
     def split_of(self, row: np.ndarray, column: np.ndarray) -> np.ndarray:
-        """Return the split whose maps contain each cell.
+        """Return the index of the split whose maps contain each cell.
 
         Args:
-            row: rows of the cells, counted northward.
-            column: columns of the cells, counted eastward.
+            row: row of each cell, counted northward.
+            column: column of each cell, counted eastward.
 
         Returns:
             Index into `strips`, −1 for cells in no map, int64, shape of `row`.
@@ -145,7 +145,7 @@ def cut(
     """Return the tiling of terrain into maps and splits.
 
     Args:
-        cells: cells of the terrain, northward and eastward; at least one map.
+        cells: cells of the terrain, northward and eastward; at least those of a map.
         shape: cells of a map, (H, W).
         stride: cells from one map to the next, northward and eastward.
         shares: fraction of the maps of each split.
@@ -162,12 +162,12 @@ def cut(
     if usable < n_splits:
         raise DatasetError(
             f"Expected terrain for {n_splits} splits with a map's width between "
-            f"them, got {n_lines} maps along its longer side. Take fewer splits, smaller "
-            "maps or a larger terrain."
+            f"them, got {n_lines} maps along its longer side. Use fewer splits, "
+            "smaller maps or larger terrain."
         )
     ends = [0]
     for count, total in enumerate(accumulate(shares.values()), start=1):
-        # Each split gets a strip, even for a small fraction.
+        # Each split gets at least one row or column of maps, even for a small fraction.
         min_end = ends[-1] + 1
         max_end = usable - n_splits + count
         end = max(round(total * usable), min_end)
@@ -180,7 +180,9 @@ def cut(
 
 
 def fewest_cells(shape: Shape, stride: Shape, splits: int) -> list[Shape]:
-    """Return the smallest sizes of terrain for some splits, for both strip directions.
+    """Return the smallest sizes of terrain for a number of splits.
+
+    The first size is for strips along y, the second for strips along x.
 
     Args:
         shape: cells of a map, (H, W).
@@ -197,7 +199,7 @@ def fewest_cells(shape: Shape, stride: Shape, splits: int) -> list[Shape]:
 
 
 def _gap(shape: Shape, stride: Shape, side: int) -> int:
-    """Return the number of omitted maps between two splits, along a side."""
+    """Return the number of omitted maps between splits along a side (0: y, 1: x)."""
     return math.ceil(2 * shape[side] / stride[side]) - 1
 
 
@@ -208,20 +210,20 @@ def cut_around(
     shape_m: np.ndarray,
     stride_m: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return terrain around positions that fits an integer number of maps.
+    """Return a part of the terrain around positions, for an integer number of maps.
 
-    If there is room, it begins at an edge between cells of the raster. All pairs are
-    northward and eastward, in metres.
+    If there is room, the part begins at an edge between cells of the raster. All pairs
+    are northward and eastward, in metres.
 
     Args:
         positions_m: positions from the raster's south-west corner, shape [N, 2].
         raster_m: size of the raster, shape [2].
-        cell_m: size of its cells, shape [2].
+        cell_m: size of the raster's cells, shape [2].
         shape_m: size of a map, shape [2].
         stride_m: distance from one map to the next, shape [2].
 
     Returns:
-        South-west corner and size of the terrain, each of shape [2].
+        South-west corner and size of the part, each of shape [2].
     """
     low_m = np.maximum(positions_m.min(axis=0) - cell_m, 0)
     high_m = np.minimum(positions_m.max(axis=0) + cell_m, raster_m)
@@ -235,10 +237,10 @@ def cut_around(
 
 
 def read_shares(text: str) -> dict[str, float]:
-    """Return splits and fractions from text: `train:0.7,valid:0.1,test/site:0.2`.
+    """Return fractions by split from text: `train:0.7,valid:0.1,test/site:0.2`.
 
     Raises:
-        ConfigError: If it has another form, or the fractions do not sum to 1.
+        ConfigError: If the text has another form, or the fractions do not sum to 1.
     """
     shares: dict[str, float] = {}
     for part in text.split(","):
@@ -249,8 +251,8 @@ def read_shares(text: str) -> dict[str, float]:
             value = math.nan
         expect(
             name and name not in shares and 0 < value <= 1,
-            "`splits` such as train:0.7,valid:0.1,test/site:0.2, each name once and "
-            f"each fraction above 0, got {part.strip()!r} in {text!r}.",
+            "`splits` such as train:0.7,valid:0.1,test/site:0.2, with each name once "
+            f"and each fraction in (0, 1], got {part.strip()!r} in {text!r}.",
         )
         shares[name] = value
     total = sum(shares.values())

@@ -7,7 +7,7 @@ from benchnav.datagen.dem.crs import horizontal
 from benchnav.datagen.dem.raster import Raster
 
 UNITS_M = {"m": 1.0, "ft": 0.3048, "us-ft": 1200 / 3937}  # by the names of PROJ
-# Spellings of units in rasters, in lower case, by the value of `dem_unit`.
+# Spellings of units that rasters declare, in lower case, by the value of `dem_unit`.
 _SPELLINGS = {
     "m": ("m", "metre", "meter", "metres", "meters"),
     "ft": ("ft", "foot", "feet", "international foot", "international feet"),
@@ -34,12 +34,12 @@ def in_unit(dem: Raster, unit: str) -> tuple[Raster, str]:
 
     Args:
         dem: Elevation model, one band.
-        unit: A name of `UNITS_M`, or metres in a unit as text. If empty, the unit that
-            the raster declares.
+        unit: Name in `UNITS_M`, or the length of the unit in metres, as text. If empty,
+            the unit that the raster declares.
 
     Raises:
         ConfigError: If the unit is invalid.
-        DatasetError: If `unit` is empty and the raster may not be in metres.
+        DatasetError: If `unit` is empty and elevations may not be in metres.
     """
     declared = dem.file.units[0] or ""
     crs = horizontal(dem.file.crs)
@@ -50,29 +50,29 @@ def in_unit(dem: Raster, unit: str) -> tuple[Raster, str]:
             metres = np.nan
         expect(
             0 < metres < np.inf,
-            f"`dem_unit` among {', '.join(UNITS_M)}, or as metres in a unit, such as "
-            f"0.01, got {unit!r}.",
+            f"`dem_unit` to be one of {', '.join(UNITS_M)}, or the length of the unit "
+            f"in metres, such as 0.01 for centimetres, got {unit!r}.",
         )
         source = f"{unit} as set by `dem_unit`"
         if declared:
             source += f", although the raster declares {declared!r}"
         return dem._replace(metres=metres), source
-    name = _option_of(declared)
+    name = _dem_unit_of(declared)
     if name == "m":
         return dem, "metres as the raster declares"
     if declared:
-        option = "--dem-unit with the metres in one unit, such as 0.01"
+        option = "--dem-unit with the length of the unit in metres, such as 0.01"
         if name:
             option = f"--dem-unit {name}"
         raise DatasetError(
             f"Expected elevations of `dem` in metres, got {declared!r} in {dem.name}. "
             f"To convert them, pass {option}; "
-            "if they are metres nevertheless, pass --dem-unit m."
+            "if they are in metres nevertheless, pass --dem-unit m."
         )
     if crs.is_projected and crs.linear_units_factor[1] != 1:
         raise DatasetError(
-            f"Expected a declared unit of the elevations of `dem`, since the CRS of "
-            f"{dem.name} is in {crs.linear_units_factor[0]}, got none. Pass their unit: "
+            f"Expected `dem` to declare the unit of its elevations, since the CRS of "
+            f"{dem.name} is in {crs.linear_units_factor[0]}, got no unit. Pass it: "
             "--dem-unit us-ft, --dem-unit ft or --dem-unit m."
         )
     return dem, "metres (the raster declares no unit; `dem_unit` sets another)"
@@ -82,14 +82,15 @@ def check_metres(raster: Raster) -> None:
     """Check that a raster of a layer in metres does not declare another unit.
 
     Raises:
-        DatasetError: If it does, with a command that converts it.
+        DatasetError: If the raster declares another unit; with a command that converts
+            it.
     """
     declared = raster.file.units[0] or ""
-    name = _option_of(declared)
+    name = _dem_unit_of(declared)
     if not declared or name == "m":
         return
     factor = "METRES"
-    explanation = ", METRES being the metres in one unit"
+    explanation = ", where METRES is the length of the unit in metres"
     if name:
         factor = f"{UNITS_M.get(name) or float(name):.10g}"
         explanation = ""
@@ -101,13 +102,13 @@ def check_metres(raster: Raster) -> None:
     relabel = f"rio edit-info --bidx 1 --units m {raster.name}"
     raise DatasetError(
         f"Expected `{raster.argument}` in metres, got {declared!r} in {raster.name}. "
-        f"If they are metres nevertheless, declare this: {relabel}. Otherwise, convert "
-        f"them{explanation}: {convert}"
+        f"If the values are in metres nevertheless, declare this: {relabel}. "
+        f"Otherwise, convert them{explanation}: {convert}"
     )
 
 
-def _option_of(declared: str) -> str:
-    """Return the value of `dem_unit` for a declared unit; empty for an unknown one."""
+def _dem_unit_of(declared: str) -> str:
+    """Return the value of `dem_unit` for a declared unit; empty if it is unknown."""
     text = declared.strip().lower()
     for name, spellings in _SPELLINGS.items():
         if text in spellings:

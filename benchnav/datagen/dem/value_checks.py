@@ -1,8 +1,8 @@
-"""Checks of raster values: their range, and undeclared sentinels among them.
+"""Checks of raster values: range, and undeclared sentinels.
 
-Maps contain values by the raster's argument, NaN if missing. For averaged cells, they
-also contain the extremes by `ARGUMENT min` and `ARGUMENT max`. Letters in shapes: K
-bands, H×W cells.
+The argument `maps` contains values by the name of the raster's argument, NaN if
+missing. For averaged cells, it also contains the extremes before averaging, named
+`ARGUMENT min` and `ARGUMENT max`. Letters in shapes: K bands, H×W cells.
 """
 
 import numpy as np
@@ -24,11 +24,12 @@ def check_elevation(dem: Raster, values: Maps, cliff_m: float) -> None:
 
     Args:
         dem: elevation model.
-        values: values of the map, each of shape [K, H, W].
-        cliff_m: difference of heights that no natural terrain has next to a cell.
+        values: values of the map by name, each of shape [K, H, W].
+        cliff_m: difference in height between neighbouring cells that natural terrain
+            does not exceed, in metres.
 
     Raises:
-        DatasetError: If they do.
+        DatasetError: If they contain an undeclared sentinel.
     """
     lowest_m = values.get("dem min", values["dem"])
     highest_m = values.get("dem max", values["dem"])
@@ -36,7 +37,7 @@ def check_elevation(dem: Raster, values: Maps, cliff_m: float) -> None:
     for extreme, heights_m in ((low, lowest_m), (high, highest_m)):
         if is_missing(dem, extreme, heights_m, cliff_m):
             expected = "elevations of `dem` without undeclared missing values"
-            raise _out_of_range(dem, expected, low, high, extreme)
+            raise _invalid_value_error(dem, expected, low, high, extreme)
     declared_gap_m = widest_gap_m(cliff_m)
     max_gap_m = declared_gap_m if dem.declares_missing else cliff_m
     for value in (0, -1):
@@ -44,12 +45,12 @@ def check_elevation(dem: Raster, values: Maps, cliff_m: float) -> None:
         if gap_m > max_gap_m:
             expected = f"elevations of `dem` without a gap next to {value}"
             advice = ""
-            if gap_m <= declared_gap_m:  # perhaps the sea
+            if gap_m <= declared_gap_m:  # the value may be the height of the sea
                 advice = (
                     f"If {value} is a height, declare a value that does not "
                     "occur, such as -9999."
                 )
-            raise _out_of_range(dem, expected, low, high, value, advice)
+            raise _invalid_value_error(dem, expected, low, high, value, advice)
 
 
 def check_limits(
@@ -57,31 +58,31 @@ def check_limits(
 ) -> tuple[float, float]:
     """Return the minimum and maximum of a raster's values, after a check.
 
-    Without any value, the minimum is larger.
+    If all values are missing, the minimum is ∞ and the maximum −∞.
 
     Args:
-        raster: the raster.
-        maps: values of some maps.
-        minimum: lower limit.
-        maximum: upper limit.
+        raster: raster of the values.
+        maps: values of the maps by name.
+        minimum: lower limit, inclusive.
+        maximum: upper limit, inclusive.
 
     Raises:
-        DatasetError: If a value is beyond the limits.
+        DatasetError: If a value is outside the limits.
     """
     low, high = _range(raster.argument, maps)
     if low < minimum or high > maximum:
         expected = f"values of `{raster.argument}` in [{minimum:g}, {maximum:g}]"
         invalid = low if low < minimum else high
-        raise _out_of_range(raster, expected, low, high, invalid)
+        raise _invalid_value_error(raster, expected, low, high, invalid)
     return low, high
 
 
 def check_layer(raster: Raster, maps: Maps, field: Field) -> bool:
-    """Return whether a layer has a value on some maps, after a check.
+    """Return whether a layer has at least one value on the maps, after a check.
 
     Args:
         raster: raster of the layer.
-        maps: values of the maps.
+        maps: values of the maps by name.
         field: field of the layer, with its limits.
 
     Raises:
@@ -97,8 +98,8 @@ def check_layer(raster: Raster, maps: Maps, field: Field) -> bool:
             expected = f"values of `{name}` without undeclared missing values"
             advice = ""
             if not raster.declares_missing:
-                advice = "If it is a valid value, declare one that does not occur."
-            raise _out_of_range(raster, expected, low, high, extreme, advice)
+                advice = "If it is a valid value, declare a value that does not occur."
+            raise _invalid_value_error(raster, expected, low, high, extreme, advice)
     return True
 
 
@@ -111,7 +112,7 @@ def _range(name: str, maps: Maps) -> tuple[float, float]:
     return float(minimum), float(maximum)
 
 
-def _out_of_range(
+def _invalid_value_error(
     raster: Raster,
     expected: str,
     low: float,
@@ -122,23 +123,23 @@ def _out_of_range(
     """Return an error on invalid values, with a command that corrects them.
 
     Args:
-        raster: the raster.
-        expected: expectation, for the message.
-        low: lowest value of a map.
-        high: highest value of a map.
-        invalid: the invalid value, perhaps a sentinel.
-        advice: further advice, a sentence.
+        raster: raster with the values.
+        expected: text of the message after "Expected".
+        low: lowest value of the maps.
+        high: highest value of the maps.
+        invalid: invalid value, which may be a sentinel.
+        advice: further advice, one sentence; may be empty.
     """
     problem = f"Expected {expected}, got {low:g} to {high:g} in {raster.name}."
     value = raster.raw(invalid)
     if invalid and not looks_missing(raster, invalid):
-        percent = "."
+        command = "."
         if raster.argument == "traversability":
-            percent = (
+            command = (
                 "; from percent: rio calc --not-masked -t float32 "
                 f"'(/ (read 1) 100.0)' {raster.name} scaled.tif"
             )
-        return DatasetError(f"{problem} Convert them{percent}")
+        return DatasetError(f"{problem} Convert the values{command}")
     nodata = raster.file.nodata
     if nodata is not None:
         replacement = f"(where (== (read 1) {value:.9g}) {nodata:.9g} (read 1))"

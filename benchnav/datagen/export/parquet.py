@@ -26,10 +26,12 @@ _CELLS_PER_ROW_GROUP = 2**20
 
 
 def split_names(splits: Iterable[str]) -> dict[str, str]:
-    """Return names of splits in letters, digits and `_`, as `test_std` for `test/std`.
+    """Return file names of splits by split, such as `test_std` for `test/std`.
+
+    They consist of letters, digits and `_`.
 
     Raises:
-        DatasetError: If two splits have the same name.
+        DatasetError: If two splits have the same file name.
     """
     names = {}
     for split in splits:
@@ -38,9 +40,9 @@ def split_names(splits: Iterable[str]) -> dict[str, str]:
         same = [candidate for candidate in names if names[candidate] == name]
         if len(same) > 1:
             raise DatasetError(
-                "Expected splits that differ in letters and digits, got "
-                f"{' and '.join(same)}, both {name!r} in Parquet. Export them "
-                f"separately, with `splits` [{split}]."
+                "Expected names of splits that differ in letters or digits, got "
+                f"{' and '.join(same)}, whose files would all be named {name!r}. "
+                f"Export these splits separately, for example with `splits` [{split}]."
             )
     return names
 
@@ -48,7 +50,7 @@ def split_names(splits: Iterable[str]) -> dict[str, str]:
 def columns_of(
     dataset: TerrainDataset, fields: Iterable[str]
 ) -> dict[str, schema.Field]:
-    """Return the columns of a split: the index of the map, and some fields."""
+    """Return the columns of a split by name: the index of the map, and `fields`."""
     meaning = "number of the map in its split"
     columns = {MAP: schema.Field("<i8", (), "1", 0, np.inf, meaning)}
     for name in fields:
@@ -61,7 +63,8 @@ def table_schema(
 ) -> pa.Schema:
     """Return the schema of a split's table.
 
-    Metadata are shape, unit and meaning of each column, and the dataset's recipes.
+    Its metadata contain shape, unit and meaning of each column, and the dataset's
+    recipes.
 
     Args:
         dataset: dataset of the split.
@@ -109,15 +112,15 @@ def write_split(
 
     Args:
         folder: folder of the files.
-        name: name of the split in names of files.
+        name: name of the split in file names, from `split_names`.
         dataset: dataset of the split.
         split: name of the split in the dataset.
         fields: names of fields, in the order of the columns.
-        maps_per_file: maximum number of maps of a file; 0 for the number that
-            `CELLS_PER_FILE` allows.
+        maps_per_file: maximum number of maps in a file; if 0, `CELLS_PER_FILE` limits
+            the number.
 
     Yields:
-        Number of maps written in each step.
+        Number of maps written in each chunk.
     """
     maximum = maps_per_file or dataset.grid.maps_in(CELLS_PER_FILE)
     step = dataset.grid.maps_in(_CELLS_PER_ROW_GROUP)
@@ -142,7 +145,7 @@ def write_split(
 
 
 def _nested_array(values: np.ndarray, kind: pa.DataType) -> pa.Array:
-    """Return nested lists of values of shape [B, *entry shape]."""
+    """Return values of shape [B, *entry shape] as nested lists of a Parquet type."""
     if not pa.types.is_fixed_size_list(kind):
         return pa.array(np.ascontiguousarray(values))
     elements = values.reshape(-1, *values.shape[2:])

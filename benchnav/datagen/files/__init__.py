@@ -1,1 +1,1 @@
-"""Datasets on disk: reading, writing, making, checking and merging them."""
+"""Creation, reading, checks, description and merging of datasets on disk."""

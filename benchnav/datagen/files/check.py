@@ -15,7 +15,7 @@ from benchnav.datagen import schema
 from benchnav.datagen.files.manifest import READ_ERRORS, open_file
 from benchnav.datagen.files.reader import CHUNK_CELLS, TerrainDataset
 
-_MISSING = "is missing or cannot be opened"
+_UNREADABLE = "is missing or cannot be opened"
 
 
 class Fault(NamedTuple):
@@ -24,7 +24,8 @@ class Fault(NamedTuple):
     Args:
         split: name of the split.
         map: index of the map; −1 if the fault does not concern a single map.
-        field: array of the split; empty if the fault does not concern a single array.
+        field: name of the damaged array; empty if the fault does not concern a single
+            array.
         problem: description of the fault.
         file: name of the shard; empty if the dataset is one file.
     """
@@ -36,19 +37,19 @@ class Fault(NamedTuple):
     file: str = ""
 
     def __str__(self) -> str:
-        """Return the fault in one line."""
+        """Return a description of the fault in one line."""
         return next(summarise([self]))
 
 
 def summarise(faults: list[Fault]) -> Iterator[str]:
-    """Yield a line for each fault; consecutive maps with the same fault share one."""
+    """Yield a line for each fault, or for each run of maps with the same fault."""
 
     def run_of(item: tuple[int, Fault]) -> Fault:
         position, fault = item
         return fault._replace(map=fault.map - position)
 
-    order = sorted(faults, key=attrgetter("split", "field", "problem", "file", "map"))
-    for _, items in groupby(enumerate(order), run_of):
+    ordered = sorted(faults, key=attrgetter("split", "field", "problem", "file", "map"))
+    for _, items in groupby(enumerate(ordered), run_of):
         (_, first), *others = items
         maps = f"map {first.map}" if first.map >= 0 else ""
         if others:
@@ -60,13 +61,13 @@ def summarise(faults: list[Fault]) -> Iterator[str]:
 
 
 def find_faults(path: str | Path) -> list[Fault]:
-    """Read a complete dataset and return its faults.
+    """Read all data of a dataset and return its faults.
 
     Args:
-        path: the file or folder.
+        path: path of the dataset's file or folder.
 
     Returns:
-        All faults, including each damaged map and field; empty if the dataset is sound.
+        All faults, with each damaged map and field; empty if the dataset is undamaged.
 
     Raises:
         DatasetError: If the file or its manifest cannot be read.
@@ -86,26 +87,26 @@ def _split_faults(
     shape = (dataset.map_count(split), len(fields), schema.DIGEST_BYTES)
     stored = np.ma.masked_all(shape, np.uint8)
     computed = stored.copy()
-    files: list[str] = []  # of each map
+    files: list[str] = []  # name of the shard of each map
     for piece in dataset.pieces[split]:
         shard = piece.path.name if piece.path != dataset.path else ""
         files += [shard] * piece.maps
         try:
             file = open_file(piece.path)
         except DatasetError:
-            yield -1, "", _MISSING, shard
+            yield -1, "", _UNREADABLE, shard
             continue
         with file:
             for name in (*fields, schema.ENTRY_DIGESTS):
                 try:
                     array = dataset.stored_array(file, split, name, piece.maps)
                 except (*READ_ERRORS, TypeError, AttributeError) as error:
-                    problem = _MISSING
+                    problem = _UNREADABLE
                     if type(error) is ValueError:
                         problem = str(error).removeprefix("it ")
                     yield -1, name, problem, shard
                     continue
-                for start, values in _read_some(array):
+                for start, values in _read_chunks(array):
                     first = piece.first + start
                     if values is None:
                         yield first, name, "is damaged", shard
@@ -114,7 +115,7 @@ def _split_faults(
                     if name == schema.ENTRY_DIGESTS:
                         stored[maps] = values
                         continue
-                    for index in _out_of_range(dataset, split, name, values):
+                    for index in _maps_out_of_range(dataset, split, name, values):
                         yield first + index, name, "is out of range", shard
                     digests = schema.entry_digests(
                         {name: values}, {name: dataset.fields[name]}
@@ -126,7 +127,8 @@ def _split_faults(
     differs = (computed != stored).filled(False).any(axis=2)
     digest = schema.split_digest(computed.data, *dataset.grid.shape, dataset.fields)
     if is_readable and digest == dataset.splits[split]["digest"]:
-        # The maps match the manifest, so the stored digests are damaged.
+        # The maps match the digest in the manifest, so the stored digests of the maps
+        # are damaged.
         for index in np.flatnonzero(differs.any(axis=1)).tolist():
             yield index, schema.ENTRY_DIGESTS, "does not match the map", files[index]
         return
@@ -139,21 +141,27 @@ def _split_faults(
 def _damaged_scales(
     file: h5py.File, split: str, names: Collection[str]
 ) -> Iterator[str]:
-    """Yield other unreadable arrays of a split, such as dimension scales."""
-    others: list[str] = []
+    """Yield the names of unreadable dimension scales of a split.
+
+    Args:
+        file: open file.
+        split: name of the split.
+        names: names of the arrays that are not dimension scales.
+    """
+    scales: list[str] = []
     with suppress(*READ_ERRORS):
-        others = sorted(set(file[split]) - set(names))
-    for name in others:
+        scales = sorted(set(file[split]) - set(names))
+    for name in scales:
         try:
             file[split][name][()]
         except READ_ERRORS:
             yield name
 
 
-def _read_some(array: h5py.Dataset) -> Iterator[tuple[int, np.ndarray | None]]:
-    """Yield chunks of maps with the index of the first map.
+def _read_chunks(array: h5py.Dataset) -> Iterator[tuple[int, np.ndarray | None]]:
+    """Yield (index of the first map, values) for chunks of maps.
 
-    Maps of a damaged chunk are read one by one; None is a damaged map.
+    Maps of a damaged chunk are read one by one. The values of a damaged map are None.
     """
     step = max(1, CHUNK_CELLS * len(array) // max(1, array.size))
     for start in range(0, len(array), step):
@@ -167,17 +175,18 @@ def _read_some(array: h5py.Dataset) -> Iterator[tuple[int, np.ndarray | None]]:
                 yield index, values
 
 
-def _out_of_range(
+def _maps_out_of_range(
     dataset: TerrainDataset, split: str, name: str, values: np.ndarray
 ) -> list[int]:
-    """Return the indices of maps with an invalid value."""
+    """Return the indices of maps with a value out of range."""
     field = dataset.fields[name]
     maximum = len(dataset.recipe.classes) - 1 if name == "class_id" else field.maximum
     is_valid = (values >= field.minimum) & (values <= maximum)
     if name == "class_id" and schema.has_unlabelled(dataset.splits[split]):
         is_valid |= values == schema.UNLABELLED
-    # NaN is a time that was not requested, unobserved λ, or a std of one row. Fields
-    # that this package does not define may contain NaN.
+    # NaN marks a reference time that was not requested, λ that was not measured, and
+    # the standard deviation of a single row. Fields that this package does not define
+    # may also contain NaN.
     may_be_nan = ("reference_time_s", "traversability", "drive_std")
     if name in may_be_nan or name not in (*schema.KNOWN, *schema.TRUTH):
         is_valid |= np.isnan(values)

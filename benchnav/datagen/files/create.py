@@ -1,10 +1,12 @@
 """Creation of datasets: shard by shard, in parallel, resumed after an interruption.
 
-A shard is a pure function of the recipe and of its maps' indices. Any process on any
-machine may generate it, and lost shards are generated again. A dataset of one file is
-built in the folder `.NAME.partial` next to it, whose shards are joined at the end. A
-dataset of many files is built in its final folder, and is finished when its manifest is
-written. If it replaces a finished dataset, it is built in a folder `.NAME.partial` too.
+A shard is a file of consecutive maps of a split. It depends only on the recipe and the
+indices of the maps, so any process on any machine may generate it, and lost shards can
+be generated again. If a dataset is a single file, its shards are written to the folder
+`.NAME.partial` next to the file and joined at the end. If a dataset is a folder, its
+shards are written to this folder, and the dataset is finished when its manifest is
+written. If the folder replaces a finished dataset, its shards are first written to
+`.NAME.partial` too.
 """
 
 import platform
@@ -48,30 +50,33 @@ def create(
 ) -> Iterator[tuple[int, int]]:
     """Create a dataset; yield (maps done, total maps). Iterate to the end.
 
-    The first pair is yielded before any map is generated: it counts existing maps.
+    The first pair is yielded before any map is generated and counts existing maps.
 
     Args:
         recipe: recipe of the dataset.
-        path: file to write, of suffix `.h5` or `.hdf5`; else a folder.
+        path: path of the file to write, if its suffix is `.h5` or `.hdf5`; else path of
+            the folder to write.
         jobs: number of processes that generate maps.
-        scheduler: address of a Dask cluster's scheduler, whose workers replace the
-            processes; empty for no cluster.
-        shard: part of the shards to generate; None for all.
+        scheduler: address of the scheduler of a Dask cluster, whose workers then
+            generate the maps; empty for no cluster.
+        shard: part of the dataset's shards to generate; None for all.
         overwrite: whether to replace an existing dataset.
-        shard_cells: cells of a shard; a single file does not depend on it.
+        shard_cells: maximum number of cells of a shard with several maps; does not
+            affect a single file.
 
     Raises:
-        DatasetError: If it cannot be written, or workers have another version of this
-            package.
-        ConfigError: If the recipe yields no valid maps, `out` exists, or the cluster
+        DatasetError: If the dataset cannot be written, or workers have another version
+            of this package.
+        ConfigError: If the recipe yields no valid maps, `path` exists, or the cluster
             cannot be reached.
-        BenchnavError: If another run is writing it, a worker was killed, or the cluster
-            was lost.
+        BenchnavError: If another process is writing the dataset, a worker was killed,
+            or the connection to the cluster was lost.
     """
     path = resolve_link(path)
     expect(
         shard is None or not is_one_file(path),
-        f"`out` to be a folder, since a shard is made, got {path}.",
+        "`out` to be a folder, since `shard` writes only part of a dataset, got the "
+        f"name of a single file, {path}. Leave out the suffix.",
     )
     for spec in recipe.layers if jobs > 1 or scheduler else ():
         spec.check_workers()
@@ -84,7 +89,8 @@ def create(
     requested = shards
     locked = path
     if shard is not None:
-        # Several processes may write to a folder, each its own part of the shards.
+        # Several processes may write to the folder, each a different part of the
+        # shards.
         requested = shards[shard.index - 1 :: shard.of]
         locked = path.with_name(f"{path.name}.{shard.index}-of-{shard.of}")
     with (
@@ -93,15 +99,15 @@ def create(
         sole_writer(locked, str(path)),
     ):
         restore(path)
-        # Shards of this recipe in a folder are resumed.
+        # A folder may contain shards of this recipe from an interrupted run.
         names = [file.name for file in shards]
         check_output(path, overwrite or not is_one_file(path), names)
         folder = path
         if is_one_file(path) or (overwrite and (path / FOLDER_MANIFEST).exists()):
             expect(
                 shard is None,
-                f"no finished dataset where a shard is made, got {path}. Remove it "
-                "first.",
+                f"no finished dataset at `out` if `shard` is given, got {path}. Remove "
+                "the dataset first.",
             )
             folder = path.with_name(f".{path.name}.partial")
         folder.mkdir(parents=True, exist_ok=True)
@@ -110,7 +116,7 @@ def create(
         manifest = folder / FOLDER_MANIFEST
         if manifest.exists() and not missing:
             check_output(path, overwrite)
-        manifest.unlink(missing_ok=True)  # until lost shards are complete again
+        manifest.unlink(missing_ok=True)  # the dataset is unfinished until the end
         total = sum(file.maps for file in requested)
         n_existing = total - sum(file.maps for file in missing)
         done = n_existing
@@ -124,8 +130,8 @@ def create(
                 done += file.maps
                 yield done, total
         except ConfigError:
-            # If this run generated maps, the recipe itself fails: nothing can be
-            # resumed.
+            # If this run generated maps before the error, the recipe is the cause, so
+            # the shards are of no use.
             if folder != path and (done > n_existing or not any(folder.iterdir())):
                 shutil.rmtree(folder, ignore_errors=True)
             raise
@@ -143,24 +149,24 @@ def create(
 def make_shard(
     recipe: Recipe, shard: ShardFile, version: str
 ) -> tuple[ShardFile, bytes]:
-    """Generate a shard, perhaps in a process on another machine.
+    """Generate a shard. The function may run on another machine.
 
     Args:
         recipe: recipe of the maps.
-        shard: the shard.
+        shard: shard to generate.
         version: expected version of this package.
 
     Returns:
         The shard, and the bytes of its file.
 
     Raises:
-        DatasetError: If another version of this package is installed there.
+        DatasetError: If the running version of this package is another one.
         ConfigError: If the recipe yields no valid maps.
     """
     if benchnav.__version__ != version:
         raise DatasetError(
-            f"Expected workers with benchnav {version}, got one on {platform.node()} "
-            f"with {benchnav.__version__}."
+            f"Expected workers with benchnav {version}, got a worker on "
+            f"{platform.node()} with {benchnav.__version__}. Install the same version."
         )
     maps = generate(recipe, shard.split, np.arange(shard.first, shard.stop))
     entry = recipe_entry(recipe, shard)
@@ -168,7 +174,7 @@ def make_shard(
 
 
 def is_current(path: Path, recipe: Recipe, shard: ShardFile) -> bool:
-    """Return whether a file is this shard of this recipe, made by this version."""
+    """Return whether a file is a shard of a recipe by this version of the package."""
     try:
         manifest = read_manifest(path)
     except DatasetError:
@@ -188,20 +194,20 @@ def _missing(
     requested: Sequence[ShardFile],
     may_replace: bool,
 ) -> list[ShardFile]:
-    """Return missing shards, and remove outdated files that they replace.
+    """Return the missing shards, and remove the outdated files that they replace.
 
-    Outdated files are of another recipe, shard size or version.
+    Files are outdated if their recipe, shard size or version differs.
 
     Args:
         folder: folder of the shards.
         recipe: recipe of the dataset.
         shards: all shards of the dataset.
-        requested: shards to generate here; if empty, all are checked, and no file is
-            removed.
+        requested: shards that this process generates. If empty, all shards are checked,
+            and no file is removed.
         may_replace: whether outdated files are allowed.
 
     Raises:
-        ConfigError: If there are outdated files, and they are not allowed.
+        ConfigError: If outdated files exist and are not allowed.
     """
     by_name = {shard.name: shard for shard in shards}
     current: set[str] = set()
@@ -215,18 +221,19 @@ def _missing(
     for file in outdated:
         expect(
             may_replace,
-            f"`out` to be new or to contain shards of one recipe and version, got {file} "
-            "of another. Choose another `out`, or pass --overwrite with the recipe, "
-            "settings and version of the other shards.",
+            "`out` to be new or to contain only shards of this recipe, these settings "
+            f"and this version, got {file}, which differs. Choose another `out`, use "
+            "the recipe, settings and version of that file, or pass --overwrite to "
+            "replace it.",
         )
     requested_names = {shard.name for shard in requested}
-    # Other processes replace their own outdated shards.
+    # Outdated shards of other processes are left, since those processes replace them.
     replaced = [
         file
         for file in outdated
         if file.name in requested_names or file.name not in by_name
     ]
-    # Partial files of requested shards are left from an interrupted run.
+    # An interrupted run may have left partial files of requested shards.
     partial_files = [
         file
         for file in folder.glob(".*.partial")

@@ -1,4 +1,4 @@
-"""Description of a dataset as plain data, as tables and, if it is new, as lines."""
+"""Description of a dataset: as plain data, as tables, and as lines after writing."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict
@@ -21,7 +21,7 @@ _DIGESTS = {
 
 
 def describe(dataset: TerrainDataset) -> schema.Json:
-    """Return the contents of `show` as data for JSON."""
+    """Return what the command `show` prints about a dataset, as data for JSON."""
     manifest = dataset.manifest
     recipe = dataset.recipe
     settings = plain(recipe)
@@ -71,7 +71,11 @@ def _stored_bytes(dataset: TerrainDataset, split: str) -> int:
 
 
 def tables(described: schema.Json) -> Iterator[Table | str]:
-    """Yield the lines and tables of `describe`'s data, for a terminal."""
+    """Yield lines and tables for a terminal.
+
+    Args:
+        described: data from `describe`.
+    """
     grid = described["grid"]
     generator = described["generator"]
     files = f" in {described['files']} files" if described["files"] > 1 else ""
@@ -155,7 +159,10 @@ def tables(described: schema.Json) -> Iterator[Table | str]:
 
 
 def _describe_layer(spec: LayerSpec, classes: ClassTable) -> schema.Json:
-    """Return the description of a layer; without its code, texts on classes are empty."""
+    """Return the description of a layer.
+
+    If the layer's code is not available, its texts on classes are empty.
+    """
     layer = spec.available
     texts = {item.name: "" for item in classes}
     if layer:
@@ -172,6 +179,7 @@ def _describe_layer(spec: LayerSpec, classes: ClassTable) -> schema.Json:
 
 
 def _origin(described: schema.Json, part: schema.Json) -> str:
+    """Return the number of maps of a part of a split, and their source, as text."""
     if "recipe" not in part:
         return f"{part['maps']} of {part['source']['file']}"
     recipe = described["recipes"][part["recipe"]]
@@ -179,12 +187,12 @@ def _origin(described: schema.Json, part: schema.Json) -> str:
 
 
 def widest(names: Iterable[str]) -> int:
-    """Return the width of a column of names in characters, at least 12."""
+    """Return the length of the longest name in characters, at least 12."""
     return max([12, *map(len, names)])
 
 
 def written(path: Path) -> TerrainDataset:
-    """Return a new dataset, and print its path, size, splits and their digests."""
+    """Print path, size, splits and digests of a new dataset, and return the dataset."""
     from rich.filesize import decimal
 
     dataset = TerrainDataset(path)

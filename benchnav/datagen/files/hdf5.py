@@ -1,7 +1,7 @@
 """Atomic writing of datasets: an HDF5 file, or a folder of such files.
 
-HDF5's own filters compress and checksum: byte shuffle, deflate, Fletcher-32. Letters in
-shapes: B maps.
+HDF5's filters compress the data (byte shuffle, deflate) and add checksums
+(Fletcher-32). Letters in shapes: B maps.
 """
 
 import os
@@ -33,20 +33,20 @@ from benchnav.datagen.files.manifest import FOLDER_MANIFEST, open_file, read_man
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import Recipe
 
-FOLDER_FORMAT_VERSION = "1.2"  # the lowest version of a folder of shards
+FOLDER_FORMAT_VERSION = "1.2"  # minimum format version of a folder of shards
 
-# Structures of HDF5 1.10 have checksums, which detect damage to them.
+# The file structures of HDF5 1.10 have checksums, which detect damage.
 _LIBRARY = ("v110", "v110")
 
 _VALUES_PER_CHUNK = 1024
-# Space for HDF5's structures, small fields, digests and the manifest.
+# Allocated space for HDF5's structures, small fields, digests and the manifest.
 _SPARE_BYTES = 1 << 18
 _SPARE_BYTES_PER_MAP = 1024
 
 _SHARD = re.compile(r".+-\d{8}-\d{8}\.h5")
-_PARTIAL = re.compile(r"\..+\.partial")  # of a shard or of the manifest
+_PARTIAL = re.compile(r"\..+\.partial")  # unfinished shard or manifest
 
-# Arrays by name, stored or to be stored, including `ENTRY_DIGESTS`.
+# Arrays by name, in memory or in a file, including `ENTRY_DIGESTS`.
 Source = Mapping[str, Any]
 
 
@@ -55,10 +55,10 @@ class Contents(NamedTuple):
 
     Args:
         id: name and version of the dataset.
-        recipes: recipes, to which parts of splits refer by index. The first determines
-            grid and class table.
-        splits: manifest entry of each split by name, without its digest.
-        files: files with the maps of each split, in order, each under the split's name.
+        recipes: recipes, to which parts of splits refer by index. The first recipe
+            determines grid and class table.
+        splits: manifest entries by split, without the digest.
+        files: paths of the files with the maps, in order, by split.
         fields: fields of each map.
     """
 
@@ -72,7 +72,7 @@ class Contents(NamedTuple):
         """Return the manifest.
 
         Args:
-            entry_digests: digests of each split's entries from `schema.entry_digests`.
+            entry_digests: digests from `schema.entry_digests`, by split.
         """
         recipes = [recipe.to_dict() for recipe in self.recipes]
         shape = self.recipes[0].grid.shape
@@ -94,7 +94,7 @@ class Contents(NamedTuple):
 
 
 class ShardFile(NamedTuple):
-    """File of consecutive maps of a recipe's split, which is a dataset too.
+    """File of consecutive maps of a recipe's split; the file is itself a dataset.
 
     Args:
         split: name of the split.
@@ -113,7 +113,7 @@ class ShardFile(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Name of its file."""
+        """Name of the file."""
         return f"{self.split.replace('/', '+')}-{self.first:08d}-{self.stop:08d}.h5"
 
 
@@ -121,8 +121,8 @@ def contents_of_recipe(recipe: Recipe, files: Mapping[str, Sequence[Path]]) -> C
     """Return the contents of a dataset of all maps of a recipe.
 
     Args:
-        recipe: the recipe.
-        files: files with the maps of each split, in order.
+        recipe: recipe of the maps.
+        files: paths of the files with the maps, in order, by split.
     """
     splits = {
         name: recipe_entry(recipe, ShardFile(name, 0, spec.maps))
@@ -132,7 +132,7 @@ def contents_of_recipe(recipe: Recipe, files: Mapping[str, Sequence[Path]]) -> C
 
 
 def recipe_entry(recipe: Recipe, shard: ShardFile) -> schema.Json:
-    """Return the manifest entry of a shard's maps, without their digest."""
+    """Return the manifest entry of a shard's maps, without the digest."""
     part = {"maps": shard.maps, "recipe": 0, "split": shard.split, "first": shard.first}
     return {
         "scenario": recipe.splits[shard.split].scenario,
@@ -144,9 +144,16 @@ def recipe_entry(recipe: Recipe, shard: ShardFile) -> schema.Json:
 def _fill(
     file: h5py.File, contents: Contents, sources: Mapping[str, Iterable[Source]]
 ) -> None:
-    """Fill an empty file with a dataset: the concatenated arrays of its sources."""
+    """Write a dataset to an empty file.
+
+    Args:
+        file: open file.
+        contents: contents of the dataset.
+        sources: arrays of consecutive maps, which are concatenated, by split.
+    """
     kinds = schema.stored_arrays(contents.fields, *contents.recipes[0].grid.shape)
-    # Arrays are referenced until all is written: HDF5 writes an array when it is freed.
+    # All arrays are referenced until the end, since HDF5 writes an array when its last
+    # reference is deleted.
     arrays: dict[str, dict[str, h5py.Dataset]] = {}
     for split, split_entry in contents.splits.items():
         arrays[split] = {}
@@ -154,7 +161,7 @@ def _fill(
         maps = split_entry["maps"]
         for name, (dtype, entry) in kinds.items():
             field = contents.fields.get(name)
-            # Fields of cells have one map per chunk.
+            # A chunk of a field with values per cell contains one map.
             chunk = max(1, min(maps, _VALUES_PER_CHUNK))
             if field and "H" in field.shape:
                 chunk = 1
@@ -190,7 +197,7 @@ def _fill(
 def _add_scales(group: h5py.Group, contents: Contents) -> None:
     """Name the dimensions of a split's arrays by HDF5 dimension scales.
 
-    The names are map_index, y_m, x_m, and axis_N for other dimensions of length N.
+    The names are map_index, y_m, x_m, and axis_N for any other dimension of length N.
     """
     recipe = contents.recipes[0]
     for name, array in list(group.items()):
@@ -216,15 +223,15 @@ def pack(
     maps: schema.Maps,
     fields: schema.Fields = schema.KNOWN,
 ) -> bytes:
-    """Return the bytes of a file with some maps of one split.
+    """Return the bytes of a file with maps of one split.
 
     Args:
         recipe: recipe of the maps, with the dataset's id.
         split: name of the split.
-        entry: manifest entry of the split without its digest.
-        maps: arrays by field, each of shape [B, *entry shape]: all of `schema.FIELDS`,
-            and others of the dataset.
-        fields: fields that maps may have; those in `maps` are stored, in this order.
+        entry: manifest entry of the split, without the digest.
+        maps: arrays by field, each of shape [B, *entry shape]: all fields of
+            `schema.FIELDS`, and further fields of the dataset.
+        fields: possible fields. Those in `maps` are stored, in the order of `fields`.
     """
     fields = {name: field for name, field in fields.items() if name in maps}
     contents = Contents(recipe.id, [recipe], {split: entry}, fields=fields)
@@ -237,7 +244,7 @@ def pack(
 
 
 def is_one_file(path: Path) -> bool:
-    """Return whether a dataset of this name is a file rather than a folder of shards."""
+    """Return whether a dataset at a path is one file instead of a folder of shards."""
     return path.suffix in (".h5", ".hdf5")
 
 
@@ -250,27 +257,30 @@ def check_output(path: Path, overwrite: bool, names: Collection[str] = ()) -> No
     """Check that a dataset may be written to a path.
 
     Args:
-        path: file or folder.
-        overwrite: whether a dataset, or any file of this name, may be replaced.
-        names: names of shards to be made in the folder; existing ones may be damaged.
+        path: path of the file or folder.
+        overwrite: whether an existing dataset, or any file at a path of a file, may be
+            replaced.
+        names: names of shards that will be written to the folder. Existing files with
+            these names may be damaged.
 
     Raises:
-        ConfigError: If it may not.
+        ConfigError: If `path` exists and may not be replaced.
     """
     check_replaceable(path, overwrite, partial(foreign_in, names=names))
 
 
 def foreign_in(path: Path, names: Collection[str] = ()) -> str:
-    """Return what a path contains other than a dataset; empty if nothing.
+    """Return why a path is not that of a dataset, as text; empty if it is.
 
-    A folder may contain only shards and their manifest.
+    A folder may contain only shards and their manifest. Files in `names` are regarded
+    as shards.
     """
     if is_one_file(path) or not path.is_dir():
         if is_one_file(path) == path.is_file():
             return ""
         return f"is a {'folder' if path.is_dir() else 'file'}"
     expected = set(names)
-    # A damaged manifest counts as a manifest if there are shards next to it.
+    # A manifest may be damaged if shards are next to it.
     with suppress(DatasetError):
         expected |= {file.name for file in TerrainDataset(path).files}
     files = sorted(file.name for file in path.iterdir())
@@ -280,12 +290,12 @@ def foreign_in(path: Path, names: Collection[str] = ()) -> str:
         expected.add(FOLDER_MANIFEST)
     for name in files:
         if name not in expected:
-            return f"holds {name}"
+            return f"contains {name}"
     return ""
 
 
 def _is_shard(file: Path) -> bool:
-    """Return whether a file is a shard of any dataset, or a partial one."""
+    """Return whether a file is a shard of any dataset, or an unfinished file."""
     if _PARTIAL.fullmatch(file.name):
         return True
     try:
@@ -298,14 +308,13 @@ def assemble(contents: Contents, folder: Path, out: Path) -> None:
     """Assemble a dataset from files that are datasets themselves.
 
     Args:
-        contents: contents of the dataset. If `out` is a folder, all its files lie in
-            `folder`.
-        folder: `out`, or a folder next to it that replaces it; unused if `out` is a
-            file.
-        out: file or folder.
+        contents: contents of the dataset. If `out` is a folder, the contents' files lie
+            in `folder`.
+        folder: `out`, or a folder that replaces `out`; unused if `out` is a file.
+        out: path of the file or folder to write.
 
     Raises:
-        ConfigError: If the folder to be replaced now contains other files.
+        ConfigError: If the folder to be replaced contains files of another program.
     """
     if is_one_file(out):
         _join(out, contents)
@@ -324,19 +333,19 @@ def assemble(contents: Contents, folder: Path, out: Path) -> None:
     manifest |= {"format_version": version, "shards": shards}
     write_text(folder / FOLDER_MANIFEST, seal(manifest))
     if folder != out:
-        check_output(out, True)  # another program may have written to it
+        check_output(out, True)  # another program may have added files meanwhile
         replace_folder(folder, out)
 
 
 def _opened(split: str, files: Iterable[Path]) -> Iterator[h5py.Group]:
-    """Yield the group of a split in each file, which is open until the next one."""
+    """Yield the group of a split in each file. A file is open until the next one."""
     for path in files:
         with open_file(path) as file:
             yield file[split]
 
 
 def _join(path: Path, contents: Contents) -> None:
-    """Write one file from many."""
+    """Write a dataset of one file from the files of its contents."""
     files = [file for paths in contents.files.values() for file in paths]
     n_maps = sum(entry["maps"] for entry in contents.splits.values())
     n_bytes = sum(file.stat().st_size for file in files)
@@ -344,7 +353,7 @@ def _join(path: Path, contents: Contents) -> None:
     sources = {split: _opened(split, paths) for split, paths in contents.files.items()}
     with replacing(path) as unfinished:
         with h5py.File(unfinished, "w", libver=_LIBRARY) as file:
-            # HDF5 crashes on a full disk, so space is allocated first.
+            # HDF5 crashes on a full disk, so space is allocated before writing.
             if hasattr(os, "posix_fallocate"):
                 with open(unfinished, "rb+") as raw:
                     os.posix_fallocate(raw.fileno(), 0, n_bytes)
@@ -357,17 +366,17 @@ def _join(path: Path, contents: Contents) -> None:
 
 @contextmanager
 def named_errors(path: Path) -> Iterator[None]:
-    """Convert write errors of a dataset to errors that name it.
+    """Convert errors of writing a dataset to errors that name its path.
 
     Raises:
-        DatasetError: If the system, or HDF5, could not write.
+        DatasetError: If the system or HDF5 could not write.
     """
     try:
         yield
     except (OSError, RuntimeError) as error:
         reason = getattr(error, "strerror", None) or " ".join(str(error).split())
         raise out_of_memory_error(error) or DatasetError(
-            f"Could not write {path}: {reason}. Correct this, then run the same "
+            f"Could not write {path}: {reason}. Remove the cause, then run the same "
             "command again."
         ) from error
 
@@ -376,9 +385,16 @@ def named_errors(path: Path) -> Iterator[None]:
 def exclusive_output(
     out: Path, overwrite: bool, foreign: Callable[[Path], str] = foreign_in
 ) -> Iterator[None]:
-    """Acquire an output path for one process, after a check; convert write errors.
+    """Reserve an output path for this process, after a check; convert write errors.
 
-    See `check_replaceable` and `named_errors`.
+    Args:
+        out: output path.
+        overwrite: whether to replace existing output.
+        foreign: returns why a path must not be replaced; empty if it may be.
+
+    Raises:
+        ConfigError: If `out` exists and may not be replaced; see `check_replaceable`.
+        DatasetError: If writing fails; see `named_errors`.
     """
     with named_errors(out), sole_writer(out, str(out)):
         restore(out)
@@ -389,12 +405,13 @@ def exclusive_output(
 def _put(source: ndarray | h5py.Dataset, target: h5py.Dataset, first: int) -> None:
     """Write maps to consecutive indices from `first`.
 
-    Stored maps with the same filters, one per chunk, are copied without decompression.
+    If source and target are files with the same filters and one map per chunk, chunks
+    are copied without decompression.
     """
     if isinstance(source, ndarray) or target.chunks[0] > 1:
         target[first : first + len(source)] = source[:]
         return
-    if _packing(source) != _packing(target):
+    if _storage_of(source) != _storage_of(target):
         target[first : first + len(source)] = source[:]
         return
     within = (0,) * (source.ndim - 1)
@@ -403,8 +420,11 @@ def _put(source: ndarray | h5py.Dataset, target: h5py.Dataset, first: int) -> No
         target.id.write_direct_chunk((first + index, *within), chunk, mask)
 
 
-def _packing(array: h5py.Dataset) -> tuple[object, ...]:
-    """Return properties that must be equal to copy chunks; deflate levels may differ."""
+def _storage_of(array: h5py.Dataset) -> tuple[object, ...]:
+    """Return properties of an array; chunks can be copied between arrays of equal ones.
+
+    Deflate levels are not among them, since they may differ.
+    """
     return (
         array.dtype.str,
         array.chunks,

@@ -15,18 +15,20 @@ from benchnav.datagen.files.reader import TerrainDataset
 class TerrainMaps(Dataset[dict[str, Tensor]]):
     """Maps of a split, each a dict of tensors by field.
 
-    Safe under DataLoader workers, forked or spawned: each process opens files itself,
-    at its first map of each file. Only the requested fields are read.
+    It may be used by forked or spawned DataLoader workers: each process opens a file
+    when it first reads a map from the file. Only the requested fields are read.
 
     Args:
-        path: dataset file or folder, or the id of a local dataset.
-        split: name of one of its splits.
-        fields: names among `TerrainDataset.field_names`.
-        in_memory: whether to read all maps now; faster if maps are read many times.
+        path: path of the dataset's file or folder, id of a local dataset, or address on
+            a hub.
+        split: name of one of the dataset's splits.
+        fields: names of fields, from `TerrainDataset.field_names`.
+        in_memory: whether to read all maps into memory now, which is faster if maps are
+            read many times.
 
     Raises:
-        DatasetError: If there is no such file, split or field, or, when a map is read,
-            its data are damaged.
+        DatasetError: If the dataset, split or field does not exist, or, when a map is
+            read, if its data are damaged.
     """
 
     def __init__(
@@ -36,13 +38,14 @@ class TerrainMaps(Dataset[dict[str, Tensor]]):
         fields: Sequence[str] = ("rgb", "class_id"),
         in_memory: bool = False,
     ) -> None:
-        """Check split and fields; read all maps if they are kept in memory."""
+        """Check split and fields; if `in_memory`, read all maps."""
         self.dataset = TerrainDataset(find_dataset(path).resolve(), keep_open=True)
         self.split = split
         self.fields = self.dataset.check_fields(tuple(fields))
         if not fields:
             raise DatasetError(
-                f"Expected `fields` among {list(self.dataset.field_names)}, got none."
+                "Expected at least one of `fields` "
+                f"{list(self.dataset.field_names)}, got an empty sequence."
             )
         self._maps = self.dataset.map_count(split)
         self._memory: dict[str, Tensor] | None = None
@@ -60,7 +63,7 @@ class TerrainMaps(Dataset[dict[str, Tensor]]):
             Tensors by field, each of the field's entry shape.
 
         Raises:
-            IndexError: If there is no such map.
+            IndexError: If no map has this index.
         """
         if not -len(self) <= index < len(self):
             raise IndexError(f"Expected a map index in 0–{len(self) - 1}, got {index}.")

@@ -1,7 +1,7 @@
 """Merging of datasets, and of the shards of one dataset.
 
-Splits of the same name are concatenated. Compressed data are copied as they are: files
-into a folder, or their chunks into one file.
+Splits of the same name are concatenated. Data are copied without decompression: files
+into a folder, or their compressed chunks into one file.
 """
 
 import json
@@ -31,7 +31,7 @@ from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.load import recipe_from_dict
 from benchnav.datagen.recipe.recipe import Recipe, check_name
 
-# Settings that determine the meaning of maps. They must be identical in all files.
+# Settings that determine the meaning of maps and must be identical in all datasets.
 _SHARED = (
     "height",
     "width",
@@ -50,32 +50,33 @@ _SHARED = (
 def merge(
     paths: Sequence[Path], out: Path, dataset_id: str = "", overwrite: bool = False
 ) -> Iterator[tuple[int, int]]:
-    """Merge datasets, or the shards of one; yield (maps done, total maps).
+    """Merge datasets, or the shards of one dataset; yield (maps done, total maps).
 
     Iterate to the end.
 
     Args:
-        paths: two or more datasets (the first determines the order of splits), or
-            folders of shards.
-        out: file to write, of suffix `.h5` or `.hdf5`; else a folder.
-        dataset_id: id of the new dataset; if empty, the name of `out`. Shards keep the
-            id of their recipe.
+        paths: paths of two or more datasets, the first of which determines the order of
+            splits; or of folders with the shards of one dataset.
+        out: path of the file to write, if its suffix is `.h5` or `.hdf5`; else path of
+            the folder to write.
+        dataset_id: id of the new dataset; if empty, the name of `out`. Not used for
+            shards, which keep the id of their recipe.
         overwrite: whether to replace an existing dataset.
 
     Raises:
-        DatasetError: If the datasets differ (with all reasons), one is damaged, or
-            shards are missing.
+        DatasetError: If the datasets cannot be merged (with all reasons), one is
+            damaged, or shards are missing.
         ConfigError: If `out` exists and may not be replaced.
     """
     out = resolve_link(out)
     finished = [path for path in paths if is_dataset(path) or not path.is_dir()]
     if finished and len(finished) < len(paths):
         raise DatasetError(
-            "Expected datasets, or shards of one dataset, got both. Merge them "
-            "separately."
+            "Expected either finished datasets or folders with shards of one dataset, "
+            "got both. Merge the shards first."
         )
     name = dataset_id or name_of(out)
-    contents = _of_datasets(finished, name) if finished else _of_shards(paths)
+    contents = _merged_datasets(finished, name) if finished else _merged_shards(paths)
     total = sum(entry["maps"] for entry in contents.splits.values())
     done = 0
     sources = dict.fromkeys(chain(*contents.files.values()))
@@ -84,7 +85,7 @@ def merge(
             if faults := find_faults(path):
                 raise DatasetError(
                     f"{path} is damaged: {faults[0]}. Run `benchnav-datagen validate` "
-                    "on it, which explains how to make it again."
+                    "on it, which explains how to create it again."
                 )
             done += sum(entry["maps"] for entry in TerrainDataset(path).splits.values())
             yield done, total
@@ -106,9 +107,14 @@ def merge(
             assemble(contents._replace(files=files), folder, out)
 
 
-def _of_datasets(paths: Sequence[Path], dataset_id: str) -> Contents:
+def _merged_datasets(paths: Sequence[Path], dataset_id: str) -> Contents:
+    """Return the contents of the merged dataset.
+
+    Raises:
+        DatasetError: If the datasets cannot be merged, with all reasons.
+    """
     datasets = [TerrainDataset(path) for path in paths]
-    reasons = list(why_unlike(datasets))
+    reasons = list(merge_obstacles(datasets))
     if len(datasets) < 2:
         reasons.append("fewer than two files")
     try:
@@ -142,25 +148,25 @@ def _of_datasets(paths: Sequence[Path], dataset_id: str) -> Contents:
     return Contents(dataset_id, recipes, splits, files, datasets[0].fields)
 
 
-def _of_shards(folders: Sequence[Path]) -> Contents:
-    """Return the dataset of the shards in some folders.
+def _merged_shards(folders: Sequence[Path]) -> Contents:
+    """Return the contents of the dataset whose shards are in some folders.
 
     Raises:
-        DatasetError: If there are no shards, they are of several recipes or versions,
-            or some are missing.
+        DatasetError: If the folders contain no shards, or shards of several recipes or
+            versions, or some shards are missing.
     """
     paths = [path for folder in folders for path in sorted(folder.glob("*.h5"))]
     shards = [TerrainDataset(path) for path in paths]
     if not shards:
         raise DatasetError(
-            "Expected datasets, or folders with shards of one, got "
-            f"{', '.join(map(str, folders))} without any."
+            "Expected datasets, or folders with shards of one dataset, got "
+            f"{', '.join(map(str, folders))} without .h5 files. Pass other folders."
         )
     for shard, name in product(shards, ("recipes", "generator")):
         if shard.manifest[name] != shards[0].manifest[name]:
             raise DatasetError(
                 f"Expected shards of one dataset, got {shards[0].path} and "
-                f"{shard.path} with different {name}."
+                f"{shard.path}, whose {name} differ. Pass only shards of one dataset."
             )
     recipe = shards[0].recipe
     files: dict[str, list[Path]] = {}
@@ -182,18 +188,18 @@ def _of_shards(folders: Sequence[Path]) -> Contents:
                 expected_first = first + shard.splits[name]["maps"]
     if missing:
         raise DatasetError(
-            f"Expected all shards of {recipe.id}, got none with {'; '.join(missing)}. "
-            "Make the missing shards first."
+            f"Expected all shards of {recipe.id}, got no shards with "
+            f"{'; '.join(missing)}. Create the missing shards first."
         )
     return contents_of_recipe(recipe, files)
 
 
-def why_unlike(datasets: Sequence[TerrainDataset]) -> Iterator[str]:
+def merge_obstacles(datasets: Sequence[TerrainDataset]) -> Iterator[str]:
     """Yield the reasons why datasets cannot be merged, one text per pair."""
-    prints = [(dataset, _fingerprints(dataset)) for dataset in datasets]
-    for (first, ours), (second, theirs) in combinations(prints, 2):
+    with_digests = [(dataset, _elevation_digests(dataset)) for dataset in datasets]
+    for (first, digests_1), (second, digests_2) in combinations(with_digests, 2):
         reasons = list(_differences(first, second))
-        common = np.intersect1d(ours, theirs)
+        common = np.intersect1d(digests_1, digests_2)
         if len(common):
             reasons.append(f"{len(common)} map(s) in common")
         if reasons:
@@ -201,12 +207,13 @@ def why_unlike(datasets: Sequence[TerrainDataset]) -> Iterator[str]:
 
 
 def _differences(first: TerrainDataset, second: TerrainDataset) -> Iterator[str]:
+    """Yield the differences between two datasets that prevent a merge, as texts."""
     fields = first.fields
     if extra := sorted(set(fields) ^ set(second.fields)):
         hint = ""
         if extra == ["group"]:
-            hint = ": import both with overlap or both without, by --stride"
-        yield f"different fields ({', '.join(extra)} only in one{hint})"
+            hint = ": import both with overlapping maps or both without, by --stride"
+        yield f"different fields ({', '.join(extra)} only in one dataset{hint})"
     elif list(fields.items()) != list(second.fields.items()):
         changed = [name for name in fields if fields[name] != second.fields[name]]
         if changed:
@@ -227,7 +234,7 @@ def _differences(first: TerrainDataset, second: TerrainDataset) -> Iterator[str]
 
 
 def _kinds(dataset: TerrainDataset, split: str) -> set[str]:
-    """Return scenario and `solvable` of the parts of a split, as JSON texts."""
+    """Return scenario and `solvable` of each part of a split, as JSON texts."""
     kinds = set()
     for part in dataset.splits[split]["parts"]:
         kind: Any = "imported"
@@ -240,7 +247,7 @@ def _kinds(dataset: TerrainDataset, split: str) -> set[str]:
     return kinds
 
 
-def _fingerprints(dataset: TerrainDataset) -> np.ndarray:
+def _elevation_digests(dataset: TerrainDataset) -> np.ndarray:
     """Return the digests of all elevation maps, shape [N]."""
     column = dataset.field_names.index("elevation_m")
     digests = np.concatenate([dataset.entry_digests(split) for split in dataset.splits])

@@ -1,7 +1,7 @@
 """Reader of datasets of formats 1.0 to 1.4: an HDF5 file, or a folder of such files.
 
-All maps are read by `TerrainDataset.read`. A `TerrainDataset` may be sent to other
-processes. PyTorch is imported only for Terrain. Letters in shapes: B maps.
+A `TerrainDataset` may be sent to other processes. PyTorch is imported only by
+`TerrainDataset.terrain`. Letters in shapes: B maps.
 """
 
 import hashlib
@@ -35,10 +35,10 @@ if TYPE_CHECKING:
     from benchnav.core.terrain import Terrain
 
 CHUNK_CELLS = 2**17
-_MAX_OPEN = 128  # files that a process keeps open; far fewer than systems allow
+_MAX_OPEN = 128  # maximum number of open files; operating systems allow more
 _SHOWN_SPLITS = 8
 
-# A file, and its arrays by split and name.
+# Open file, and its arrays by split and name.
 Opened = tuple[h5py.File, dict[tuple[str, str], h5py.Dataset]]
 
 
@@ -46,9 +46,9 @@ class Piece(NamedTuple):
     """Maps of a split in one file.
 
     Args:
-        path: the file.
-        first: index of its first map in the split.
-        maps: number of its maps.
+        path: path of the file.
+        first: index in the split of the file's first map.
+        maps: number of maps in the file.
     """
 
     path: Path
@@ -66,14 +66,14 @@ class TerrainDataset:
     """Dataset in a file or a folder.
 
     Args:
-        path: the file, or the folder.
+        path: path of the file or folder.
         keep_open: whether to keep files open between calls, for many reads of few maps.
-            Each process opens them itself, forked or spawned. Otherwise, files are open
-            only during a call, and may change between calls.
+            Each process, forked or spawned, opens files itself. If False, files are
+            open only during a call, and may change between calls.
 
     Raises:
-        DatasetError: If there is no such file, or it is damaged, or of another or a
-            newer format.
+        DatasetError: If the dataset does not exist, is damaged, or has another format
+            or a newer version.
     """
 
     def __init__(self, path: str | Path, keep_open: bool = False) -> None:
@@ -81,7 +81,7 @@ class TerrainDataset:
         self.path = Path(path)
         self.keep_open = keep_open
         self.manifest: schema.Json = read_manifest(self.path)
-        # By process, since processes must not share open files.
+        # Keys contain the process id, since processes must not share open files.
         self._opened: dict[tuple[int, Path], Opened] = {}
 
     def __getstate__(self) -> schema.Json:
@@ -89,7 +89,7 @@ class TerrainDataset:
         return self.__dict__ | {"_opened": {}}
 
     def __repr__(self) -> str:
-        """Return id, path, cells and the maps of each split, in up to six lines."""
+        """Return id, path, cells, fields and the maps of each split, in three lines."""
         height, width = self.grid.shape
         splits = [f"{name} {entry['maps']}" for name, entry in self.splits.items()]
         if len(splits) > _SHOWN_SPLITS:
@@ -113,7 +113,7 @@ class TerrainDataset:
 
     @cached_property
     def recipe(self) -> Recipe:
-        """Recipe of the dataset; the first one if it has several."""
+        """Recipe of the dataset; the first recipe if it has several."""
         return _read_recipe(json.dumps(self.manifest["recipes"][0]), f"in {self.path}")
 
     @property
@@ -123,7 +123,7 @@ class TerrainDataset:
 
     @cached_property
     def fields(self) -> dict[str, schema.Field]:
-        """Fields of the maps by name: `schema.FIELDS`, and others of this dataset."""
+        """Fields of the maps by name: `schema.FIELDS`, and further ones."""
         recorded = {spec.name: spec.stored_field for spec in self.recipe.layers}
         layers = shipped_fields() | recorded
         return schema.read_field_table(self.manifest["fields"], layers)
@@ -147,15 +147,15 @@ class TerrainDataset:
         """Return whether the true distribution of λ of a split is known.
 
         Returns:
-            "generated" if recipes generated all its maps, λ by their class tables;
-            "unknown" if some were imported: the class table does not describe real
-            terrain, even if λ was measured there.
+            "generated" if recipes generated all maps, with λ from their class tables;
+            "unknown" if some maps were imported, since a class table does not describe
+            real terrain, even where λ was measured.
 
         Raises:
-            DatasetError: If there is no such split.
+            DatasetError: If the dataset has no such split.
         """
         self.map_count(split)
-        # Formats before 1.3 do not record this for imported maps.
+        # Formats before 1.3 do not record the kind of truth of imported maps.
         is_known = all(
             "recipe" in part or part["source"].get("truth") == "generated"
             for part in self.splits[split]["parts"]
@@ -171,22 +171,22 @@ class TerrainDataset:
     def has_photo(self, split: str) -> bool:
         """Return whether some maps of a split have the colours of a photo.
 
-        A photo is lit from one direction.
+        Maps that are cut from one photo have the same direction of light.
 
         Raises:
-            DatasetError: If there is no such split.
+            DatasetError: If the split does not exist.
         """
         self.map_count(split)
         sources = [part.get("source", {}) for part in self.splits[split]["parts"]]
         return any(source.get("photo") for source in sources)
 
     def about_digest(self, split: str) -> str:
-        """Return the SHA-256 of the properties of a split other than its maps.
+        """Return the SHA-256 digest of the properties of a split other than its maps.
 
-        They are class table, recipe layers, λ_stuck, resolution and kind of truth.
+        These are class table, recipe layers, λ_stuck, resolution and kind of truth.
 
         Raises:
-            DatasetError: If there is no such split.
+            DatasetError: If the split does not exist.
         """
         recipe = self.recipe
         properties: schema.Json = {
@@ -202,12 +202,12 @@ class TerrainDataset:
         return hashlib.sha256(text.encode()).hexdigest()
 
     def split_digest(self, split: str) -> str:
-        """Return the SHA-256 of a split that models and results record.
+        """Return the SHA-256 digest of a split, which models and results record.
 
-        It covers the maps' digest and `about_digest`.
+        It is computed from the digest of the maps and `about_digest`.
 
         Raises:
-            DatasetError: If there is no such split.
+            DatasetError: If the split does not exist.
         """
         text = f"{self.splits[split]['digest']} {self.about_digest(split)}"
         return hashlib.sha256(text.encode()).hexdigest()
@@ -223,18 +223,18 @@ class TerrainDataset:
         indices: Sequence[int] | None = None,
         fields: Collection[str] | None = None,
     ) -> Maps:
-        """Return stored arrays.
+        """Return stored arrays of maps.
 
         Args:
             split: name of a split.
             indices: indices of the maps, in any order; None for all.
-            fields: names among `field_names`; None for all.
+            fields: names of fields, from `field_names`; None for all.
 
         Returns:
             Arrays by field, each of shape [B, *entry shape].
 
         Raises:
-            DatasetError: If there is no such split or map, or a stored chunk is
+            DatasetError: If a split, map or field does not exist, or a stored chunk is
                 damaged.
         """
         size = self.map_count(split)
@@ -247,7 +247,7 @@ class TerrainDataset:
             )
         pieces = self.pieces[split]
         firsts = self._firsts[split]
-        # Each run of consecutive maps is read at once, in the order of the files.
+        # Each run of consecutive maps in a file is read at once, in ascending order.
         order = sorted(range(len(chosen)), key=chosen.__getitem__)
 
         def run_of(item: tuple[int, int]) -> tuple[int, int]:
@@ -272,10 +272,10 @@ class TerrainDataset:
     def entry_digests(
         self, split: str, indices: Sequence[int] | None = None
     ) -> np.ndarray:
-        """Return the stored SHA-256 of all entries, as `schema.entry_digests` does.
+        """Return the stored SHA-256 digests of maps, as in `schema.entry_digests`.
 
         Raises:
-            DatasetError: If there is no such split, or a stored chunk is damaged.
+            DatasetError: If the split does not exist, or a stored chunk is damaged.
         """
         return self.read(split, indices, (schema.ENTRY_DIGESTS,))[schema.ENTRY_DIGESTS]
 
@@ -285,12 +285,12 @@ class TerrainDataset:
         fields: Collection[str] | None = None,
         cells: int = CHUNK_CELLS,
     ) -> Iterator[tuple[range, Maps]]:
-        """Read a split in chunks, from its first map to its last.
+        """Read a split in chunks, from the first map to the last.
 
         Args:
             split: name of a split.
-            fields: names among `field_names`; None for all.
-            cells: maximum number of cells of a chunk; a chunk has at least one map.
+            fields: names of fields, from `field_names`; None for all.
+            cells: maximum number of cells of a chunk with several maps.
 
         Yields:
             Indices of the maps, and their arrays as from `read`.
@@ -302,15 +302,15 @@ class TerrainDataset:
             yield indices, self.read(split, indices, fields)
 
     def terrain_chunks(self, split: str) -> "Iterator[Terrain]":
-        """Read a split as Terrain in chunks, as `chunks` does."""
+        """Read a split as Terrain, in the chunks of `chunks`."""
         for indices, _ in self.chunks(split, fields=()):
             yield self.terrain(split, indices)
 
     def check_fields(self, names: Collection[str]) -> Collection[str]:
-        """Return names of fields, after a check.
+        """Return the names after a check that maps have such fields.
 
         Raises:
-            DatasetError: If maps have no such field.
+            DatasetError: If a field does not exist.
         """
         known_names = {*self.fields, schema.ENTRY_DIGESTS}
         unknown = [name for name in names if name not in known_names]
@@ -353,7 +353,7 @@ class TerrainDataset:
     def _read_run(
         self, split: str, piece: Piece, run: range, names: Collection[str]
     ) -> Maps:
-        """Return consecutive maps of a file, as `read` does."""
+        """Return consecutive maps of a file, in the form of `read`."""
         file, arrays = self._open(piece.path)
         maps = Maps()
         max_class = len(self.recipe.classes) - 1
@@ -366,11 +366,11 @@ class TerrainDataset:
                     )
                 values = _values(arrays[split, name], selection)
                 maps[name] = values
-                # The maximum is checked first, which is faster than comparing all.
+                # The maximum is checked first, since it is faster to compute.
                 if name == "class_id" and values.max(initial=0) > max_class:
                     is_beyond = (values > max_class) & (values != schema.UNLABELLED)
                     if is_beyond.any():
-                        raise ValueError(f"it has classes beyond {max_class}")
+                        raise ValueError(f"it has class indices above {max_class}")
         except READ_ERRORS as error:
             raise damage_error(piece.path, split, name, error) from error
         finally:
@@ -379,14 +379,14 @@ class TerrainDataset:
         return maps
 
     def _open(self, path: Path) -> Opened:
-        """Return an open file, and its opened arrays by split and name."""
+        """Return an open file, and its arrays so far by split and name."""
         if not self.keep_open:
             return open_file(path), {}
         key = os.getpid(), path
         if key not in self._opened:
             if len(self._opened) == _MAX_OPEN:
-                # Deleting the last reference closes the file. h5py's `close` is slow:
-                # it searches all open objects of all files.
+                # Deleting the last reference closes the file. h5py's `close` is slow,
+                # since it searches all open objects of all files.
                 del self._opened[next(iter(self._opened))]
             self._opened[key] = open_file(path), {}
         return self._opened[key]
@@ -394,16 +394,16 @@ class TerrainDataset:
     def stored_array(
         self, file: h5py.File, split: str, name: str, maps: int
     ) -> h5py.Dataset:
-        """Return an array of a file, after a check.
+        """Return an array of a file, after a check of its dtype and shape.
 
         Args:
-            file: the open file.
+            file: open file.
             split: name of a split.
             name: name of a field.
             maps: expected number of maps.
 
         Raises:
-            ValueError: If dtype or shape differ from the manifest.
+            ValueError: If dtype or shape differs from the manifest.
         """
         array = file[f"{split}/{name}"]
         dtype, entry = self._stored[name]
@@ -416,7 +416,7 @@ class TerrainDataset:
         return array
 
     def terrain(self, split: str, indices: Sequence[int] | None = None) -> "Terrain":
-        """Return maps as Terrain, float32 on the CPU, with the true distribution of λ.
+        """Return maps as Terrain, in float32 on the CPU, with the true distribution.
 
         Args:
             split: name of a split.
@@ -431,7 +431,7 @@ class TerrainDataset:
         """Return the number of maps of a split.
 
         Raises:
-            DatasetError: If there is no such split.
+            DatasetError: If the split does not exist.
         """
         if split not in self.splits:
             raise DatasetError(
@@ -442,7 +442,7 @@ class TerrainDataset:
 
 
 def _values(array: h5py.Dataset, selection: slice) -> np.ndarray:
-    """Return some maps of an array, read one by one if memory is short."""
+    """Return maps of an array; if memory does not suffice, they are read one by one."""
     try:
         return array[selection]
     except OSError:

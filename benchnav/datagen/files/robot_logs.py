@@ -1,7 +1,7 @@
-"""Tables that robots logged, a row for each time: CSV, TSV (also .gz), or Parquet.
+"""Reader of tables that robots logged: CSV, TSV (also .gz), or Parquet.
 
-Text is read as text. A class may therefore be named NA, and an invalid number is
-reported with its row.
+A table has a row for each time. Values of text files are read as text. A class may
+therefore be named NA, and an error on an invalid number names the row.
 """
 
 import warnings
@@ -18,7 +18,7 @@ from benchnav.core.settings import hint
 from benchnav.core.touched import note_file
 
 ENDINGS = (".csv", ".tsv", ".csv.gz", ".tsv.gz", ".parquet")
-_SEPARATE = (
+_SEPARATOR_REMEDY = (
     "Separate columns by commas, in a .tsv by tabs, and write decimals with a point."
 )
 _MISSING = ["", "NA", "N/A", "nan", "NaN", "null", "None"]
@@ -33,22 +33,23 @@ def require_columns(
         rows: rows of the log.
         columns: required columns.
         path: path of the log.
-        remedy: remedy if no column has a similar name, as a sentence.
+        remedy: remedy if no column has a similar name, one sentence.
 
     Raises:
-        DatasetError: If one is missing.
+        DatasetError: If a column is missing.
     """
     names = [str(name) for name in rows.columns]
     if missing := [name for name in columns if name not in names]:
         advice = hint(missing[0], [name for name in names if name not in columns])
         advice = advice or (remedy and f" {remedy}")
         if len(names) == 1 and any(separator in names[0] for separator in ",;\t| "):
-            advice = f" {_SEPARATE}"
+            advice = f" {_SEPARATOR_REMEDY}"
         elif any(_is_number(name) for name in names):
             advice = " Begin the file with a line of column names."
         raise DatasetError(
             f"Expected columns {', '.join(columns)} in {path}, got no "
-            f"{' and no '.join(missing)}. It has {', '.join(names) or 'no columns'}."
+            f"{' and no '.join(missing)}. The file has "
+            f"{', '.join(names) or 'no columns'}."
             f"{advice}"
         )
 
@@ -61,10 +62,10 @@ def _is_number(text: str) -> bool:
 
 
 def read_log(path: Path) -> pd.DataFrame:
-    """Return the rows of a log, a file that ends in one of `ENDINGS`.
+    """Return the rows of a log, a file whose name ends in one of `ENDINGS`.
 
     Raises:
-        DatasetError: If there is no such file, or it cannot be read.
+        DatasetError: If the file does not exist or cannot be read.
     """
     try:
         if path.suffix == ".parquet":
@@ -91,23 +92,23 @@ def read_log(path: Path) -> pd.DataFrame:
         lines = [*str(error).strip().splitlines(), type(error).__name__]
         remedy = ""
         if isinstance(error, pd.errors.ParserWarning | pd.errors.ParserError):
-            remedy = f". {_SEPARATE} Remove lines above the column names."
+            remedy = f". {_SEPARATOR_REMEDY} Remove lines above the column names."
         elif isinstance(error, UnicodeDecodeError):
             remedy = ". Save it as UTF-8."
         elif isinstance(error, pd.errors.EmptyDataError):
             remedy = ". Write a line of column names and a row for each time."
         kind = path.suffix.removeprefix(".").upper()
         raise DatasetError(
-            f"Expected a {kind} table in {path}, got one that cannot be read: "
+            f"Expected a {kind} table in {path}, got a file that cannot be read: "
             f"{lines[0].removesuffix('.')}{remedy}"
         ) from error
     for name in rows.columns:
-        # pandas numbers the second of two columns of one name.
+        # pandas adds a number to the name of a repeated column, such as `x.1`.
         first, dot, number = str(name).rpartition(".")
         if dot and number.isdigit() and first in rows.columns and not _is_number(first):
             raise DatasetError(
                 f"Expected one column `{first}` in {path}, got several. Rename or "
-                "remove the others."
+                "remove the other columns."
             )
     return rows
 
@@ -126,12 +127,12 @@ def read_numbers(
         rows: rows of a log.
         name: name of the column.
         path: path of the log.
-        limits: minimum and maximum.
-        remedy: remedy if all numbers are beyond the limits, as a sentence.
-        number: remedy if no value is a number, as a sentence.
+        limits: minimum and maximum, inclusive.
+        remedy: remedy if all numbers are outside the limits, one sentence.
+        number: remedy if no value is a number, one sentence.
 
     Raises:
-        DatasetError: If a value is not a finite number, or is beyond the limits.
+        DatasetError: If a value is not a finite number, or is outside the limits.
     """
     column, (minimum, maximum) = rows[name], limits
     text = column if is_numeric_dtype(column) else column.astype("string").str.strip()
@@ -158,8 +159,7 @@ def read_numbers(
 
 
 def read_names(rows: pd.DataFrame, name: str, path: Path) -> np.ndarray:
-    """Return the names of a column, such as those of classes or drives, as text, shape
-    [N].
+    """Return the names in a column, such as those of classes or drives, shape [N].
 
     Raises:
         DatasetError: If a row has no name.
@@ -168,7 +168,8 @@ def read_names(rows: pd.DataFrame, name: str, path: Path) -> np.ndarray:
     absent = text.index[text == ""]
     if len(absent):
         raise DatasetError(
-            f"Expected a `{name}` in every row of {path}, got an empty one in row "
-            f"{absent[0] + 1} below the header. Fill it in, or leave the row out."
+            f"Expected a value of `{name}` in each row of {path}, got an empty value "
+            f"in row {absent[0] + 1} below the header. Fill it in, or leave the row "
+            "out."
         )
     return text.to_numpy(str)

@@ -1,4 +1,4 @@
-"""Stored maps as Terrain, with the true distribution of λ.
+"""Conversion of stored maps to Terrain, with the true distribution of λ.
 
 Letters in shapes: B maps.
 """
@@ -20,18 +20,19 @@ def terrain_of(maps: Maps, recipe: Recipe) -> Terrain:
     """Return stored arrays as Terrain, float32 on the CPU.
 
     Args:
-        maps: the fields of `schema.MAP_FIELDS`, each of shape [B, *entry shape]. Arrays
-            that are not fields of the schema are layers.
+        maps: arrays by field: those of `schema.MAP_FIELDS` and, optionally, of
+            `schema.TRUTH`, each of shape [B, *entry shape]. Arrays that are not fields
+            of the schema are layers.
         recipe: recipe of the maps.
     """
     fields = {name: torch.from_numpy(maps[name]) for name in MAP_FIELDS}
     fields["class_id"] = fields["class_id"].long()
     layer_names = [name for name in maps if name not in (*KNOWN, *TRUTH)]
     layers = {name: torch.from_numpy(maps[name]) for name in layer_names}
-    have_same_colours = len(recipe.units) < len(recipe.classes)
-    are_hidden = have_same_colours or any(spec.hides for spec in recipe.layers)
+    has_look_alikes = len(recipe.units) < len(recipe.classes)
+    is_hidden = has_look_alikes or any(spec.hides for spec in recipe.layers)
     look_alikes = None
-    if recipe.synthesis > 1 and are_hidden:
+    if recipe.synthesis > 1 and is_hidden:
         look_alikes = partial(_look_alikes, recipe)
     parameters = latent.stored_truth(maps, recipe.classes)
     weights = parameters[0]
@@ -75,7 +76,7 @@ def _to_float64(tensor: torch.Tensor) -> np.ndarray:
 def _mixture(
     parameters: latent.Parameters, group: tuple[int, ...]
 ) -> TraversabilityMixture:
-    """Return the mixture in float32."""
+    """Return a mixture in float32; `group` is the class index of each component."""
     tensors = [torch.from_numpy(values.astype(np.float32)) for values in parameters]
     weights, means, stds = tensors
     return TraversabilityMixture(weights, means, stds, group)

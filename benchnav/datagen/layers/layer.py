@@ -1,9 +1,10 @@
 """Base class of layers: stored map, drawing, appearance, and effect on λ.
 
 A layer is a frozen dataclass whose fields are its settings. Its class attributes
-describe the stored map, which is float32 without NaN. Only `draw` is required: by
-default, a layer is invisible and does not change λ. All methods are pure functions of
-their arguments, for any batch of maps. Letters in shapes: B maps, H×W cells, C classes.
+describe the stored map, which is float32 without NaN. A subclass must only override
+`draw`: by default, a layer is invisible and does not change λ. The result of a method
+must depend only on settings and arguments, and that of a map not on the other maps of a
+batch. Letters in shapes: B maps, H×W cells, C classes.
 """
 
 from collections.abc import Mapping
@@ -27,11 +28,11 @@ class Streams:
 
     The numbers of a map are the same in any batch, order or process. Two draws of the
     same kind and name return the same numbers, so a layer that draws several times must
-    name each draw.
+    give each draw another name.
 
     Args:
         seed: root seed of the recipe.
-        names: split, layer and number of previously rejected draws.
+        names: names of the streams: split, layer, and number of rejected draws.
         indices: indices of the maps in the split, shape [B].
         grid: size and resolution of the maps.
     """
@@ -66,15 +67,15 @@ class Streams:
 
 @dataclass(frozen=True)
 class DrawnMaps:
-    """Terrain of maps below their layers.
+    """Terrain of maps without layers.
 
     Args:
-        class_id: index into the class table; 255 is unlabelled, as in imported maps;
+        class_id: index into the class table, 255 for unlabelled cells of imported maps,
             shape [B, H, W].
         elevation_m: elevation in metres, shape [B, H, W].
         slope_deg: slope in degrees, shape [B, H, W].
         grid: size and resolution of the maps.
-        classes: the class table.
+        classes: class table.
     """
 
     class_id: ndarray
@@ -99,14 +100,14 @@ class Layer:
     """Map of a property of the terrain, drawn by a recipe and available to models.
 
     Attributes:
-        name: name of the stored field and of the input of models: letters, digits and
-            `_`, not beginning with a digit. A name that ends in `_azimuth_deg` is a
+        name: name of the stored field and of the model input: letters, digits and `_`,
+            not beginning with a digit. A name that ends in `_azimuth_deg` is that of a
             direction.
-        unit: SI unit, or "1".
+        unit: SI unit, "deg", or "1" for no unit.
         minimum: smallest valid value.
         maximum: largest valid value.
-        meaning: one line for readers of the dataset.
-        stream: names of its random streams; by default, its name.
+        meaning: description for readers of the dataset, in one line.
+        stream: names of the layer's random streams; if empty, the layer's name.
     """
 
     name: ClassVar[str] = ""
@@ -123,23 +124,23 @@ class Layer:
 
         Args:
             grid: size and resolution of the maps.
-            classes: the class table.
-            colours: for each scenario, the tinted colours of the classes in full light,
-                0–255, shape [C, 3].
+            classes: class table.
+            colours: tinted colours of the classes in full light by scenario, 0–255,
+                each of shape [C, 3].
 
         Raises:
-            ConfigError: If they do not fit.
+            ConfigError: If a setting does not fit.
         """
 
     def draw(self, streams: Streams, maps: DrawnMaps) -> ndarray:
-        """Return drawn values of B maps, in `unit`, shape [B, H, W].
+        """Draw the values of the layer.
 
         Args:
-            streams: random numbers of the maps.
-            maps: the terrain below.
+            streams: random streams of the maps.
+            maps: terrain below the layer.
 
         Returns:
-            Values, which are stored in single precision.
+            Values in `unit`, shape [B, H, W]. They are stored in single precision.
         """
         raise NotImplementedError
 
@@ -149,8 +150,8 @@ class Layer:
         Args:
             rgb: colours without this layer, after tints and earlier layers, 0–255,
                 float64, shape [B, 3, H, W].
-            values: values as stored, float64, shape [B, H, W].
-            maps: the terrain below.
+            values: stored values of the layer, float64, shape [B, H, W].
+            maps: terrain below the layer.
         """
         return rgb
 
@@ -159,15 +160,15 @@ class Layer:
     ) -> tuple[ndarray, ndarray]:
         """Return the distribution of λ with the layer.
 
-        It is called once for the latent function of the class, and once for its soft
-        spots.
+        The method is called for each component of λ: for the latent functions of the
+        classes, and, if a class has soft spots, for the soft spots.
 
         Args:
             mean: mean of the normal distribution of λ before clipping, without the
                 layer, in [0, 1], shape [B, H, W].
             std: standard deviation of that distribution, in (0, 1], shape [B, H, W].
-            values: values as stored, float64, shape [B, H, W].
-            maps: the terrain below.
+            values: stored values of the layer, float64, shape [B, H, W].
+            maps: terrain below the layer.
 
         Returns:
             Mean in [0, 1] and standard deviation in (0, 1], each of shape [B, H, W].
@@ -179,14 +180,14 @@ class Layer:
     ) -> ndarray:
         """Return class probabilities given an image with the layer, for model `ideal`.
 
-        A layer that hides the colour of classes overrides this; weights need not sum to
-        1.
+        A layer that hides the colour of classes must override this method. The weights
+        need not sum to 1.
 
         Args:
             weights: class probabilities given the colours without the layer, shape [B,
                 C, H, W].
-            values: values as stored, float64, shape [B, H, W].
-            maps: the terrain below.
+            values: stored values of the layer, float64, shape [B, H, W].
+            maps: terrain below the layer.
         """
         return weights
 
@@ -198,11 +199,11 @@ class Layer:
         return f"layer {self.name} ({', '.join(settings)})"
 
     def describe_class(self, name: str) -> str:
-        """Return a description of the layer on a class; by default, it is empty."""
+        """Return a description of the layer on a class; by default, an empty text."""
         return ""
 
     def class_columns(self, name: str) -> dict[str, float | str]:
-        """Return the layer's columns of an exported class table, for one class.
+        """Return a class's values in the layer's columns of an exported class table.
 
         All classes must have the same columns.
         """
@@ -212,7 +213,7 @@ class Layer:
         """Return the layer for maps of another size.
 
         Args:
-            factor: factor of all lengths of the map.
+            factor: ratio of new to old lengths of the map.
             resolution_m: new cell width in metres.
         """
         return self

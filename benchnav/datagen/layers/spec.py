@@ -1,8 +1,8 @@
 """Record of a layer in a recipe: part, options, stored field, digest of its code.
 
-The layer can be rebuilt from its record. A dataset with a custom layer can be read
-without the layer's code. The code is needed to generate maps, and to predict λ from
-colours if the layer changes λ.
+A layer can be rebuilt from its record. Its code is needed to generate maps, and to
+predict λ from colours if the layer changes λ or hides colours. A dataset with a custom
+layer can be read without the layer's code.
 """
 
 import sys
@@ -30,21 +30,21 @@ class LayerSpec:
     """Layer of a recipe, as its dataset records it.
 
     Args:
-        part: shipped name, entry point, `package.module:Name` or
+        part: name of a shipped layer or of an entry point, `package.module:Name` or
             `path/to/file.py:Name`.
-        options: all settings of the layer, as plain data.
+        options: all settings of the layer by name, as plain data.
         name: name of the stored field.
         unit: unit of the stored field.
-        minimum: smallest valid value; None without a lower limit.
-        maximum: largest valid value; None without an upper limit.
-        meaning: one line for readers of the dataset.
+        minimum: smallest valid value; None for no lower limit.
+        maximum: largest valid value; None for no upper limit.
+        meaning: description for readers of the dataset, in one line.
         words: description of the layer and its settings, for `show`.
         affects: whether the layer changes the distribution of λ.
         hides: whether the layer changes the classes that an image shows.
         source: origin of the layer's code; empty if it is shipped.
-        digest: SHA-256 of the layer's code and the code that it imports; empty if it
-            is shipped.
-        files: digests of the files that options name, by path.
+        digest: SHA-256 digest of the layer's code and of the code that it imports;
+            empty if the layer is shipped.
+        files: digests of files that are named in options, by path.
     """
 
     part: str
@@ -66,7 +66,7 @@ class LayerSpec:
         check_layer_name(f"`name` of layer {self.part}", self.name)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Omit the layer itself, since another process may need to load its class."""
+        """Omit the layer object, since another process must load its class first."""
         return {name: value for name, value in vars(self).items() if name != "layer"}
 
     @property
@@ -78,12 +78,12 @@ class LayerSpec:
 
     @property
     def is_vegetation(self) -> bool:
-        """Whether recipes contain it under the keys of vegetation."""
+        """Whether the layer is vegetation, which has its own keys in recipes."""
         return self.part == "vegetation"
 
     @property
     def meaning_of_maps(self) -> dict[str, Any]:
-        """Entries that determine the maps, whatever the location of the code."""
+        """Entries that determine the maps; the location of the code is not included."""
         return {
             "name": self.name,
             "options": self.options,
@@ -93,16 +93,16 @@ class LayerSpec:
 
     @property
     def is_built(self) -> bool:
-        """Whether the layer itself was built."""
+        """Whether the layer object was built."""
         return "layer" in vars(self)
 
     @cached_property
     def layer(self) -> Layer:
-        """The layer itself, built from the record.
+        """The layer object, built from the record.
 
         Raises:
-            ConfigError: If its code is not found, differs from the recorded code, or
-                rejects its options.
+            ConfigError: If the layer's code is not found, differs from the recorded
+                code, or rejects the options.
         """
         if self.is_vegetation:
             return read(Vegetation, self.options, of("layer 'vegetation'"))
@@ -115,23 +115,23 @@ class LayerSpec:
             files = registry.option_files(part) if self.source else {}
         except BenchnavError as error:
             raise ConfigError(
-                f"The code of layer {self.name!r} is needed to generate maps or to "
-                f"predict from colours: {error}"
+                f"Expected the code of layer {self.name!r}, to generate maps or to "
+                f"predict λ from colours, got: {error}"
             ) from error
         expected = self.digest[:12] or "none"
         got = digest[:12] or "none"
         expect(
             digest == self.digest,
-            f"the code of layer {self.name!r} that the dataset records, of digest "
-            f"{expected}, got {self.part} of digest {got}. Restore that code, or create "
-            "a new dataset.",
+            f"the code of layer {self.name!r} to have the digest {expected}, which the "
+            f"dataset records, got {self.part} with digest {got}. Restore the recorded "
+            "code, or create a new dataset.",
         )
         different = dict(files.items() ^ self.files.items())
         changed = ", ".join(sorted(different))
         expect(
             files == self.files,
-            f"the files that options of layer {self.name!r} name as the dataset "
-            f"records them, got others: {changed}. Restore them, or create a new "
+            f"the files in options of layer {self.name!r} to be those that the dataset "
+            f"records, got changed files: {changed}. Restore them, or create a new "
             "dataset.",
         )
         return layer
@@ -140,19 +140,20 @@ class LayerSpec:
         """Check that other processes can build the layer.
 
         Raises:
-            ConfigError: If its class is registered in this process only.
+            ConfigError: If the layer's class is registered only in this process.
         """
         entry = None if self.is_vegetation else registry.find(KIND, self.part)
         is_everywhere = entry is None or entry.everywhere
         expect(
             is_everywhere,
-            f"one process with layer {self.name!r}, whose class is registered in this "
-            "process only, got more. Pass `jobs` 1, or put the class in a file.",
+            f"a single process with layer {self.name!r}, whose class is registered "
+            "only in this process, got several. Pass `jobs` 1, or put the class in a "
+            "file.",
         )
 
     @property
     def available(self) -> Layer | None:
-        """The layer itself; None if its code is not available."""
+        """The layer object; None if its code is not available."""
         with suppress(BenchnavError):
             return self.layer
         return None
@@ -170,11 +171,12 @@ def read_layer(entry: Any) -> LayerSpec:
     """Return the record of a layer in a recipe.
 
     Args:
-        entry: `NAME`, `{part: NAME, options: {…}}`, a `Layer`, or a `LayerSpec`, which
-            may be plain data.
+        entry: `NAME`, `{part: NAME, options: {…}}`, a `Layer`, or a `LayerSpec` as an
+            object or as plain data.
 
     Raises:
-        ConfigError: If it is of another type, or there is no such layer or option.
+        ConfigError: If the entry has another type, or the layer or option does not
+            exist.
     """
     if isinstance(entry, LayerSpec):
         return entry
@@ -201,15 +203,16 @@ def read_layers(entries: Any) -> tuple[LayerSpec, ...]:
         entries: list of entries that `read_layer` accepts.
 
     Raises:
-        ConfigError: If it is not a list, two layers have one name, or `read_layer`
-            raises.
+        ConfigError: If `entries` is not a list, two layers have the same name, or
+            `read_layer` raises.
     """
     expect(isinstance(entries, list | tuple), f"`layers` as a list, got {entries!r}.")
     specs = tuple(map(read_layer, entries))
     names = [spec.name for spec in specs]
     for name in names:
         expect(
-            names.count(name) == 1, f"layers of different names, got {name!r} twice."
+            names.count(name) == 1,
+            f"different names of `layers`, got {name!r} more than once. Leave one out.",
         )
     return specs
 
@@ -217,7 +220,12 @@ def read_layers(entries: Any) -> tuple[LayerSpec, ...]:
 def overrides_of(
     before: Sequence[LayerSpec], after: Sequence[LayerSpec]
 ) -> dict[str, Any]:
-    """Return the changed options of a recipe's layers, by their keys in overrides."""
+    """Return the options of a recipe's layers that changed, by the keys of overrides.
+
+    Args:
+        before: records of the layers before the change.
+        after: records of the same layers after the change.
+    """
     changed: dict[str, Any] = {}
     number = 0
     for old, new in zip(before, after, strict=True):
@@ -236,7 +244,7 @@ def shipped_fields() -> dict[str, Field]:
 
 @cache
 def _shipped_fields(path: tuple[str, ...]) -> dict[str, Field]:
-    """Return the fields of `shipped_fields`, cached for each search path."""
+    """Return the result of `shipped_fields`, cached for each Python search path."""
     shipped = _shipped_classes()
     layers: Iterable[type[Layer]] = (Vegetation, *shipped.values())
     return {layer.name: layer.field() for layer in layers}
@@ -248,7 +256,7 @@ def _shipped_classes() -> dict[str, type[Layer]]:
 
 
 def _part_of(layer: Layer) -> str:
-    """Return the name by which the class of a layer can be found again."""
+    """Return the part name of a layer's class, by which `registry` finds the class."""
     kind = type(layer)
     if isinstance(layer, Vegetation):
         return "vegetation"
@@ -262,7 +270,7 @@ def _part_of(layer: Layer) -> str:
 
 
 def _record(part: registry.Part, layer: Layer) -> LayerSpec:
-    """Return the record of a layer that was built."""
+    """Return the record of a layer object that was built from a part."""
     kind = type(layer)
     is_vegetation = isinstance(layer, Vegetation)
     stored = kind.field()

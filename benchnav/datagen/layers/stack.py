@@ -1,4 +1,4 @@
-"""Application of the layers of maps in order, with checks of their results.
+"""Application of a recipe's layers in order, with checks of their results.
 
 Letters in shapes: B maps, H×W cells, C classes, K components.
 """
@@ -15,7 +15,7 @@ from benchnav.core.settings import one_line
 from benchnav.datagen.layers.layer import DrawnMaps, Layer, Streams
 from benchnav.datagen.recipe.classes import ClassTable
 
-# Weights, means and standard deviations, each of shape [B, K, H, W].
+# Weights, means and standard deviations of a mixture, each of shape [B, K, H, W].
 Parameters = tuple[ndarray, ndarray, ndarray]
 
 
@@ -33,20 +33,21 @@ def draw_layers(
     indices: ndarray,
     maps: DrawnMaps,
 ) -> dict[str, ndarray]:
-    """Return drawn values of layers.
+    """Draw the values of layers.
 
     Args:
-        layers: layers in their order.
+        layers: layers in the recipe's order.
         seed: root seed of the recipe.
-        names: the split, and the number of previously rejected draws.
+        names: name of the split, and number of rejected draws of these maps.
         indices: indices of the maps in the split, shape [B].
-        maps: the terrain below.
+        maps: terrain below the layers.
 
     Returns:
-        Values by layer as stored, but in float64, shape [B, H, W].
+        Values by layer, rounded to float32, as float64, each of shape [B, H, W].
 
     Raises:
-        ConfigError: If a layer raises, or returns another shape or an invalid value.
+        ConfigError: If a layer raises an exception, or returns a wrong shape or an
+            invalid value.
     """
     split, attempt = names
     values = {}
@@ -69,17 +70,17 @@ def colour_layers(
     """Return the colours of the terrain with all layers, in full light.
 
     Args:
-        layers: layers in their order.
-        rgb: colours without them, 0–255, float64, shape [B, 3, H, W].
-        values: values by layer, shape [B, H, W].
-        maps: the terrain below.
+        layers: layers in the recipe's order.
+        rgb: colours without layers, 0–255, float64, shape [B, 3, H, W].
+        values: values by layer, each of shape [B, H, W].
+        maps: terrain below the layers.
 
     Returns:
-        0–255, float64, shape [B, 3, H, W].
+        RGB in 0–255, float64, shape [B, 3, H, W].
 
     Raises:
-        ConfigError: If a layer raises, or returns another shape or a value beyond
-            0–255.
+        ConfigError: If a layer raises an exception, or returns a wrong shape or a value
+            outside 0–255.
     """
     for layer in layers:
         shown = _call(layer, "look", layer.look, rgb, values[layer.name], maps)
@@ -98,14 +99,14 @@ def affect_layers(
     Components without weight, and unlabelled cells, do not change.
 
     Args:
-        layers: layers in their order.
-        truth: distribution without them.
-        values: values by layer, shape [B, H, W].
-        maps: the terrain below.
+        layers: layers in the recipe's order.
+        truth: true distribution of λ without layers.
+        values: values by layer, each of shape [B, H, W].
+        maps: terrain below the layers.
 
     Raises:
-        ConfigError: If a layer raises, or returns another shape, a mean beyond [0, 1]
-            or a standard deviation beyond (0, 1].
+        ConfigError: If a layer raises an exception, or returns a wrong shape, a mean
+            outside [0, 1] or a standard deviation outside [1e-6, 1].
     """
     layers = [layer for layer in layers if layer.affects()]
     if not layers:
@@ -124,7 +125,8 @@ def affect_layers(
             kind = type(result).__name__
             expect(
                 is_pair,
-                f"mean and std of `affect` of layer {layer.name!r}, got {kind}.",
+                f"a pair (mean, std) from `affect` of layer {layer.name!r}, got "
+                f"{kind}.",
             )
             new_mean, new_std = result
             new_mean = _checked(
@@ -147,18 +149,18 @@ def weigh_layers(
     """Return class probabilities given an image with all layers.
 
     Args:
-        layers: layers in their order.
-        weights: class probabilities given colours without them, shape [B, C, H, W].
-        values: values by layer, shape [B, H, W].
-        maps: the terrain below.
+        layers: layers in the recipe's order.
+        weights: class probabilities given colours without layers, shape [B, C, H, W].
+        values: values by layer, each of shape [B, H, W].
+        maps: terrain below the layers.
 
     Returns:
-        Weights, float64, shape [B, C, H, W]. They sum to 1 over C if a layer hides
-        colours.
+        Weights, float64, shape [B, C, H, W]. If a layer hides colours, they sum to 1
+        over C.
 
     Raises:
-        ConfigError: If a layer raises, or returns another shape or a weight that is
-            negative or non-finite.
+        ConfigError: If a layer raises an exception, or returns a wrong shape or a
+            weight that is negative or non-finite.
     """
     hiding = [layer for layer in layers if layer.hides()]
     for layer in hiding:
@@ -178,7 +180,7 @@ def weigh_layers(
 def _call(
     layer: Layer, method: str, function: Callable[..., Any], *arguments: Any
 ) -> Any:
-    """Call a method of a layer; convert its exceptions to errors of one line."""
+    """Call a method of a layer, and convert its exceptions to errors of one line."""
     try:
         return function(*arguments)
     except BenchnavError:
@@ -190,7 +192,7 @@ def _call(
 
 def _checked(
     layer: Layer,
-    what: str,
+    description: str,
     result: Any,
     shape: tuple[int, ...],
     limits: tuple[float, float],
@@ -199,17 +201,17 @@ def _checked(
     """Return the result of a layer's method as float64, after checks.
 
     Args:
-        layer: the layer, for messages.
-        what: description of the result, for messages.
-        result: the result.
+        layer: layer of the method, for messages.
+        description: description of the result, for messages.
+        result: result to check.
         shape: expected shape.
         limits: smallest and largest valid value.
-        cells: mask of the cells whose values are used; None for all.
+        cells: mask of the cells to check; None for all.
 
     Raises:
         ConfigError: If the result is invalid.
     """
-    subject = f"{what} of layer {layer.name!r}"
+    subject = f"{description} of layer {layer.name!r}"
     try:
         array = np.asarray(result, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -231,6 +233,7 @@ def _checked(
         valid_range = "finite" if is_unbounded else f"in [{low:g}, {high:g}]"
         first = array[invalid][0]
         raise ConfigError(
-            f"Expected {subject} {valid_range}, got {first:g} in {invalid.sum()} cells."
+            f"Expected {subject} {valid_range}, got {first:g}, the first of "
+            f"{invalid.sum()} invalid values."
         )
     return array

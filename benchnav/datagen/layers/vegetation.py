@@ -1,7 +1,7 @@
 """Vegetation: a layer that hides the terrain's colour and does not change λ.
 
-Recipes describe it by `vegetation` of a class and by `vegetation_period_m`. Letters in
-shapes: B maps, H×W cells, C classes.
+Recipes describe vegetation by the keys `vegetation` of a class and
+`vegetation_period_m`. Letters in shapes: B maps, H×W cells, C classes.
 """
 
 from collections.abc import Mapping
@@ -29,7 +29,7 @@ class Growth:
     Args:
         height_m: minimum and maximum height in metres; heights are uniform between
             them.
-        cover: fraction of the class's cells that is overgrown, in (0, 1].
+        cover: fraction of the class's cells with vegetation, in (0, 1].
         colour: RGB in full light, 0–255.
     """
 
@@ -52,18 +52,18 @@ class Growth:
 
     @property
     def appearance(self) -> str:
-        """Properties that an image shows, as text: colour and cover."""
+        """Text of the properties that an image shows: colour and cover."""
         return f"{list(self.colour)} on {self.cover:.6g}"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Vegetation(Layer):
-    """Vegetation in patches, by one noise for all classes.
+    """Vegetation in patches, from the same noise for all classes.
 
     Args:
         period_m: lattice spacing of the noise in metres, at least two cells; a patch is
             about half as wide.
-        classes: vegetation by class.
+        classes: vegetation by name of the class.
     """
 
     period_m: float
@@ -79,15 +79,16 @@ class Vegetation(Layer):
     def check(
         self, grid: Grid, classes: ClassTable, colours: Mapping[str, ndarray]
     ) -> None:
-        """Check that its colours neither create nor separate look-alike classes.
+        """Check that vegetation neither creates nor separates look-alike classes.
 
-        Heights may separate them. The arguments are those of `Layer.check`.
+        Only colours and cover are checked, since heights may separate classes. The
+        arguments are those of `Layer.check`.
         """
         min_m = 2 * grid.resolution_m
         expect(
             min_m <= self.period_m < np.inf,
-            f"`vegetation_period_m` of at least two cells, {min_m:g} m, where a class "
-            f"has `vegetation`, got {self.period_m:g}.",
+            f"`vegetation_period_m` to be finite and at least two cells, {min_m:g} m, "
+            f"if a class has `vegetation`, got {self.period_m:g} m.",
         )
         names = [item.name for item in classes]
         for name in self.classes:
@@ -100,10 +101,10 @@ class Vegetation(Layer):
             first = alike[0]
             if shown[first] != shown[class_id]:
                 raise ConfigError(
-                    "Expected `vegetation` of one `colour` and `cover` on "
-                    f"{names[first]!r} and {names[class_id]!r}, whose terrain has one "
-                    f"colour, got {shown[first]} and {shown[class_id]}. Only "
-                    "`height_m` may differ."
+                    "Expected the same `colour` and `cover` of `vegetation` on "
+                    f"{names[first]!r} and {names[class_id]!r}, since their terrain "
+                    f"has the same colour, got {shown[first]} and {shown[class_id]}. "
+                    "Only `height_m` may differ."
                 )
         for scenario, class_colours in colours.items():
             for name, growth in self.classes.items():
@@ -112,8 +113,9 @@ class Vegetation(Layer):
                 same = [repr(names[class_id]) for class_id in same_ids]
                 expect(
                     not same,
-                    f"vegetation on {name!r} of a `colour` that no terrain has in "
-                    f"scenario {scenario!r}, got that of {', '.join(same)}.",
+                    f"vegetation on {name!r} to have a `colour` that no terrain has in "
+                    f"scenario {scenario!r}, got the colour of {', '.join(same)}. "
+                    "Change a `colour`.",
                 )
 
     def draw(self, streams: Streams, maps: DrawnMaps) -> ndarray:
@@ -125,12 +127,13 @@ class Vegetation(Layer):
         """Return heights that increase with the noise, 0 on bare terrain.
 
         On each map, vegetation covers the fraction `cover` of each class's cells, to
-        within a cell, and its heights are uniform. Cover and heights follow the noise's
-        ranks within the class, so patches do not reveal the class among look-alikes.
+        within a cell, and its heights are uniform. Cover and heights depend only on the
+        ranks of the noise within the class, so patches do not reveal the class among
+        look-alikes.
 
         Args:
             noise: smooth noise, shape [B, H, W].
-            maps: the terrain below.
+            maps: terrain below the vegetation.
 
         Returns:
             Metres, float64, shape [B, H, W].
@@ -169,13 +172,13 @@ class Vegetation(Layer):
     def class_weights(
         self, weights: ndarray, values: ndarray, maps: DrawnMaps
     ) -> ndarray:
-        """Return weights of the classes that may lie below vegetation of one colour.
+        """Return the weights of the classes that may lie below each cell's vegetation.
 
         An overgrown cell looks like the overgrown cells of all classes on its map that
-        have vegetation of the same colour. The weight of a class is its cover. If these
-        classes also have one terrain colour, an image contains no more information. If
-        they do not, bare terrain next to a patch indicates the class within it, and a
-        model that uses the neighbourhood can predict better.
+        have vegetation of the same colour. The weight of a class is its cover. If the
+        terrain of these classes has the same colour too, an image contains no more
+        information. Otherwise, bare terrain next to a patch indicates the class in the
+        patch, and a model that uses neighbouring cells can predict better.
         """
         weights = weights.copy()
         overgrown = values > 0
@@ -199,7 +202,7 @@ class Vegetation(Layer):
         return weights
 
     def describe(self) -> str:
-        """Return a description with the size of the patches."""
+        """Return a description of the layer, with the period of the patches."""
         return f"vegetation in patches with a period of {self.period_m:g} m"
 
     def describe_class(self, name: str) -> str:
@@ -211,7 +214,7 @@ class Vegetation(Layer):
         return f"{growth.cover:.0%} #{bytes(growth.colour).hex()} {low:g}–{high:g} m"
 
     def class_columns(self, name: str) -> dict[str, float | str]:
-        """Return cover, heights and colour on a class; 0 and empty without vegetation."""
+        """Return cover, heights and colour on a class by column; 0 or "" if bare."""
         cover = low = high = 0.0
         colour = ""
         growth = self.classes.get(name)
@@ -227,24 +230,24 @@ class Vegetation(Layer):
         }
 
     def scaled(self, factor: float, resolution_m: float) -> Self:
-        """Return the layer with its period scaled with the map, of at least two cells."""
+        """Return the layer with its period scaled, to at least two cells of a map."""
         period_m = float(f"{self.period_m * factor:.6g}")
         min_m = 2 * resolution_m
         return replace(self, period_m=max(min_m, period_m))
 
 
 def read_keys(data: Mapping[str, Any]) -> tuple[Vegetation | None, dict[str, Any]]:
-    """Return the vegetation of a recipe: `vegetation` of classes, and its period.
+    """Return the vegetation of a recipe, and the recipe without its keys.
 
     Args:
-        data: a recipe as plain data.
+        data: recipe as plain data.
 
     Returns:
-        The layer, or None without vegetation; and the recipe without the keys of
-        vegetation.
+        The layer, or None if no class has vegetation; and the plain data without the
+        keys of vegetation.
 
     Raises:
-        ConfigError: If the keys are invalid.
+        ConfigError: If the values of these keys are invalid.
     """
     recipe = dict(data)
     rows = data.get("classes")
@@ -260,16 +263,16 @@ def read_keys(data: Mapping[str, Any]) -> tuple[Vegetation | None, dict[str, Any
         is_distinct = len(set(names)) == len(names)
         expect(
             is_distinct or not growths,
-            "classes of different names where one has `vegetation`, got two of one "
-            "name. Rename one.",
+            "different names of `classes` if a class has `vegetation`, got two classes "
+            "with the same name. Rename one.",
         )
     if growths:
         options = {"period_m": period_m, "classes": growths}
         return read(Vegetation, options, _key_of), recipe
     expect(
         not period_m,
-        f"`vegetation_period_m` only with `vegetation` of a class, got {period_m}. "
-        "Leave it out.",
+        f"`vegetation_period_m` only if a class has `vegetation`, got {period_m} "
+        "without one. Leave `vegetation_period_m` out.",
     )
     return None, recipe
 
@@ -295,7 +298,7 @@ def _without_vegetation(row: Any) -> Any:
 
 
 def _key_of(key: str) -> str:
-    """Return the name of an option of the layer as a recipe's key."""
+    """Return the key of a recipe for an option of the layer, for messages."""
     head, _, tail = key.partition(".")
     name, _, inner = tail.partition(".")
     if head == "classes" and name:

@@ -1,7 +1,7 @@
 """Terrain classes: colours, and parameters of latent traversability (LT) functions.
 
-Beyond the paper, a class may have soft spots, a second mode of λ that neither colour
-nor slope shows, and several classes may have one colour.
+In addition to the paper, a class may have soft spots, a second mode of λ that neither
+colour nor slope shows, and several classes may have the same colour.
 """
 
 from dataclasses import dataclass
@@ -42,11 +42,12 @@ class TerrainClass:
     Args:
         name: name of the class.
         colour: RGB in full light, 0–255.
-        scale: a_c, in [1, 9] in the shipped table.
-        exponent: b_c, in [1.4, 2.0] in the shipped table.
-        offset: o_c, loss on flat terrain, in [0, 0.1] in the shipped table.
-        noise: σ_c, in [0.1, 0.2] in the shipped table.
-        soft: soft spots of the class; None if it has no soft spots.
+        scale: a_c ≥ 0, factor of the loss on slopes; 1–9 in the shipped table.
+        exponent: b_c > 0, exponent of the slope; 1.4–2.0 in the shipped table.
+        offset: o_c, loss on flat terrain; 0–0.1 in the shipped table.
+        noise: σ_c > 0, standard deviation of λ before clipping; 0.1–0.2 in the shipped
+            table.
+        soft: soft spots of the class; None for a class without soft spots.
     """
 
     name: str
@@ -66,8 +67,8 @@ class TerrainClass:
         in_range = self.scale >= 0 and self.exponent > 0 and self.noise > 0
         expect(
             is_finite and in_range,
-            f"`scale` ≥ 0, `exponent` > 0 and `noise` > 0 of class {self.name!r}, "
-            f"got {self.scale}, {self.exponent} and {self.noise}.",
+            f"`scale` ≥ 0, `exponent` > 0 and `noise` > 0 of class {self.name!r}, all "
+            f"finite, got {self.scale}, {self.exponent} and {self.noise}.",
         )
 
 
@@ -75,21 +76,18 @@ ClassTable = tuple[TerrainClass, ...]
 
 
 def look_alike_classes(classes: ClassTable) -> list[tuple[int, ...]]:
-    """Return, for each class, the indices of all classes of its colour.
-
-    The class itself is among them.
-    """
+    """Return for each class the indices of all classes of its colour, with its own."""
     by_colour: dict[tuple[int, int, int], tuple[int, ...]] = {}
     for class_id, item in enumerate(classes):
         by_colour[item.colour] = (*by_colour.get(item.colour, ()), class_id)
     return [by_colour[item.colour] for item in classes]
 
 
-def check_colour(of: str, colour: tuple[int, int, int]) -> None:
-    """Check that a colour has 8 bits per channel.
+def check_colour(owner: str, colour: tuple[int, int, int]) -> None:
+    """Check that the channels of a colour are in 0–255.
 
     Args:
-        of: owner of the colour, for the message.
+        owner: description of what has the colour, for the message.
         colour: RGB.
 
     Raises:
@@ -97,5 +95,5 @@ def check_colour(of: str, colour: tuple[int, int, int]) -> None:
     """
     expect(
         all(0 <= value <= 255 for value in colour),
-        f"`colour` of {of} in 0–255, got {colour}.",
+        f"channels of `colour` of {owner} in 0–255, got {colour}.",
     )

@@ -1,8 +1,9 @@
-"""Choice of the classes of each environment.
+"""Selection of the classes of each environment.
 
-Classes are dealt by units: a class, or all classes of one colour. Look-alikes are shown
-together or not at all; otherwise, colour would identify the class. Letters in shapes: E
-environments, M classes shown.
+Classes are selected by units, from a sequence that is called the pack. A unit is a
+class, or, in synthesis 2, all classes of one colour. Environments show all look-alike
+classes or none of them; otherwise, colour would identify the class. Letters in shapes:
+E environments, M classes of an environment.
 """
 
 import numpy as np
@@ -11,16 +12,16 @@ AlikeClasses = tuple[int, ...]
 
 
 def deal_classes(count: int, shown: int, environments: int) -> np.ndarray:
-    """Return the classes of all environments, dealt consecutively from one pack.
+    """Return the classes of all environments, dealt consecutively from the pack.
 
-    Each class is a unit. The pack is the class table read with a stride, so that the
-    classes of an environment differ in colour. The stride changes each time that the
-    environments so far have used up a whole number of packs.
+    Each class is a unit. The pack is the class table, read with a stride so that the
+    classes of an environment differ in colour. The stride changes whenever an
+    environment ends at the end of a pack.
 
     Args:
         count: number of classes.
         shown: M, number of classes of an environment.
-        environments: E, number of environments; a larger E does not change the first.
+        environments: E, number of environments; a larger E only adds environments.
 
     Returns:
         Class indices, distinct in each row, shape [E, M].
@@ -38,14 +39,14 @@ def deal_units(
 ) -> np.ndarray:
     """Return the classes of all environments, dealt by units about equally often.
 
-    Units that were dealt least often come first. Among them, the order is that of the
-    pack in `deal_classes`; its stride depends on how often they were dealt. A unit that
-    does not fit in the remaining room is skipped.
+    Units that were dealt least often are dealt first. Units that were dealt equally
+    often have the order of the pack, whose stride depends on that number. A unit is
+    skipped if other units cannot complete it to M classes.
 
     Args:
-        units: classes that are shown together; must exclude those of `never_shown`.
+        units: class indices of each unit; must exclude the units of `never_shown`.
         shown: M, number of classes of an environment.
-        environments: E, number of environments; a larger E does not change the first.
+        environments: E, number of environments; a larger E only adds environments.
 
     Returns:
         Class indices, distinct in each row, shape [E, M].
@@ -76,7 +77,7 @@ def deal_units(
 
 
 def never_shown(units: tuple[AlikeClasses, ...], shown: int) -> list[AlikeClasses]:
-    """Return the units that other units cannot complete to `shown` classes."""
+    """Return the units that no other units complete to `shown` classes."""
     sizes = [len(unit) for unit in units]
     excluded = []
     for index, unit in enumerate(units):
@@ -87,16 +88,16 @@ def never_shown(units: tuple[AlikeClasses, ...], shown: int) -> list[AlikeClasse
 
 
 def strides(count: int) -> list[int]:
-    """Return strides that visit all of a pack: 3 and 1, then all from 2 on.
+    """Return the strides that visit each unit of a pack: 3, 1, and then all from 2 on.
 
-    3 comes twice, since maps of synthesis 1 depend on this order.
+    3 may occur twice, since maps of synthesis 1 depend on this order.
     """
     candidates = (3, 1, *range(2, count))
     return [stride for stride in candidates if np.gcd(stride, count) == 1]
 
 
 def _fill(order: list[int], units: tuple[AlikeClasses, ...], room: int) -> list[int]:
-    """Return the first units in their order that fill the room exactly."""
+    """Return the first units in `order` that together have exactly `room` classes."""
     dealt = []
     for position, unit in enumerate(order):
         remaining = room - len(units[unit])

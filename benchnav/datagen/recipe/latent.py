@@ -1,11 +1,13 @@
 """Latent traversability (LT) functions: λ of a class as a function of slope.
 
-f_c(ψ) = clip(1 − (a_c·10⁻³·ψ^b_c + o_c), 0, 1), ψ in degrees; observed λ = clip(f_c(ψ)
-+ ε_c, 0, 1) with ε_c zero-mean Gaussian of standard deviation σ_c. Source: paper III-A.
+For a class c and a slope of ψ degrees, f_c(ψ) = clip(1 − (a_c·10⁻³·ψ^b_c + o_c), 0, 1).
+Observed λ is clip(f_c(ψ) + ε_c, 0, 1), where ε_c is Gaussian with mean 0 and standard
+deviation σ_c. Source: Endo et al. (2024), "BenchNav: Simulation Platform for
+Benchmarking Off-road Navigation Algorithms with Probabilistic Traversability", III-A.
 
-Beyond the paper, a class may have soft spots, a second mode of λ that neither colour
-nor slope shows, and several classes may have one colour. Letters in shapes: B maps,
-H×W cells, K components.
+In addition to the paper, a class may have soft spots, a second mode of λ that neither
+colour nor slope shows, and several classes may have the same colour. Letters in shapes:
+B maps, H×W cells, K components.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,7 +21,7 @@ from benchnav.datagen.layers.stack import Parameters, affect_layers, weigh_layer
 from benchnav.datagen.recipe.classes import ClassTable, look_alike_classes
 from benchnav.datagen.schema import TRUTH, UNLABELLED, Maps
 
-_BISECTIONS = 24  # leave an error of at most 2⁻²⁵
+_BISECTIONS = 24  # number of bisections, for an error of at most 2⁻²⁵
 
 
 def latent_mean(class_id: ndarray, slope_deg: ndarray, classes: ClassTable) -> ndarray:
@@ -40,9 +42,9 @@ def truth(class_id: ndarray, slope_deg: ndarray, classes: ClassTable) -> Paramet
     """Return the true distribution of λ, as a Gaussian mixture before clipping.
 
     Args:
-        class_id: index into the class table; 255 is unlabelled; shape [B, H, W].
+        class_id: index into the class table, 255 for unlabelled cells, shape [B, H, W].
         slope_deg: slope in degrees, shape [B, H, W].
-        classes: the class table.
+        classes: class table.
 
     Returns:
         Weights, means and standard deviations, each of shape [B, K, H, W]. K is 2 if
@@ -76,12 +78,12 @@ def truth(class_id: ndarray, slope_deg: ndarray, classes: ClassTable) -> Paramet
 
 
 def stored_truth(maps: Maps, classes: ClassTable) -> Parameters:
-    """Return the true distribution of λ of stored maps, as `truth` does.
+    """Return the true distribution of λ of stored maps, in the form of `truth`.
 
     Args:
-        maps: `class_id`, `slope_deg` and, where layers change λ, the fields of
-            `schema.TRUTH`.
-        classes: the class table.
+        maps: stored fields `class_id` and `slope_deg`, and, if layers change λ, the
+            fields of `schema.TRUTH`.
+        classes: class table.
     """
     slope_deg = maps["slope_deg"].astype(np.float64)
     weights, means, stds = truth(maps["class_id"], slope_deg, classes)
@@ -97,24 +99,25 @@ def look_alikes(
 ) -> Parameters:
     """Return the best prediction of λ from colours: a mixture over look-alike classes.
 
-    Classes of one colour are shown together, and chance decides on each map which of
-    them has which cells, so they have equal weights. Layers may change these weights,
-    and λ of each class; the values of layers count as observed.
+    Look-alike classes occur on the same maps, in random cells with equal probability,
+    so they have equal weights. Layers may change these weights, and λ of each class;
+    the values of layers are assumed to be observed.
 
     Args:
         maps: classes and slopes of B maps.
-        layers: layers that hide colours or affect λ, in their order.
-        values: values by layer, each of shape [B, H, W].
+        layers: layers that hide colours or change λ, in the recipe's order.
+        values: values of layers by name, each of shape [B, H, W].
 
     Returns:
-        Mixture as from `truth`, with the components of each class in turn: two for a
-        class with soft spots, else one.
+        Weights, means and standard deviations as in `truth`. The components are ordered
+        by class: two for a class with soft spots, one for any other class.
     """
     values = values or {}
     labelled = maps.class_id != UNLABELLED
     alike = look_alike_classes(maps.classes)
     n_classes = len(alike)
-    class_given_true = np.zeros((n_classes, n_classes))  # weights by true class
+    # Weight of each class, given the true class of a cell.
+    class_given_true = np.zeros((n_classes, n_classes))
     for true_id, members in enumerate(alike):
         class_given_true[list(members), true_id] = 1 / len(members)
     true_ids = np.where(labelled, maps.class_id, 0)
@@ -159,8 +162,8 @@ def expected_of(parameters: Parameters) -> ndarray:
 def expected_traversability(mean: ndarray, std: ndarray) -> ndarray:
     """Return E[λ] of the clipped Gaussian N(mean, std), shape of `mean`.
 
-    It is the integral of 1 − Φ from 0 to 1. `TraversabilityMixture.mean` computes the
-    same for mixtures of tensors.
+    The result is the integral of 1 − F from 0 to 1, where F is the Gaussian's CDF.
+    `TraversabilityMixture.mean` computes it for mixtures of tensors.
     """
     limits = np.array([[1.0], [0.0]])
     z = (limits - mean.ravel()) / std.ravel()
@@ -173,12 +176,13 @@ def expected_traversability(mean: ndarray, std: ndarray) -> ndarray:
 def quantile_of(parameters: Parameters, normal: ndarray) -> ndarray:
     """Return λ = clip(F⁻¹(Φ(z)), 0, 1), where F is the mixture's CDF.
 
-    It is in closed form if one component has all the weight, else from bisection, to
-    within 2⁻²⁵. `TraversabilityMixture.from_normal` computes the same for tensors.
+    If one component has all the weight, the result is in closed form. Otherwise, it is
+    from bisection, with an error of at most 2⁻²⁵. `TraversabilityMixture.from_normal`
+    computes it for tensors.
 
     Args:
         parameters: weights, means and standard deviations, each of shape [B, K, H, W].
-        normal: z, shape [B, H, W].
+        normal: standard normal variable z, shape [B, H, W].
 
     Returns:
         λ in [0, 1], shape [B, H, W].
@@ -215,8 +219,8 @@ def _bisected_quantile(parameters: tuple[ndarray, ...], rank: ndarray) -> ndarra
 
 
 def _probability(z: ndarray) -> ndarray:
-    """Return Φ(z)."""
-    # SciPy is imported here, since listing and showing datasets do not need it.
+    """Return Φ(z), the CDF of the standard normal distribution."""
+    # SciPy is slow to import, and commands that list and show datasets do not need it.
     from scipy.special import ndtr
 
     return ndtr(z)

@@ -26,15 +26,15 @@ def load_recipe(source: str | Path, overrides: Sequence[str] = ()) -> Recipe:
     """Load a recipe by its shipped id or the path of a YAML file.
 
     Args:
-        source: id or path.
+        source: id of a shipped recipe, or path of a file.
         overrides: changes `key.key=value` with the value in YAML, such as
             `splits.train.maps=50`. The key of an item of a list is its `name`, as in
-            `classes.dune_sand.soft.weight=0.2`. Changes must include `id=NAME`, since
-            other maps need another id.
+            `classes.dune_sand.soft.weight=0.2`. Overrides must include `id=NAME`, since
+            changed maps need another id.
 
     Raises:
-        ConfigError: If there is no such recipe, it is invalid, or its id names other
-            maps.
+        ConfigError: If the recipe does not exist or is invalid, or its id is used for
+            other maps.
     """
     path = RECIPES / f"{source}.yaml"
     if not path.exists():
@@ -43,7 +43,7 @@ def load_recipe(source: str | Path, overrides: Sequence[str] = ()) -> Recipe:
     expect(
         path.is_file(),
         f"a shipped recipe ({', '.join(shipped)}) or the path of a YAML file, got "
-        f"{str(source)!r}.",
+        f"{str(source)!r}, which does not exist.",
     )
     data = read_yaml(path)
     resolved = _with_class_table(data)
@@ -60,15 +60,15 @@ def load_recipe(source: str | Path, overrides: Sequence[str] = ()) -> Recipe:
     has_new_id = not overrides or recipe.id != data.get("id")
     expect(
         has_new_id,
-        f"`id=NAME` among the overrides, since {recipe.id!r} names the maps of the "
-        "recipe as it is.",
+        f"a new id for a recipe with overrides, got {recipe.id!r}, the id of the "
+        "recipe without them. Add `id=NAME` to the overrides, with another name.",
     )
     is_shipped = path == RECIPES / f"{recipe.id}.yaml" and not overrides
     if recipe.id in shipped and not is_shipped:
         expect(
             recipe == load_recipe(recipe.id),
-            f"an unused `id` in {source}, got {recipe.id!r}, which names the maps of a "
-            "shipped recipe.",
+            f"an `id` in {source} that no shipped recipe has, got {recipe.id!r}. "
+            "Choose another `id`.",
         )
     return recipe
 
@@ -79,13 +79,13 @@ def shipped_recipes() -> list[str]:
 
 
 def shipped_sizes(recipe: str) -> dict[str, int]:
-    """Return the number of maps of each split of a shipped recipe, without checks."""
+    """Return the number of maps by split of a shipped recipe, which is not checked."""
     splits = read_yaml(RECIPES / f"{recipe}.yaml")["splits"]
     return {split: entry["maps"] for split, entry in splits.items()}
 
 
 def _with_class_table(data: Any) -> Any:
-    """Return the data with the shipped class table, if it is `default` or missing."""
+    """Return the data with the shipped class table, unless it lists its own classes."""
     if not isinstance(data, dict) or data.get("classes", "default") != "default":
         return data
     classes, _ = load_presets(data.get("synthesis"))
@@ -93,11 +93,11 @@ def _with_class_table(data: Any) -> Any:
 
 
 def recipe_from_dict(data: Any, origin: str) -> Recipe:
-    """Return a recipe from plain data, with presets resolved.
+    """Return a recipe from plain data.
 
     Args:
-        data: mapping as in a recipe file or a manifest.
-        origin: source of the data, for messages.
+        data: mapping with the keys of a recipe file; scenarios may name presets.
+        origin: source of the data, for messages, such as the path of the file.
 
     Raises:
         ConfigError: If a key is unknown or missing, or a value is of the wrong type or

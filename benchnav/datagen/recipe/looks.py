@@ -1,8 +1,8 @@
 """Tinted colours of classes, and a check that tints preserve look-alikes.
 
-`Terrain.look_alikes`, the best prediction from colours, follows the class table. A tint
-may therefore neither create nor separate look-alike classes. Letters in shapes: C
-classes.
+`Terrain.look_alikes`, the best prediction from colours, uses the colours of the class
+table. A tint may therefore neither create nor separate look-alike classes. Letters in
+shapes: C classes.
 """
 
 from collections.abc import Mapping
@@ -20,7 +20,7 @@ def shown_colours(classes: ClassTable, scenario: Scenario) -> ndarray:
     """Return the tinted colours of classes in full light.
 
     Args:
-        classes: the class table.
+        classes: class table.
         scenario: scenario whose tints apply.
 
     Returns:
@@ -38,28 +38,28 @@ def check_tints(classes: ClassTable, scenarios: Mapping[str, Scenario]) -> None:
     """Check that tints preserve look-alike classes.
 
     Raises:
-        ConfigError: If a scenario has other look-alikes than the class table, or tints
-            an unknown class.
+        ConfigError: If look-alikes of a scenario differ from those of the class table,
+            or a scenario tints an unknown class.
     """
     names = [item.name for item in classes]
-    table = shown_colours(classes, Scenario())
+    untinted = shown_colours(classes, Scenario())
     for name, scenario in scenarios.items():
         for tint in scenario.tints:
             for tinted in tint.classes:
                 check_known(f"`classes` of a tint of scenario {name!r}", tinted, names)
         colours = np.rint(shown_colours(classes, scenario))
-        differs = _alike(colours) != _alike(table)
+        differs = _is_alike(colours) != _is_alike(untinted)
         for a, b in np.argwhere(differs).tolist():
             is_alike = (colours[a] == colours[b]).all()
-            problem = "one colour" if is_alike else "two colours"
+            problem = "the same colour" if is_alike else "different colours"
             remedy = "Lower a `share`" if is_alike else "Tint both"
             raise ConfigError(
-                f"Expected `tints` of scenario {name!r} that leave look-alikes as "
-                f"they are in the class table, got {names[a]!r} and {names[b]!r} in "
-                f"{problem}. {remedy}."
+                f"Expected `tints` of scenario {name!r} to preserve the look-alikes of "
+                f"the class table, got {names[a]!r} and {names[b]!r} in {problem}. "
+                f"{remedy}."
             )
 
 
-def _alike(colours: ndarray) -> ndarray:
-    """Return which pairs of N colours [N, 3] are equal, bool, shape [N, N]."""
+def _is_alike(colours: ndarray) -> ndarray:
+    """Return a mask of the equal pairs of N colours [N, 3], bool, shape [N, N]."""
     return (colours[:, None] == colours).all(axis=-1)

@@ -33,23 +33,26 @@ from benchnav.datagen.recipe.places import PlacesRule, check_places
 from benchnav.datagen.recipe.scenario import Scenario
 from benchnav.datagen.schema import FIELDS, UNLABELLED, Fields, truth_fields
 
-_MAX_CRATERED = 0.4  # fraction of a map; random sequential discs jam at 0.55
-_MIN_GAP = 0.3  # between classes of one colour, in E[λ] on flat terrain
-# In synthesis 2, relief and crater counts refer to a square with this side.
+# Maximum fraction of a map in craters. Discs that are placed at random cannot cover
+# more than 0.55 without overlap.
+_MAX_CRATERED = 0.4
+_MIN_GAP = 0.3  # minimum difference of E[λ] between look-alike classes on flat terrain
+# Side in metres of the square to which relief and crater counts refer in synthesis 2.
 REFERENCE_M = 32.0
 
-# The name of a shard has eight digits for maps; no machine generates more.
+# The name of a shard contains map indices of eight digits.
 MAX_MAPS = 10**8 - 1
 MAX_CELLS = 2**40
 
 
 @dataclass(frozen=True, kw_only=True)
 class Split:
-    """Split of a dataset.
+    """Split of a dataset, with the number and kind of its maps.
 
     Args:
         scenario: name of one of the recipe's scenarios.
-        maps: number of maps; map i shows environment i mod the number of environments.
+        maps: number of maps, ≥ 1; map i has environment i mod the number of
+            environments.
         solvable: whether to keep only maps whose goal is reachable, and to store the
             grid reference time.
     """
@@ -62,7 +65,8 @@ class Split:
         """Reject empty splits."""
         expect(
             self.maps >= 1,
-            f"`maps` ≥ 1 in every split, got {self.maps}. Leave the split out instead.",
+            f"`maps` ≥ 1 in each split, got {self.maps}. Leave the split out of the "
+            "recipe instead.",
         )
 
 
@@ -70,33 +74,34 @@ class Split:
 class Recipe:
     """Everything that determines a dataset.
 
-    The same recipe gives the same maps on any machine.
+    A recipe yields the same maps on any machine.
 
     Args:
         id: name and version of the dataset, for example `paper-v1`.
-        seed: root seed; another seed gives other maps of the same class table.
-        height: rows of a map.
-        width: columns of a map.
+        seed: root seed, in 0–2⁶³ − 1; another seed yields other maps with the same
+            class table.
+        height: number of rows of a map.
+        width: number of columns of a map.
         resolution_m: cell width in metres.
         start_m: (x, y) of the start in metres; None if `places` is given.
         goal_m: (x, y) of the goal in metres; None if `places` is given.
         places: rule that draws start and goal for each map, instead of `start_m` and
             `goal_m`; synthesis 2 only.
-        stuck_threshold: λ_stuck in [0, 1); a cell is truly free if E[λ] exceeds it.
+        stuck_threshold: λ_stuck in [0, 1); a cell is free if its true E[λ] is greater.
         synthesis: version of the generator. 1 reproduces version 0.1 bit for bit. 2
             adds soft spots, look-alike classes, drawn start and goal, and correlated λ;
             its terrain does not depend on the size of the map.
-        correlation_m: correlation length ℓ of stored λ, in metres: the noise of two
-            cells at distance d has the correlation exp(−d²/2ℓ²). At 0, as in synthesis
-            1, cells are independent.
-        layers: further layers, in the order in which they are drawn; objects of `Layer`
-            become their specs. Synthesis 2 only.
+        correlation_m: correlation length ℓ of stored λ in metres, at most a quarter of
+            the map's shorter side: the noise of two cells at distance d has the
+            correlation exp(−d²/2ℓ²). At 0, as in synthesis 1, cells are independent.
+        layers: further layers, in the order in which they are drawn. `Layer` objects
+            are converted to their specs. Synthesis 2 only.
         closed_corners: whether solvable maps and reference times exclude diagonal steps
             between two non-free cells; synthesis 2 only. It is false in the shipped
-            recipes and in files of versions before 1.2, and by default true in custom
-            recipes of synthesis 2.
-        environments: number of environments; each shows its own choice of classes.
-        occupancy: fraction of the cells of each class of an environment, summing to 1.
+            recipes and in files of versions before 1.2. In custom recipes of synthesis
+            2, it is true by default.
+        environments: number of environments; each is a selection of classes.
+        occupancy: fraction of a map's cells of each class of an environment; sums to 1.
         class_periods_m: lattice spacings of the class noise in metres, one per octave.
         classes: the class table.
         scenarios: scenarios by name.
@@ -126,7 +131,7 @@ class Recipe:
     closed_corners: bool = False
 
     def __post_init__(self) -> None:
-        """Reject values out of range, and values that contradict each other."""
+        """Reject values that are out of range or contradict each other."""
         object.__setattr__(self, "layers", read_layers(self.layers))
         expect(self.synthesis in (1, 2), f"`synthesis` 1 or 2, got {self.synthesis}.")
         expect(0 <= self.seed < 2**63, f"`seed` in 0–2^63 − 1, got {self.seed}.")
@@ -135,7 +140,7 @@ class Recipe:
             f"`stuck_threshold` in [0, 1), got {self.stuck_threshold}.",
         )
         check_name("id", self.id)
-        _check_ends(self)
+        _check_start_and_goal(self)
         _check_scenarios(self)
         _check_environments(self)
         _check_splits(self)
@@ -168,7 +173,7 @@ class Recipe:
 
     @property
     def class_rows(self) -> list[dict[str, Any]]:
-        """Class table as plain data, with the vegetation of each class."""
+        """Rows of the class table as plain data, with the vegetation of each class."""
         rows = plain(list(self.classes))
         return vegetation.write_classes(rows, self._vegetation)
 
@@ -180,15 +185,15 @@ class Recipe:
         return None
 
     def cells_of(self, positions_m: ndarray) -> tuple[ndarray, ndarray]:
-        """Return rows and columns of the cells of positions.
+        """Return the rows and columns of the cells that contain positions.
 
-        Positions are read in single precision, as stored.
+        Positions are rounded to single precision, in which they are stored.
 
         Args:
             positions_m: (x, y) in metres, shape [B, 2].
 
         Returns:
-            Two arrays, int64, shape [B].
+            Rows and columns, each int64, shape [B].
         """
         cells = positions_m.astype(np.float32) / np.float32(self.resolution_m)
         column, row = np.floor(cells).astype(np.int64).T
@@ -196,21 +201,21 @@ class Recipe:
 
     @cached_property
     def units(self) -> tuple[AlikeClasses, ...]:
-        """Classes of one colour, shown together in synthesis 2, in the table's order."""
+        """Groups of class indices of one colour, which environments show together."""
         return tuple(dict.fromkeys(look_alike_classes(self.classes)))
 
     @cached_property
     def environment_classes(self) -> ndarray:
-        """Class indices of each environment, distinct in a row: [E, len(occupancy)]."""
+        """Distinct class indices of each environment, shape [E, len(occupancy)]."""
         shown = len(self.occupancy)
         if self.synthesis == 1:
             return deal_classes(len(self.classes), shown, self.environments)
         return deal_units(self.units, shown, self.environments)
 
     def craters(self, scenario: Scenario) -> tuple[int, int]:
-        """Return minimum and maximum number of craters of a map.
+        """Return the minimum and maximum number of craters on a map.
 
-        In synthesis 2, a scenario's counts refer to 32 m × 32 m.
+        In synthesis 2, the scenario's counts refer to 32 m × 32 m and are scaled.
         """
         extent_x, extent_y = self.grid.extent_m
         scale = 1.0
@@ -230,14 +235,14 @@ class Recipe:
         data["layers"] = plain([spec for spec in self.layers if not spec.is_vegetation])
         for scenario in data["scenarios"].values():
             if not scenario["tints"]:
-                del scenario["tints"]  # as versions without tints wrote it
+                del scenario["tints"]  # earlier versions did not write this key
         unused = ["places"] if self.places is None else ["start_m", "goal_m"]
         if not data["layers"]:
             unused.append("layers")
         if not self.closed_corners:
             unused.append("closed_corners")
         if self.synthesis == 1:
-            # Version 0.1 wrote neither of them, and its files and readers do not change.
+            # Version 0.1 did not write these keys, and its files must not change.
             unused += ["synthesis", "correlation_m"]
             for item in data["classes"]:
                 item.pop("soft")
@@ -249,7 +254,7 @@ def check_name(kind: str, name: str) -> None:
 
     Args:
         kind: description of the name, for the message.
-        name: the name.
+        name: name to check.
 
     Raises:
         ConfigError: If the name is invalid.
@@ -257,11 +262,12 @@ def check_name(kind: str, name: str) -> None:
     is_plain = re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name)
     expect(
         is_plain and name != "manifest",
-        f"{kind} of letters, digits, '.', '_' and '-', got {name!r}.",
+        f"{kind} of letters, digits, '.', '_' and '-' that begins with a letter or "
+        f"digit and is not 'manifest', got {name!r}.",
     )
 
 
-def _check_ends(recipe: Recipe) -> None:
+def _check_start_and_goal(recipe: Recipe) -> None:
     keys = ("start_m", "goal_m", "places")
     names = [name for name in keys if getattr(recipe, name) is not None]
     is_complete = names in (["start_m", "goal_m"], ["places"])
@@ -270,17 +276,17 @@ def _check_ends(recipe: Recipe) -> None:
     if recipe.places is not None:
         return check_places(recipe.places, recipe.grid)
     extent_x, extent_y = recipe.grid.extent_m
-    ends = np.array([recipe.start_m, recipe.goal_m])
-    for name, (x, y) in zip(names, ends.tolist(), strict=True):
+    positions_m = np.array([recipe.start_m, recipe.goal_m])
+    for name, (x, y) in zip(names, positions_m.tolist(), strict=True):
         is_on_map = 0 <= x < extent_x and 0 <= y < extent_y
         expect(
             is_on_map,
             f"`{name}` on the map of {extent_x:g} m × {extent_y:g} m, got ({x}, {y}).",
         )
-    start, goal = np.transpose(recipe.cells_of(ends)).tolist()
+    start, goal = np.transpose(recipe.cells_of(positions_m)).tolist()
     expect(
         start != goal,
-        "`goal_m` in another cell than `start_m`, got both in that of "
+        "`start_m` and `goal_m` in different cells, got both in the cell of "
         f"{recipe.goal_m}.",
     )
 
@@ -293,8 +299,8 @@ def _check_synthesis_1(recipe: Recipe) -> None:
     for name, value in values.items():
         expect(
             not value,
-            f"`synthesis: 2` with `{name}`, got 1, which makes maps as version 0.1 "
-            "did. Set `synthesis: 2` in the recipe.",
+            f"`synthesis: 2` with `{name}`, got `synthesis: 1`, which generates the "
+            "maps of version 0.1. Set `synthesis: 2` in the recipe.",
         )
 
 
@@ -309,8 +315,9 @@ def _check_scenarios(recipe: Recipe) -> None:
         fits = 2 * max_radius_m <= min(extent_x, extent_y)
         expect(
             fits or max_craters == 0,
-            f"`crater_radius_m` of scenario {name!r} to fit a map of {extent_x:g} m × "
-            f"{extent_y:g} m, got {scenario.crater_radius_m}.",
+            f"`crater_radius_m` of scenario {name!r} to be at most half of the shorter "
+            f"side of a map of {extent_x:g} m × {extent_y:g} m, got "
+            f"{scenario.crater_radius_m}.",
         )
         area_m2 = extent_x * extent_y
         covered = max_craters * scenario.mean_crater_area_m2 / area_m2
@@ -333,7 +340,7 @@ def _check_environments(recipe: Recipe) -> None:
     sums_to_1 = np.isclose(sum(occupancy), 1, atol=1e-6)
     expect(
         sums_to_1 and min(occupancy) > 0,
-        f"`occupancy` as fractions > 0 summing to 1, got {list(occupancy)}.",
+        f"`occupancy` as fractions > 0 that sum to 1, got {list(occupancy)}.",
     )
     expect(
         len(occupancy) <= len(classes),
@@ -348,8 +355,8 @@ def _check_environments(recipe: Recipe) -> None:
     are_valid = all(recipe.resolution_m <= period < np.inf for period in periods)
     expect(
         periods and are_valid,
-        f"`class_periods_m` of at least a cell, {recipe.resolution_m} m, got "
-        f"{list(periods)}.",
+        f"`class_periods_m` as finite lengths of at least a cell, "
+        f"{recipe.resolution_m} m, got {list(periods)}.",
     )
 
 
@@ -359,14 +366,18 @@ def _check_splits(recipe: Recipe) -> None:
     cells = recipe.height * recipe.width
     expect(
         maps <= MAX_MAPS and maps * cells <= MAX_CELLS,
-        f"at most {MAX_MAPS:,} maps of {MAX_CELLS:,} cells together, got {maps:,} of "
-        f"{cells:,}. Lower `maps`.",
+        f"at most {MAX_MAPS:,} maps with at most {MAX_CELLS:,} cells in total, got "
+        f"{maps:,} maps of {cells:,} cells each. Lower `maps`.",
     )
     for name, split in recipe.splits.items():
         for part in name.split("/"):
             check_name("split name", part)
         nested = [inner for inner in recipe.splits if inner.startswith(f"{name}/")]
-        expect(not nested, f"splits that are not nested, got one inside {name!r}.")
+        expect(
+            not nested,
+            f"names of splits that are not nested, got {nested} inside {name!r}. "
+            "Rename one.",
+        )
         expect(
             split.scenario in recipe.scenarios,
             f"`scenario` of split {name!r} to be one of {sorted(recipe.scenarios)}, "
@@ -386,16 +397,17 @@ def _check_look_alikes(recipe: Recipe) -> None:
             gap = abs(means[a] - means[b])
             expect(
                 gap >= _MIN_GAP,
-                f"classes of one colour to differ by at least {_MIN_GAP:g} in E[λ] on "
-                f"flat terrain, got {means[a]:.3f} for {names[a]!r} and {means[b]:.3f} "
-                f"for {names[b]!r}. Change an `offset` or a `colour`.",
+                f"classes of the same colour to differ by at least {_MIN_GAP:g} in "
+                f"E[λ] on flat terrain, got {means[a]:.3f} for {names[a]!r} and "
+                f"{means[b]:.3f} for {names[b]!r}. Change an `offset` or a `colour`.",
             )
     for unit in never_shown(recipe.units, shown):
         members = ", ".join(names[member] for member in unit)
         raise ConfigError(
-            f"Expected classes that can be shown {shown} at a time, one for each "
-            "fraction in `occupancy`, with all classes of one colour together; got no "
-            f"choice that includes {members}. Change `occupancy` or a `colour`."
+            f"Expected each class to be in a selection of {shown} classes, the number "
+            "of fractions in `occupancy`, that includes all classes of a colour or "
+            f"none of them, got no such selection for {members}. Change `occupancy` or "
+            "a `colour`."
         )
 
 
@@ -404,6 +416,7 @@ def _check_layers(recipe: Recipe) -> None:
     for name, scenario in recipe.scenarios.items():
         colours[name] = np.rint(shown_colours(recipe.classes, scenario))
     for spec in recipe.layers:
-        # Other layers belong to a dataset; its recipe was checked when it was created.
+        # Layers without an object come from a dataset, whose recipe was checked when
+        # the dataset was created.
         if spec.is_vegetation or spec.is_built:
             check_layer(spec.layer, recipe.grid, recipe.classes, colours)

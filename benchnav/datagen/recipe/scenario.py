@@ -1,8 +1,8 @@
 """Scenarios: geometry, light and tints of a family of maps.
 
-`presets.yaml` contains the shipped class table and scenarios, which a recipe may name
-or replace. The `severity` s of a scenario interpolates each of its numbers between
-`std` (s = 0) and the preset (s = 1), and extrapolates beyond.
+`presets.yaml` contains the shipped class table and scenarios, the presets. A recipe may
+name or replace them. With a `severity` s, each number of a scenario is interpolated
+between `std` (s = 0) and the preset (s = 1), or extrapolated.
 """
 
 import re
@@ -50,7 +50,7 @@ class Tint:
         in_range = all(0 <= value <= 255 for value in self.colour)
         expect(
             in_range,
-            f"`colour` of a tint in 0–255, got {self.colour}.",
+            f"channels of `colour` of a tint in 0–255, got {self.colour}.",
         )
         expect(
             0 < self.share < 1,
@@ -66,15 +66,16 @@ class Scenario:
     A range (minimum, maximum) is sampled uniformly, one value per map.
 
     Args:
-        relief_m: maximum minus minimum elevation of the fractal terrain, in metres.
+        relief_m: difference between the maximum and minimum elevation of the fractal
+            terrain, in metres.
         roughness: Hurst exponent of the fractal terrain, in [0, 1].
         crater_count: number of craters per map.
         crater_radius_m: radius of a crater's rim, in metres.
         crater_depth_ratio: depth below the rim, divided by the diameter, in [0, 1].
         light_height: z of the unit vector toward the light, in [0, 1]; 1 is overhead.
         ambient: fraction of ambient light, in [0, 1].
-        tints: changes of the classes' colours, applied in order. Vegetation keeps its
-            colour.
+        tints: changes of the classes' colours, applied in order. They do not change the
+            colour of vegetation.
     """
 
     relief_m: Range = (1.4, 1.7)
@@ -87,7 +88,7 @@ class Scenario:
     tints: tuple[Tint, ...] = ()
 
     def __post_init__(self) -> None:
-        """Reject ranges that are not finite, ordered, or physical."""
+        """Reject ranges that are not ordered or exceed physical limits."""
         limits: dict[str, Range] = {
             "relief_m": (0, 1000),
             "roughness": (0, 1),
@@ -103,13 +104,13 @@ class Scenario:
             low, high = value if is_range else (value, value)
             expect(
                 minimum <= low <= high <= maximum,
-                f"scenario `{name}` finite, ordered and within [{minimum:g}, "
+                f"`{name}` of a scenario ordered and within [{minimum:g}, "
                 f"{maximum:g}], got {value}.",
             )
 
     @property
     def mean_crater_area_m2(self) -> float:
-        """Mean area inside a rim in m²; the logarithms of radii are uniform."""
+        """Mean area of a crater in m²; the logarithm of its radius is uniform."""
         low, high = self.crater_radius_m
         if low == high:
             return float(np.pi * low**2)
@@ -121,7 +122,7 @@ def blend(base: Scenario, full: Scenario, severity: float) -> Scenario:
     """Return a scenario between `base` (severity 0) and `full` (severity 1).
 
     All numbers are interpolated. The weights of the tints of `full` are multiplied by
-    the severity; `base` must not have tints, and `std` has none.
+    the severity. `base` must not have tints.
     """
 
     def between(low: Any, high: Any) -> Any:
@@ -141,18 +142,18 @@ def blend(base: Scenario, full: Scenario, severity: float) -> Scenario:
 
 
 def load_presets(synthesis: Any) -> tuple[list[Any], dict[str, Any]]:
-    """Return the shipped class table and scenarios of a synthesis as plain data."""
+    """Return the shipped class table and scenarios for a synthesis, as plain data."""
     data = yaml.safe_load(PRESETS.read_text())
     key = "scenarios-2" if synthesis == 2 else "scenarios"
     return data["classes"], data[key]
 
 
 def resolve(entry: Any, presets: Mapping[str, Any], name: str) -> Any:
-    """Return the plain data of a scenario with all numbers of its preset.
+    """Return the plain data of a scenario, with the numbers of its preset filled in.
 
     Args:
         entry: plain data of a scenario. If it names a `preset`, the preset's numbers at
-            its `severity` apply, except those that the entry lists itself.
+            the given `severity` are used for all keys that the entry does not contain.
         presets: plain data of the presets by name, including `std`.
         name: name of the scenario, for messages.
 
@@ -186,18 +187,17 @@ def find_series(splits: Iterable[str]) -> SeriesOfShifts:
     """Return the series of shifts among splits, by their names.
 
     A split belongs to a series if its name ends in a severity: in hundredths after a
-    dash (`test/hg-050`), or as a number after an @ (`test/hg@0.5`). The name before the
-    severity is the scenario. The split `std` of the same folder has severity 0 in each
-    series, and a split named as the scenario (`test/hg`) has severity 1. Other splits
-    do not belong to a series.
+    dash (`test/hg-050`), or as a number after an @ (`test/hg@0.5`). The text before the
+    severity is the name of the series (`test/hg`). A split with exactly this name has
+    severity 1, and the split `std` of the same folder (`test/std`) has severity 0. All
+    other splits belong to no series.
 
     Args:
         splits: names of splits.
 
     Returns:
-        Pairs (severity, split) in ascending order, by scenario. They include `std` and
-        the scenario's split, if they exist. Scenarios with fewer than two pairs are
-        omitted.
+        Pairs (severity, split) in ascending order, by name of the series. Series with
+        fewer than two pairs are omitted.
     """
     splits = list(splits)
     all_series: SeriesOfShifts = {}

@@ -1,8 +1,9 @@
 """Appearance of terrain: layout of classes by bands of noise, and shaded colours.
 
-Shading is Lambert's law with ambient light, as in paper III-A. Batched NumPy in
-float64; results are the same on every machine. Letters in shapes: B maps, H×W cells, M
-classes that a map shows.
+Shading follows Lambert's law with ambient light, as in section III-A of Endo et al.
+(2024), "BenchNav: Simulation Platform for Benchmarking Off-road Navigation Algorithms
+with Probabilistic Traversability". Computations are in NumPy and float64, and results
+are the same on every machine. Letters in shapes: B maps, H×W cells, M classes on a map.
 """
 
 import numpy as np
@@ -10,15 +11,15 @@ from numpy import ndarray
 
 
 def class_bands(noise: ndarray, occupancy: ndarray) -> ndarray:
-    """Return bands of noise, cut at the quantiles of the occupancy.
+    """Return the band of each cell; bands are intervals of noise values.
 
     Args:
         noise: smooth noise, shape [B, H, W].
-        occupancy: fraction of the cells of each band, summing to 1, shape [M].
+        occupancy: fraction of the cells in each band, shape [M]; sums to 1.
 
     Returns:
-        Band index in [0, M), int64, shape [B, H, W]; each fraction is exact to within
-        one cell.
+        Band index in [0, M), int64, shape [B, H, W]. The number of cells of a band is
+        exact to within one cell.
     """
     flat = noise.reshape(len(noise), -1)
     n_cells = flat.shape[1]
@@ -34,7 +35,8 @@ def light_direction(azimuth_rad: ndarray, height: ndarray) -> ndarray:
     """Return unit vectors toward the light.
 
     Args:
-        azimuth_rad: direction in the plane in radians, shape [B].
+        azimuth_rad: horizontal direction in radians, from the x axis toward the y axis,
+            shape [B].
         height: z of the unit vector, in [0, 1], shape [B].
 
     Returns:
@@ -50,6 +52,8 @@ def shade(
     along_x: ndarray, along_y: ndarray, light: ndarray, ambient: float
 ) -> ndarray:
     """Return the brightness of terrain: ambient + (1 − ambient)·max(0, n·l).
+
+    n is the unit normal of the terrain, and l the direction of the light.
 
     Args:
         along_x: ∂z/∂x, shape [B, H, W].

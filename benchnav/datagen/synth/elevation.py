@@ -1,10 +1,13 @@
 """Rough terrain: fractal elevation and craters, and slope by Horn's method.
 
-Batched NumPy in float64: NumPy's Fourier transform returns the same numbers on every
-machine, unlike those that PyTorch uses. Letters in shapes: B maps, H×W cells.
+Computations are in NumPy and float64, since NumPy's Fourier transform returns the same
+numbers on every machine, in contrast to PyTorch's. Letters in shapes: B maps, H×W
+cells, N craters.
 
-Sources: paper III-A; Yokokohji et al. (2004) for fractal terrain; Pike (1977) for the
-proportions of craters; Horn (1981), "Hill shading and the reflectance map", for slope.
+Sources: Endo et al. (2024), "BenchNav: Simulation Platform for Benchmarking Off-road
+Navigation Algorithms with Probabilistic Traversability", III-A; Yokokohji et al.
+(2004) for fractal terrain; Pike (1977) for the proportions of craters; Horn (1981),
+"Hill shading and the reflectance map", for slope.
 """
 
 import numpy as np
@@ -19,11 +22,11 @@ def fractal(key: int, indices: ndarray, shape: Shape, roughness: float) -> ndarr
     """Return fractal surfaces from a power-law spectrum.
 
     Args:
-        key: stream key.
-        indices: elements of the stream, shape [B].
-        shape: (H, W).
-        roughness: Hurst exponent in (0, 1); amplitude falls with frequency to the
-            −(roughness + 1).
+        key: key of the random stream.
+        indices: index of each map's element of the stream, shape [B].
+        shape: number of rows and columns, (H, W).
+        roughness: Hurst exponent in [0, 1]; the amplitude at a frequency f is
+            proportional to f^−(roughness + 1).
 
     Returns:
         Surfaces scaled to a relief (maximum minus minimum) of 1, float64, shape [B, H,
@@ -48,21 +51,22 @@ def open_fractal(
 ) -> ndarray:
     """Return sections of fractal terrain that continues beyond the map.
 
-    The spectrum is that of `fractal` for wavelengths below the reference side, and flat
-    above it (von Kármán's). The steepness therefore does not depend on the size of the
-    map. The surface is a torus of twice the extent, which is cropped: opposite edges of
-    the map are not neighbours.
+    The spectrum is that of `fractal` for wavelengths below the side of the reference
+    square, and flat for longer ones (von Kármán's spectrum). The steepness therefore
+    does not depend on the size of the map. The surface is generated periodically, with
+    twice the map's extent, and cropped, so that opposite edges of the map differ.
 
     Args:
-        key: stream key.
-        indices: elements of the stream, shape [B].
-        shape: (H, W).
-        roughness: Hurst exponent in (0, 1).
-        reference_cells: side of the square on which relief is measured, in cells.
+        key: key of the random stream.
+        indices: index of each map's element of the stream, shape [B].
+        shape: number of rows and columns, (H, W).
+        roughness: Hurst exponent in [0, 1].
+        reference_cells: side of the reference square, on which relief is measured, in
+            cells.
 
     Returns:
-        Surfaces scaled to a mean relief of 1 over the reference squares that cover the
-        map, from its corner to beyond its edges; float64, shape [B, H, W].
+        Surfaces, float64, shape [B, H, W]. They are scaled so that the mean relief of
+        the reference squares that cover the map is 1; these may extend beyond the map.
 
     Source: von Kármán (1948), "Progress in the statistical theory of turbulence", for
     the spectrum.
@@ -88,14 +92,14 @@ def open_fractal(
 
 
 def _frequencies(shape: Shape) -> ndarray:
-    """Return the half spectrum's frequencies in cycles per cell, [H, W // 2 + 1]."""
+    """Return the frequencies of a half spectrum, cycles per cell, [H, W // 2 + 1]."""
     frequency_y = np.fft.fftfreq(shape[0])[:, None]
     frequency_x = np.fft.rfftfreq(shape[1])[None, :]
     return np.hypot(frequency_y, frequency_x)
 
 
 def _filtered(white: ndarray, amplitude: ndarray) -> ndarray:
-    """Return white noise with another spectrum, shape of `white`, [B, H, W]."""
+    """Return white noise [B, H, W], with its spectrum multiplied by the amplitude."""
     spectrum = np.fft.rfft2(white) * amplitude
     return np.fft.irfft2(spectrum, s=white.shape[1:])
 
@@ -108,27 +112,27 @@ def place_craters(
     radius_m: tuple[float, float],
     max_count: int,
 ) -> tuple[ndarray, ndarray]:
-    """Draw centres and radii of craters by sequential rejection; rims do not overlap.
+    """Draw centres and radii of craters; craters that would overlap are rejected.
 
     Args:
-        key: stream key.
-        indices: elements of the stream, shape [B].
+        key: key of the random stream.
+        indices: index of each map's element of the stream, shape [B].
         extent_m: size of the map in x and y, in metres.
-        count: requested number of craters of each map, shape [B]; a crowded map has
-            fewer.
+        count: requested number of craters on each map, shape [B]. A map has fewer if
+            too many draws are rejected.
         radius_m: minimum and maximum radius of a rim, in metres.
-        max_count: maximum number of craters of all maps of the stream; it determines
-            the number of draws per map.
+        max_count: maximum of `count` over all maps of the stream; it determines the
+            number of draws per map.
 
     Returns:
-        Centres (x, y) in metres, shape [B, N, 2], and radii, shape [B, N]; radius 0
-        means no crater.
+        Centres (x, y) in metres, shape [B, N, 2], and radii in metres, shape [B, N]; a
+        radius of 0 marks an unused entry.
     """
     n_draws = 12 * max_count
     shape = (max(n_draws, 1), 3)
     draws = rng.uniform(key, indices, shape)
     centres = draws[..., :2] * np.asarray(extent_m)
-    # Small craters are more frequent: log radii are uniform.
+    # Small craters are more frequent: logarithms of radii are uniform.
     low, high = np.log(radius_m)
     log_radii = low + (high - low) * draws[..., 2]
     radii = np.exp(log_radii)
@@ -146,7 +150,7 @@ def place_craters(
         is_accepted = is_apart.all(axis=1) & is_short
         accepted[:, i] = np.where(is_accepted, radii[:, i], 0)
     n_accepted = (accepted > 0).sum(axis=1)
-    # Accepted craters come first, in their order.
+    # Accepted craters are moved to the front, in the order of their draws.
     order = np.argsort(accepted == 0, axis=1, kind="stable")
     order = order[:, : n_accepted.max(initial=0)]
     centres = np.take_along_axis(centres, order[..., None], axis=1)
@@ -164,16 +168,16 @@ def crater_elevation(
     """Return the elevation of craters: raised rims and parabolic bowls.
 
     Args:
-        centres_m: (x, y) in metres, shape [B, N, 2].
-        radii_m: radius of each rim in metres, 0 for no crater, shape [B, N].
-        shape: (H, W).
+        centres_m: centres (x, y) in metres, shape [B, N, 2].
+        radii_m: radius of each rim in metres, 0 for unused entries, shape [B, N].
+        shape: number of rows and columns, (H, W).
         resolution_m: cell width in metres.
-        depth_ratio: depth of a bowl below its rim, divided by its diameter. The rim
-            rises a fifth of the depth above the plain; outside, its height falls with
-            the cube of the distance.
+        depth_ratio: depth of a bowl below its rim, divided by the rim's diameter. The
+            rim is a fifth of the depth above the surrounding plain. Outside the rim,
+            the height decreases with the inverse cube of the distance.
 
     Returns:
-        Elevation to be added, metres, shape [B, H, W].
+        Elevation to add to the terrain in metres, shape [B, H, W].
     """
     height, width = shape
     y = (np.arange(height)[:, None] + 0.5) * resolution_m
@@ -198,12 +202,12 @@ def horn_gradient(padded_m: ndarray, resolution_m: float) -> tuple[ndarray, ndar
 
     Args:
         padded_m: elevation in metres, padded by one cell of the surrounding terrain,
-            shape [B, H + 2, W + 2]. Where padding is NaN, the surface is continued
-            linearly, so planes are exact everywhere. See `pad_missing`.
+            shape [B, H + 2, W + 2]. NaN padding (`pad_missing`) is replaced by a linear
+            extrapolation, so gradients of planes are exact at the edges too.
         resolution_m: cell width in metres.
 
     Returns:
-        Two arrays of shape [B, H, W], dimensionless.
+        ∂z/∂x and ∂z/∂y, dimensionless, each of shape [B, H, W].
     """
     z = padded_m.copy()
     columns = z.transpose(2, 0, 1)
@@ -225,28 +229,28 @@ def horn_gradient(padded_m: ndarray, resolution_m: float) -> tuple[ndarray, ndar
 
 
 def inclination_deg(along_x: ndarray, along_y: ndarray) -> ndarray:
-    """Return the angle between the terrain and the horizontal.
+    """Return the angle between the terrain and the horizontal plane.
 
     Args:
         along_x: ∂z/∂x, any shape.
         along_y: ∂z/∂y, shape of `along_x`.
 
     Returns:
-        Degrees in [0, 90), shape of `along_x`.
+        Angle in degrees, in [0, 90), shape of `along_x`.
     """
     steepness = np.sqrt(along_x * along_x + along_y * along_y)
     return np.arctan(steepness) * (180 / np.pi)
 
 
 def slopes_deg(elevation_m: ndarray, resolution_m: float) -> ndarray:
-    """Return slopes of maps without surrounding terrain.
+    """Return the slopes of maps whose surrounding terrain is unknown.
 
     Args:
         elevation_m: elevation in metres, shape [B, H, W].
         resolution_m: cell width in metres.
 
     Returns:
-        Degrees, float64, shape [B, H, W].
+        Slope in degrees, float64, shape [B, H, W].
     """
     padded_m = pad_missing(elevation_m.astype(np.float64))
     gradient = horn_gradient(padded_m, resolution_m)

@@ -1,7 +1,7 @@
-"""Generation of maps: each map is a pure function of (recipe, split, index).
+"""Generation of maps: each map depends only on recipe, split and index.
 
-Elevation is quantised first; slope, shading and λ are derived from quantised elevation.
-Batched NumPy in float64. Letters in shapes: B maps, H×W cells.
+Elevation is quantised; slope, shading and λ are computed from the quantised elevation,
+in NumPy and float64. Letters in shapes: B maps, H×W cells.
 """
 
 from collections.abc import Sequence
@@ -24,25 +24,25 @@ from benchnav.datagen.recipe.scenario import Scenario
 from benchnav.datagen.schema import TRUTH, Maps, join_maps, quantise
 from benchnav.datagen.synth import appearance, elevation
 
-MAX_ATTEMPTS = 200
-# Maps per chunk, so that arrays stay in the processor's cache; fewer for large maps.
+MAX_ATTEMPTS = 200  # maximum number of draws of a map that must be solvable
+# Maximum number of maps per chunk. Arrays of a chunk fit in the processor's cache.
 _CHUNK = 16
 _CHUNK_CELLS = 2**20
 
 
 def generate(recipe: Recipe, split: str, indices: ndarray) -> Maps:
-    """Generate some maps of a split.
+    """Generate maps of a split.
 
     Args:
         recipe: recipe of the maps.
-        split: name of one of its splits.
-        indices: indices of the maps, ascending integers ≥ 0, shape [B].
+        split: name of one of the recipe's splits.
+        indices: indices of the maps in the split, ascending integers ≥ 0, shape [B].
 
     Returns:
-        The fields of `recipe.fields`, each of shape [B, *entry shape].
+        Arrays by name of `recipe.fields`, each of shape [B, *entry shape].
 
     Raises:
-        ConfigError: If a split requires solvable maps, and all draws of a map are
+        ConfigError: If the split requires solvable maps, and all draws of a map are
             rejected.
     """
     indices = np.asarray(indices, dtype=np.int64)
@@ -76,20 +76,20 @@ def _generate_chunk(recipe: Recipe, split: str, indices: ndarray) -> Maps:
             return maps
     unsolvable = int(indices[pending[0]])
     raise ConfigError(
-        f"Expected maps of split {split!r} whose goal can be reached, got none for map "
-        f"{unsolvable} in {MAX_ATTEMPTS} draws. Ease its scenario or lower "
-        "`stuck_threshold`."
+        f"Expected a goal that can be reached on each map of split {split!r}, got no "
+        f"such draw of map {unsolvable} in {MAX_ATTEMPTS} draws. Use an easier "
+        "scenario, or lower `stuck_threshold`."
     )
 
 
 def reference_time_s(recipe: Recipe, maps: Maps) -> ndarray:
-    """Return grid reference times: minimum times over truly free cells at 1 m/s.
+    """Return grid reference times, the minimum times over cells with E[λ] > λ_stuck.
 
-    They are a reference, not a bound, since the grid has only eight headings and λ is
-    replaced by its expectation.
+    The commanded speed is 1 m/s. An episode may be faster, since the grid has only
+    eight headings, and λ is replaced by its true expectation.
 
     Returns:
-        Seconds from start to goal, infinite without a free path, shape [B].
+        Time from start to goal in seconds, infinite if no free path exists, shape [B].
     """
     truth = latent.stored_truth(maps, recipe.classes)
     expected = latent.expected_of(truth)
@@ -109,9 +109,9 @@ def reference_time_s(recipe: Recipe, maps: Maps) -> ndarray:
 def class_map(
     recipe: Recipe, split: str, indices: ndarray, attempt: int = 0
 ) -> ndarray:
-    """Return the layout of the classes of each map's environment.
+    """Return the class of each cell, from the classes of the map's environment.
 
-    Map i shows environment i mod the number of environments.
+    Map i has environment i mod the number of environments.
 
     Returns:
         Class indices, shape [B, H, W].
@@ -119,7 +119,7 @@ def class_map(
     periods = [period / recipe.resolution_m for period in recipe.class_periods_m]
     names = (split, "class", attempt)
     noise = fractal_perlin(recipe.seed, names, indices, recipe.grid.shape, periods)
-    # The order of classes over the bands is random, so that neighbours vary.
+    # Classes are assigned to bands in random order, so that neighbours vary.
     order_key = rng.stream_key(recipe.seed, split, "class order", attempt)
     order = rng.permutation(order_key, indices, len(recipe.occupancy))
     table = recipe.environment_classes[indices % recipe.environments]
@@ -139,25 +139,25 @@ def complete(
     attempt: int = 0,
     layers: Sequence[LayerSpec] = (),
 ) -> Maps:
-    """Return maps with all fields that follow from classes and elevation.
+    """Return all fields of maps with given classes and elevation.
 
-    These fields are slope, layers, colour under a random light, and λ.
+    Slope, layers, colours under a random light, start, goal and λ are added.
 
     Args:
-        recipe: class table, seed, start and goal.
-        split: name of the maps' split, which determines the scenario's light and the
-            random streams.
+        recipe: recipe with the class table, seed, start and goal.
+        split: name of the maps' split, which determines the scenario and the random
+            streams.
         indices: indices of the maps in the split, shape [B].
         class_id: class indices, shape [B, H, W].
         padded_m: elevation in metres, padded by one cell of the surrounding terrain,
-            NaN if missing, shape [B, H + 2, W + 2]. It is quantised first; all other
-            fields follow from the quantised values.
-        attempt: number of previously rejected draws of these maps.
+            NaN if missing, shape [B, H + 2, W + 2]. It is quantised, and other fields
+            are computed from the quantised values.
+        attempt: number of rejected draws of these maps.
         layers: layers to draw.
 
     Returns:
-        The fields of `schema.FIELDS` except `reference_time_s`, those of the layers,
-        and those of `schema.TRUTH` if a layer changes λ.
+        Arrays by field: `schema.FIELDS` except `reference_time_s`, the layers, and
+        `schema.TRUTH` if a layer changes λ.
     """
     key = partial(rng.stream_key, recipe.seed, split)
     scenario = recipe.scenarios[recipe.splits[split].scenario]
@@ -183,8 +183,8 @@ def complete(
     brightness = appearance.shade(*gradient, light, scenario.ambient)
     colours = _colour(stack, values, below, scenario)
     if recipe.places is None:
-        ends = np.array([recipe.start_m, recipe.goal_m], dtype=np.float64)
-        start_m, goal_m = np.tile(ends[:, None], (1, len(indices), 1))
+        positions_m = np.array([recipe.start_m, recipe.goal_m], dtype=np.float64)
+        start_m, goal_m = np.tile(positions_m[:, None], (1, len(indices), 1))
     else:
         places_key = key("places", attempt)
         start_m, goal_m = draw_places(recipe.places, recipe.grid, places_key, indices)
@@ -205,9 +205,10 @@ def complete(
 def _realise(
     layers: Sequence[Layer], values: Maps, below: DrawnMaps, noise: ndarray
 ) -> tuple[ndarray, Maps]:
-    """Return λ [B, H, W] from standard normal noise, and the fields of `TRUTH`.
+    """Return λ from standard normal noise, and the fields of `TRUTH`.
 
-    There are no such fields if no layer changes λ.
+    Returns:
+        λ, shape [B, H, W]; and arrays by field, empty if no layer changes λ.
     """
     truth = latent.truth(below.class_id, below.slope_deg, below.classes)
     truth = affect_layers(layers, truth, values, below)
@@ -230,7 +231,7 @@ def _colour(
 
 
 def _draw(recipe: Recipe, split: str, indices: ndarray, attempt: int) -> Maps:
-    """Return drawn maps, which may be unsolvable; see `complete`."""
+    """Draw maps with the fields of `complete`. The maps may be unsolvable."""
     key = partial(rng.stream_key, recipe.seed, split)
     grid = recipe.grid
     scenario = recipe.scenarios[recipe.splits[split].scenario]

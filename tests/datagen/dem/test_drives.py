@@ -648,7 +648,7 @@ def test_measured_traversability_by_raster_needs_no_classes_either(dem: Path) ->
     assert (maps["traversability"] == 0.25).all()
     with pytest.raises(ConfigError, match="`unlabelled` with `photo`"):
         Rasters(unlabelled=True)
-    with pytest.raises(ConfigError, match="without classes"):
+    with pytest.raises(ConfigError, match="without `classes`"):
         Rasters(unlabelled=True, photo="a.tif", random_classes=True)
 
 
@@ -702,7 +702,7 @@ MOVE = "".join(
         (MOVE, "Begin the file with a line of column names"),
         ("# robot 7\n" + HEAD + MOVE, "Remove lines above the column names"),
         (HEAD.replace("drive", "x_m") + MOVE, "Expected one column `x_m`"),
-        (HEAD + MOVE.replace("1,0.8", "0,0"), "of 31, 31 were commanded less"),
+        (HEAD + MOVE.replace("1,0.8", "0,0"), "of 31 rows, 31 have a commanded speed"),
         (
             HEAD + "0,1,1,fast,1,a\n",
             "`commanded_m_s` to be numbers in .*, got fast in row 1",
@@ -718,7 +718,10 @@ MOVE = "".join(
             HEAD + "0,1,1,1,1,a\n",
             "covers x 500000 to 500096 and y .*got x_m 1 to 1 and y_m 1 to 1 in",
         ),
-        (HEAD + "0,500010,3999910,1,1,a\n", "got none in drives of up to 0 s"),
+        (
+            HEAD + "0,500010,3999910,1,1,a\n",
+            "got no such motion in drives of up to 0 s",
+        ),
         (HEAD + MOVE, "a drive for each of the 3 splits .* got 1 in .*--splits"),
         (
             HEAD + "".join(MOVE.replace("a\n", f"{name}\n") for name in "abc"),
@@ -741,7 +744,7 @@ def test_a_drive_on_the_ground_of_each_split_is_needed(dem: Path) -> None:
     rows = rows[(rows["x"] < 30) | (rows["drive"] == "drive-11")]
     path = log_of(rows, dem.parent / "log.csv")
     with pytest.raises(
-        DatasetError, match="on the terrain of each split, got none for valid in"
+        DatasetError, match="of its own on its terrain, got none for valid in"
     ):
         imported(dem, path)
 
@@ -754,7 +757,8 @@ def test_other_bad_settings_are_refused(dem: Path) -> None:
             Drives(file="log.csv", least_speed=speed)
     rasters = Rasters(photo="p.tif", traversability="t.tif", unlabelled=True)
     with pytest.raises(
-        ConfigError, match="`drives` or from `traversability`, got both"
+        ConfigError,
+        match="either `drives` or `traversability` as the source of λ, got both",
     ):
         imported(dem, Path("log.csv"), rasters=rasters)
     with pytest.raises(ConfigError, match="`classes` with `solvable`"):
@@ -768,7 +772,7 @@ def test_other_bad_settings_are_refused(dem: Path) -> None:
         transform=rasterio.Affine(1e-5, 0, 11, 0, -1e-5, 47),
     )
     with pytest.raises(
-        DatasetError, match=r"as longitude_deg and latitude_deg .* not in metres"
+        DatasetError, match=r"`longitude_deg` and `latitude_deg` .* in metres"
     ):
         imported(degrees, log_of(drives_over(), dem.parent / "log.csv"))
 
@@ -804,7 +808,7 @@ def test_the_command_says_what_was_used_and_what_was_not(
     used = sum(about["used"].values())
     assert f"{used} of {len(rows)} rows of log.csv.gz were used" in said
     for reason, why in (
-        ("slow", "were commanded less than the least speed"),
+        ("slow", "have a commanded speed below `least_speed`"),
         ("between_maps", "lie between the maps"),
         (
             "other_split",
@@ -822,8 +826,12 @@ def test_the_command_says_what_was_used_and_what_was_not(
     assert "have no cell that a drive of their split crossed" in said
     assert "group(s), the statistical unit" in said
     assert 0.95 < about["pace"] < 1.05
-    assert f"positions move {about['pace']:g} times as far as measured_m_s says" in said
-    assert f"and {about['commanded_pace']:g} times as far as commanded_m_s says" in said
+    assert (
+        f"positions move {about['pace']:g} times as far as measured_m_s implies" in said
+    )
+    assert (
+        f"and {about['commanded_pace']:g} times as far as commanded_m_s implies" in said
+    )
     for line in (
         "validate site.h5",
         "show site.h5",

@@ -219,7 +219,7 @@ CASES: list[Case] = [
      lambda log, line: scaled(named_factor(line), "time_s")(log)),
     ("hours", scaled(1 / 3600, "time_s"), "looks like hours",
      lambda log, line: scaled(named_factor(line), "time_s")(log)),
-    ("one time", lambda log: log.assign(time_s=5.0), "got none in drives of up to 0 s", "--speed measured"),
+    ("one time", lambda log: log.assign(time_s=5.0), "got no such motion in drives of up to 0 s", "--speed measured"),
     ("knots", scaled(1 / 0.5144, "measured_m_s"), "looks like knots", "--speed positions"),
     ("knots, mended", scaled(1 / 0.5144, "measured_m_s"), "looks like knots",
      lambda log, line: scaled(named_factor(line), "measured_m_s")(log)),
@@ -235,11 +235,11 @@ CASES: list[Case] = [
      "--speed positions"),
     ("many sentinels", with_value(0.3, -1000.0, "measured_m_s"), "a speed above 15 m/s",
      lambda log, _: log.assign(measured_m_s=log["measured_m_s"].where(log["measured_m_s"] > -999))),
-    ("half the command", scaled(0.5, "commanded_m_s"), "times as far as `commanded_m_s` says, scale it by",
+    ("half the command", scaled(0.5, "commanded_m_s"), "times as far as `commanded_m_s` implies: calibrate",
      lambda log, _: scaled(2, "commanded_m_s")(log)),
-    ("unsigned", unsigned, "Log speed forward over ground, negative backward",
+    ("unsigned", unsigned, "Log the forward speed over ground, negative when",
      lambda log, _: log.assign(measured_m_s=log["measured_m_s"] * np.sign(log["commanded_m_s"]))),
-    ("feet", scaled(3.281, "x_m", "y_m"), "Give x_m and y_m in that CRS",
+    ("feet", scaled(3.281, "x_m", "y_m"), "Log x_m and y_m in that CRS",
      lambda log, _: scaled(1 / 3.281, "x_m", "y_m")(log)),
     ("axes swapped", swapped("x_m", "y_m"), "Swap `x_m` and `y_m`",
      lambda log, _: swapped("x_m", "y_m")(log)),
@@ -350,7 +350,7 @@ def reverses() -> pd.DataFrame:
         (
             reverses(),
             "",
-            r"positions reverse in 1\d\d rows, measured_m_s never does: where .* must be negative",
+            r"positions reverse in 1\d\d rows, but measured_m_s never does: where .* must be negative",
         ),
         (
             reverses(),
@@ -360,7 +360,7 @@ def reverses() -> pd.DataFrame:
         (
             clean_log()[::RATE],
             "--speed positions",
-            "positions come every 1 s, too seldom to distinguish",
+            "positions are logged every 1 s, too rarely to distinguish",
         ),
         (
             few_decimals(clean_log()),
@@ -389,5 +389,5 @@ def test_what_looks_wrong_of_positions_is_printed(
     status, said = run(options, capfd)
     assert status == 0, said
     assert re.search(line, said)
-    doubts = ("reverse in", "looks wrong", "too seldom", "multiples")
+    doubts = ("reverse in", "is unlikely", "too rarely", "multiples")
     assert sum(doubt in said for doubt in doubts) == bool(line)

@@ -315,7 +315,7 @@ def test_a_split_without_maps_is_named_with_the_reason(tmp_path: Path) -> None:
         write(tmp_path / "dem.tif", values), shares={"train": 0.7, "valid": 0.3}
     )
     assert "split 'valid'" in message
-    assert "of 2, 2 have cells without elevation" in message
+    assert "Of 2 candidate maps, 2 have cells without elevation" in message
 
 
 # Errors
@@ -388,7 +388,7 @@ def test_ground_that_gives_no_maps_is_refused(tmp_path: Path) -> None:
     message = refusal(
         write(tmp_path / "gaps.tif", np.full((32, 24), -1, np.int16), nodata=-1)
     )
-    assert "of 2, 2 have cells without elevation." in message
+    assert "Of 2 candidate maps, 2 have cells without elevation." in message
     assert "one band" in refusal(write(tmp_path / "bands.tif", np.stack([FLAT, FLAT])))
     sentinel = FLAT.copy()
     sentinel[3, 3] = -9999
@@ -412,7 +412,9 @@ def test_rasters_that_hold_something_else_are_refused(tmp_path: Path) -> None:
     assert "one band in `classes`" in refusal(dem, classes=bands)
     assert "one band in `traversability`" in refusal(dem, traversability=bands, **ANY)
     afar = write(tmp_path / "afar.tif", np.stack([kinds] * 3), offset=(50, 0))
-    assert "of 1, 1 have cells without colour." in refusal(dem, photo=afar, **ANY)
+    assert "Of 1 candidate maps, 1 have cells without colour." in refusal(
+        dem, photo=afar, **ANY
+    )
 
 
 def test_unknown_classes_are_listed(tmp_path: Path) -> None:

@@ -188,11 +188,11 @@ def test_layers_go_with_their_maps_where_others_are_left_out_and_maps_overlap(
         ("=a.tif", "got ''"),
         (
             "slope_deg=a.tif",
-            "that is not reserved (rgb, class_id, elevation_m, slope_deg,",
+            "other than the reserved names rgb, class_id, elevation_m, slope_deg,",
         ),
-        ("group=a.tif", "that is not reserved (rgb"),
-        ("entry_digests=a.tif", "that is not reserved (rgb"),
-        ("state=a.tif", "that is not reserved (rgb"),
+        ("group=a.tif", "other than the reserved names rgb"),
+        ("entry_digests=a.tif", "other than the reserved names rgb"),
+        ("state=a.tif", "other than the reserved names rgb"),
         ("vegetation_m=a.tif:ft", "`layer` vegetation_m in m, got 'ft'"),
     ],
 )
@@ -238,7 +238,7 @@ def test_a_raster_that_does_not_cover_the_ground_is_refused(tmp_path: Path) -> N
     for raster in (half, elsewhere):
         message = refusal(dem, f"vegetation_m={raster}")
         assert (
-            f"Expected `layer vegetation_m` over all of the terrain, WEST SOUTH EAST NORTH {ours} in EPSG:32654"
+            f"Expected `layer vegetation_m` to cover all of the terrain, WEST SOUTH EAST NORTH {ours} in EPSG:32654"
             in message
         )
         assert raster.name in message
@@ -255,7 +255,7 @@ def test_a_raster_that_does_not_cover_the_ground_is_refused(tmp_path: Path) -> N
         (
             np.full((16, 24), -1.0, np.float32),
             {"nodata": -1},
-            "`layer vegetation_m` with a value on some map, got none in",
+            "value of `layer vegetation_m` in at least one cell of the maps, got only",
         ),
         (
             np.zeros((2, 16, 24), np.float32),

@@ -374,10 +374,10 @@ def test_what_is_there_is_refused_and_replaced_only_where_it_is_an_export(
         (["--splits", "[]"], "`splits` among"),
         (["--fields", "[rbg]"], "`fields` among"),
         (["--maps-per-file", "-1"], "`maps_per_file` ≥ 0"),
-        (["--license", "my own"], "`license` as a name"),
+        (["--license", "my own"], "`license` as an identifier"),
         (
             ["--license", "foo"],
-            "`license` as a name of the SPDX list, such as CC-BY-4.0, or a URL, got 'foo'.",
+            "`license` as an identifier from the SPDX list, such as CC-BY-4.0, or a URL, got 'foo'.",
         ),
         (["--license", "cc-by-4.0"], "got 'cc-by-4.0'. Did you mean 'CC-BY-4.0'?"),
         (["--license", "LicenseRef-mine"], "got 'LicenseRef-mine'"),
@@ -468,7 +468,7 @@ def test_maps_of_others_are_never_ours(
     assert datagen(*changed) == 0
     for half in (OWN[:2], OWN[2:], ()):
         assert datagen("export", "mine.h5", "--out", "theirs", *half) == 2
-        assert "Expected `license` and `creator`" in capsys.readouterr().err
+        assert "Expected both `license` and `creator`" in capsys.readouterr().err
     assert datagen("export", "mine.h5", "--out", "theirs", *OWN) == 0
     assert datagen("export", own, "--out", "ours") == 0
     ours, theirs = (metadata(Path(name)) for name in ("ours", "theirs"))

@@ -165,7 +165,7 @@ def test_a_full_disk_is_named_and_leaves_no_half_file(
 
 def test_an_error_in_a_worker_is_the_runs_error(tmp_path: Path) -> None:
     recipe = replace(tiny_recipe(), stuck_threshold=0.999)
-    with pytest.raises(ConfigError, match="goal can be reached"):
+    with pytest.raises(ConfigError, match="goal that can be reached"):
         for _ in create(recipe, tmp_path / "d.h5", jobs=2):
             pass
     assert not list(tmp_path.iterdir())
@@ -252,11 +252,11 @@ def test_a_folder_that_holds_anything_else_is_left_alone(tmp_path: Path) -> None
     for how in ({}, {"overwrite": True}):
         other = replace(tiny_recipe(), seed=3)
         (folder / "notes.txt").write_text("mine")
-        with pytest.raises(ConfigError, match=r"holds notes\.txt"):
+        with pytest.raises(ConfigError, match=r"contains notes\.txt"):
             make(folder, other, **how)
         (folder / "notes.txt").unlink()
     with pytest.raises(
-        ConfigError, match=r"one recipe and version, got .*\.h5 of another"
+        ConfigError, match=r"and this version, got .*\.h5, which differs"
     ):
         make(folder, replace(tiny_recipe(), seed=3))
     assert {file: file.read_bytes() for file in folder.iterdir()} == before
@@ -264,7 +264,7 @@ def test_a_folder_that_holds_anything_else_is_left_alone(tmp_path: Path) -> None
     assert digests(folder) == digests(
         tiny_dataset(tmp_path / "o.h5", replace(tiny_recipe(), seed=3))
     )
-    with pytest.raises(ConfigError, match="folder, since a shard"):
+    with pytest.raises(ConfigError, match="folder, since `shard`"):
         make(tmp_path / "e.h5", shard=Shard(index=1, of=2))
 
 
@@ -303,7 +303,7 @@ def test_a_finished_folder_is_there_until_what_replaces_it_is_whole(
         pass
     assert digests(path) == digests(tiny_dataset(tmp_path / "o.h5", other)) != before
     assert sorted(item.name for item in tmp_path.iterdir()) == ["d", "o.h5"]
-    with pytest.raises(ConfigError, match="Remove it first"):
+    with pytest.raises(ConfigError, match="Remove the dataset first"):
         make(path, shard=Shard(index=1, of=2), overwrite=True)
     assert find_faults(path) == []
 
@@ -348,7 +348,7 @@ def test_unlike_shares_that_are_made_at_once_are_no_dataset(tmp_path: Path) -> N
     path, recipe = tmp_path / "d", tiny_recipe()
     one, other = begun(path, recipe, 1), begun(path, replace(recipe, seed=3), 2)
     with pytest.raises(
-        ConfigError, match=r"one recipe and version, got .*\.h5 of another"
+        ConfigError, match=r"and this version, got .*\.h5, which differs"
     ):
         finish(one, other)
     assert not (path / "manifest.json").exists()
@@ -439,7 +439,7 @@ def test_what_is_put_into_a_folder_while_it_is_replaced_is_kept(tmp_path: Path) 
     )
     next(steps)
     (path / "notes.txt").write_text("mine")
-    with pytest.raises(ConfigError, match=r"holds notes\.txt"):
+    with pytest.raises(ConfigError, match=r"contains notes\.txt"):
         finish(steps)
     assert (path / "notes.txt").read_text() == "mine"
     assert digests(path) == before

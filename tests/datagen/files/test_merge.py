@@ -158,7 +158,7 @@ def test_a_folder_is_replaced_only_where_it_is_a_dataset(tmp_path: Path) -> None
     out.mkdir()
     (out / "notes.txt").write_text("mine")
     for overwrite in (False, True):
-        with pytest.raises(ConfigError, match=r"holds notes\.txt"):
+        with pytest.raises(ConfigError, match=r"contains notes\.txt"):
             next(merge(parts, out, "both", overwrite))
     assert (out / "notes.txt").read_text() == "mine"
     (out / "notes.txt").unlink()

@@ -228,7 +228,7 @@ class Broken(Plain):
         ("affect", (1.5 * ONES, ONES), "means of `affect` of layer 'plain' in [0, 1], got 1.5"),
         ("affect", (-0.1 * ONES, ONES), "means of `affect` of layer 'plain' in [0, 1], got -0.1"),
         ("affect", (ONES, 0 * ONES), "stds of `affect` of layer 'plain' in [1e-06, 1], got 0"),
-        ("affect", ONES, "mean and std of `affect` of layer 'plain', got ndarray"),
+        ("affect", ONES, "(mean, std) from `affect` of layer 'plain', got ndarray"),
     ],
 )  # fmt: skip
 def test_a_bad_layer_ends_in_one_line(
@@ -255,7 +255,7 @@ def test_a_bad_layer_ends_in_one_line(
         ([{"part": "vegetation", "label": "grass"}], "a layer as NAME or as {part: NAME, options: {…}}"),
         ([{"part": "vegetation", "options": {"period_m": 4, "moss": 1}}], "'moss'"),
         ([{"part": "vegetation", "options": ON_ICE}], "classes of layer 'vegetation' among"),
-        ([{"part": "tests.datagen.layers.own:Plain"}] * 2, "layers of different names, got 'plain' twice"),
+        ([{"part": "tests.datagen.layers.own:Plain"}] * 2, "different names of `layers`, got 'plain' more than once"),
     ],
 )  # fmt: skip
 def test_layers_that_are_none_are_rejected(layers: object, expected: str) -> None:

@@ -120,7 +120,7 @@ def test_a_dataset_is_read_and_driven_on_without_the_code(
     with pytest.raises(ConfigError) as caught:
         generate(dataset.recipe, "train", np.arange(1))
     assert str(caught.value).startswith(
-        "The code of layer 'wetness' is needed to generate maps"
+        "Expected the code of layer 'wetness', to generate maps"
     )
     assert "\n" not in str(caught.value)
 
@@ -135,7 +135,7 @@ def test_other_code_than_was_recorded_is_rejected(
     recipe = TerrainDataset(folder / "one.h5").recipe
     with pytest.raises(
         ConfigError,
-        match="Expected the code of layer 'wetness' that the dataset records",
+        match="Expected the code of layer 'wetness' to have the digest",
     ):
         generate(recipe, "train", np.arange(1))
     # With the code as it was, the maps are made again, bit for bit.
@@ -209,7 +209,7 @@ def test_a_layer_of_this_process_only_is_not_made_in_two(
     monkeypatch.setattr(part_lookup, "_REGISTERED", {})
     registry.register("layer", "mine", Plain)
     recipe = recipe_from_dict(small_stakes().to_dict() | {"layers": ["mine"]}, "test")
-    with pytest.raises(ConfigError, match="one process with layer 'plain'"):
+    with pytest.raises(ConfigError, match="a single process with layer 'plain'"):
         next(create_dataset(recipe, tmp_path / "d.h5", jobs=2))
     assert generate(recipe, "train", np.arange(1))["plain"].shape == (1, 32, 32)
 

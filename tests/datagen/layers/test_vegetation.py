@@ -209,8 +209,8 @@ def test_a_class_may_be_overgrown_altogether_or_by_less_than_a_cell() -> None:
         ("wet_clay", {"cover": 0}, "`cover` of vegetation in (0, 1], got 0"),
         ("wet_clay", {"cover": 1.1}, "`cover` of vegetation in (0, 1], got 1.1"),
         ("wet_clay", {"colour": [0, 0, 256]}, "`colour` of vegetation in 0–255, got (0, 0, 256)"),
-        ("wet_clay", {"colour": [152, 126, 100]}, "on 'wet_clay' of a `colour` that no terrain has in scenario 'std'"),
-        ("packed_soil", {}, "on 'packed_soil' and 'crusted_soil', whose terrain has one colour, got [40, 90"),
+        ("wet_clay", {"colour": [152, 126, 100]}, "on 'wet_clay' to have a `colour` that no terrain has in"),
+        ("packed_soil", {}, "on 'packed_soil' and 'crusted_soil', since their terrain has the same colour, got"),
         ("wet_clay", {"width": 3}, "'width'"),
     ],
 )  # fmt: skip
@@ -232,9 +232,12 @@ def test_what_does_not_grow_is_refused_in_one_line(
 @pytest.mark.parametrize(
     ("period_m", "expected"),
     [
-        (0.9, "of at least two cells, 1 m, where a class has `vegetation`, got 0.9"),
-        (0.0, "of at least two cells"),
-        (float("inf"), "of at least two cells"),
+        (
+            0.9,
+            "to be finite and at least two cells, 1 m, if a class has `vegetation`, got 0.9",
+        ),
+        (0.0, "to be finite and at least two cells"),
+        (float("inf"), "to be finite and at least two cells"),
         ("wide", "Expected `vegetation_period_m` as a number, got 'wide'"),
     ],
 )
@@ -249,7 +252,7 @@ def test_recipes_with_vegetation_say_how_large_its_patches_are(
     bare = small_stakes().to_dict() | {"vegetation_period_m": 4}
     with pytest.raises(
         ConfigError,
-        match="`vegetation_period_m` only with `vegetation` of a class, got 4",
+        match="`vegetation_period_m` only if a class has `vegetation`, got 4",
     ):
         recipe_from_dict(bare, "mine.yaml")
 
@@ -264,7 +267,8 @@ def test_synthesis_1_has_no_vegetation() -> None:
         "colour": [40, 90, 20],
     }
     with pytest.raises(
-        ConfigError, match="`synthesis: 2` with `layer vegetation_m`, got 1"
+        ConfigError,
+        match="`synthesis: 2` with `layer vegetation_m`, got `synthesis: 1`",
     ):
         recipe_from_dict(
             tiny_recipe().to_dict() | {"classes": classes, "vegetation_period_m": 4},

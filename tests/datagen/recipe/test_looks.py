@@ -168,11 +168,11 @@ def test_a_recipe_without_scenarios_has_the_three_of_before() -> None:
         ({"classes": ["gravle"]}, "`classes` of a tint of scenario 'std' among basalt"),
         (
             {"share": 0.995},
-            "as they are in the class table, got 'basalt' and 'wet_clay' in one colour. Lower",
+            "of the class table, got 'basalt' and 'wet_clay' in the same colour. Lower",
         ),
         (
             {"classes": ["packed_soil"]},
-            "got 'packed_soil' and 'crusted_soil' in two colours. Tint both.",
+            "got 'packed_soil' and 'crusted_soil' in different colours. Tint both.",
         ),
         ({"depth": 1}, "'depth'"),
     ],
@@ -202,7 +202,7 @@ def test_a_tint_may_not_give_ground_the_colour_of_vegetation() -> None:
     )
     with pytest.raises(
         ConfigError,
-        match="on 'wet_clay' of a `colour` that no terrain has in scenario 'mud'",
+        match="on 'wet_clay' to have a `colour` that no terrain has in scenario 'mud'",
     ):
         grown(muddy, wet_clay=replace(grass(0.4), colour=(76, 110, 50)))
 

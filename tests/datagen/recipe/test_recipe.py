@@ -101,7 +101,7 @@ def test_severity_moves_from_std_to_the_preset() -> None:
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
-        ({"occupancy": [0.5, 0.2]}, "summing to 1"),
+        ({"occupancy": [0.5, 0.2]}, "that sum to 1"),
         ({"occupancy": [0.5, float("nan")]}, "occupancy"),
         ({"colour": 3}, "colour"),
         ({"splits": {"train": {"scenario": "std", "maps": 0}}}, "maps"),

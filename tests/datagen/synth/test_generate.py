@@ -109,7 +109,7 @@ def test_solvable_maps_have_the_reference_time_of_networkx() -> None:
 
 def test_a_recipe_that_cannot_be_met_says_so() -> None:
     recipe = replace(tiny_recipe(), stuck_threshold=0.999)
-    with pytest.raises(ConfigError, match="goal can be reached"):
+    with pytest.raises(ConfigError, match="goal that can be reached"):
         generate(recipe, "test/std", np.arange(2))
 
 
