@@ -121,7 +121,7 @@ def test_each_option_asks_for_what_it_names(
     assert call("eval", "replay", str(folder), *words) == 2
     labels = ", ".join(f"{name} 'some {name}'" for name in columns)
     assert (
-        f"got {labels}, realisation 3, map 4, seed {seed}." in capsys.readouterr().err
+        f"got {labels}, realisation 3, map 4, seed {seed}, " in capsys.readouterr().err
     )
 
 
@@ -265,13 +265,13 @@ def test_run_says_what_it_recorded_and_how_it_is_replayed(
     [
         (
             ("replay", "RUN", "--video", "a.avi"),
-            "Expected `video` as a file .mp4, got 'a.avi'",
+            "Expected `video` as a .mp4 file, got 'a.avi'",
         ),
         (
             ("replay", "RUN", "--video", "a.mp4", "--web"),
             "Expected `video` or `web`, got both.",
         ),
-        (("replay", "RUN", "--video", "mp4"), "Expected `video` as a file .mp4"),
+        (("replay", "RUN", "--video", "mp4"), "Expected `video` as a .mp4 file"),
         (("replay", "RUN", "--planner", "mpi"), "planner straight, Faulty; "),
         (
             ("run", "--record", "some"),

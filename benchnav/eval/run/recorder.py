@@ -26,14 +26,14 @@ from benchnav.planning.world.simulation import Simulation
 
 
 class Recorder:
-    """Collects plans and known maps of some episodes of a unit.
+    """Collector of the plans and known maps of some episodes of a unit.
 
     Args:
         unit: unit whose episodes are recorded.
         problem: the unit's problem.
         simulation: the unit's simulation, with a λ field that is not resampled.
         terrain: the unit's true maps, with the true λ, which no planner receives.
-        members: indices of the unit's episodes.
+        members: indices of the recorded episodes in the unit.
     """
 
     def __init__(
@@ -53,11 +53,11 @@ class Recorder:
         self._known: dict[int, list[KnownMap]] = {member: [] for member in self._plans}
 
     def watch(self, step: int, plan: Plan, planned: list[int]) -> None:
-        """Store a step's plan; plans after the time that figures show are thinned.
+        """Store the plan of a step; plans after the time that figures show are thinned.
 
         Args:
             step: index of the step.
-            plan: plan of some episodes.
+            plan: plan of the remaining episodes.
             planned: indices of these episodes in the unit.
         """
         is_shown = step * self.problem.dt_s <= MOMENT_S + 1e-6
@@ -71,7 +71,7 @@ class Recorder:
 
     @property
     def observer(self) -> Observer:
-        """Observer that `run_episodes` calls with plans and knowledge."""
+        """Callbacks of this recorder, for `run_episodes`."""
         return Observer(
             plan=self.watch,
             plan_interval=drawing_interval(self.problem.dt_s),
@@ -79,21 +79,21 @@ class Recorder:
         )
 
     def learn(self, step: int, knowing: Knowing) -> None:
-        """Store the robots' knowledge from a step on.
+        """Store the robots' known maps from a step on.
 
         Args:
             step: index of the step.
-            knowing: the knowledge of the batch.
+            knowing: knowledge of the robots of the batch.
         """
         for member, known_map in knowing.maps_of(step, self._known).items():
-            # float16 takes half the memory, and is finer than a file's resolution.
+            # float16 needs half the memory, and is finer than the levels in files.
             halved = {
                 name: getattr(known_map, name).astype(np.float16) for name in NUMBERS
             }
             self._known[member].append(replace(known_map, **halved))
 
     def recording(self, episodes: Episodes, member: int) -> Recording:
-        """Return the recording of one episode."""
+        """Return the recording of an episode, by its index in the unit."""
         steps = int(episodes.steps[member])
         outcome = Outcome(int(episodes.outcome[member]))
         return self.driven(
@@ -112,9 +112,10 @@ class Recorder:
         actions: np.ndarray,
         traversability: np.ndarray,
     ) -> Recording:
-        """Record an episode from its driven states, with the collected plans.
+        """Return the recording of an episode from its driven states.
 
-        Letters in shapes are those of `Recording`.
+        The recording contains the collected plans and known maps. Letters in shapes are
+        those of `Recording`.
 
         Args:
             member: index of the episode in the unit.
@@ -169,7 +170,7 @@ class Recorder:
         )
 
     def _identity(self, member: int, outcome: str) -> dict[str, str]:
-        """Return the text by which a recording identifies its episode."""
+        """Return the columns that identify an episode, with values as text."""
         unit = self.unit
         identity = {"condition": unit.condition.id, **unit.condition.labels}
         identity["seed"] = str(unit.seed)

@@ -1,4 +1,4 @@
-"""Recordings created again from a finished run, and the map that its figures show."""
+"""Recordings created again from a run, and the map that its figures show."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -52,7 +52,7 @@ def find_recording(
 
     Raises:
         ConfigError: If the run has no row of the episode, or its device is missing.
-        BenchnavError: If the unit does not repeat its stored row.
+        BenchnavError: If the repeated episode differs from its stored row.
     """
     out = out or folder
     for parent in (folder, out):
@@ -61,7 +61,7 @@ def find_recording(
             return Recording.load(stored)
     row = _row(folder, unit, unit.maps[member])
     device = device_of_run(open_run(folder).manifest)
-    # Without a time limit of planners, since it changes no action.
+    # No time limit of planners, since it changes no action.
     settings = Settings(device=device.type)
     with one_thread():
         recorder, built = _recorder(unit, settings, [member])
@@ -69,9 +69,9 @@ def find_recording(
     recording = recorder.recording(episodes, member)
     if not _repeats(row, recording):
         raise BenchnavError(
-            f"The repeated episode differs from the stored one: {folder} was made "
-            "with other versions or on "
-            "another machine type. Run the suite again here to replay it."
+            f"The repeated episode differs from the stored one: {folder} was run with "
+            "other versions or on another type of machine. Run the suite again on this "
+            "machine to replay it."
         )
     recording.save(out / unit.recording_path(member))
     return recording
@@ -80,7 +80,7 @@ def find_recording(
 def _recorder(
     unit: Unit, settings: Settings, members: Sequence[int]
 ) -> tuple[Recorder, Built]:
-    """Create the problem and the simulation of a unit again."""
+    """Return a recorder of some episodes of a unit, and the unit's inputs."""
     origin = settings.origins().of(unit)
     device = torch.device(settings.device)
     built = build(unit, origin, device)
@@ -90,7 +90,7 @@ def _recorder(
 
 
 def _row(folder: Path, unit: Unit, map_index: int) -> dict[str, Any]:
-    """Return the row of an episode, also if its run is not finished."""
+    """Return the row of an episode; the run need not be finished."""
     if (folder / EPISODES).exists():
         rows = read_table(folder, EPISODES)
     else:
@@ -106,23 +106,23 @@ def _row(folder: Path, unit: Unit, map_index: int) -> dict[str, Any]:
     matches = _matching(rows, keys)
     if matches.empty:
         raise ConfigError(
-            f"Expected an episode that is finished, got one that {folder} does not "
-            "have yet. Give its `benchnav-eval "
-            "run` command again to finish it, or name another condition."
+            f"Expected a finished episode, got one that {folder} does not have yet. "
+            "Run its `benchnav-eval run` command again to finish it, or select another "
+            "condition."
         )
     return matches.to_dict("records")[0]
 
 
 def _matching(rows: pd.DataFrame, values: Mapping[str, Any]) -> pd.DataFrame:
-    """Return the rows that have these values in the columns of their names."""
+    """Return the rows with the given values, by column."""
     is_equal = rows[list(values)] == pd.Series(values)
     return rows[is_equal.all(axis=1)]
 
 
 def _repeats(row: Mapping[str, Any], recording: Recording) -> bool:
     """Return whether a repeated episode agrees with its row."""
-    ended = np.isclose(row["end_time_s"], recording.end_s, atol=1e-6)
-    if row["outcome"] != recording.about["outcome"] or not ended:
+    is_same_end = np.isclose(row["end_time_s"], recording.end_s, atol=1e-6)
+    if row["outcome"] != recording.about["outcome"] or not is_same_end:
         return False
     if not len(recording.traversability):
         return True
@@ -138,7 +138,7 @@ def record_driven(folder: Path, rows: pd.DataFrame) -> list[Recording]:
 
     Args:
         folder: a finished run that stored steps.
-        rows: episodes of one condition, rows of the run's table.
+        rows: rows of the run's table, all of one condition.
 
     Returns:
         One recording per row.
@@ -155,7 +155,7 @@ def record_driven(folder: Path, rows: pd.DataFrame) -> list[Recording]:
 
 
 def _record_block(run: Run, rows: pd.DataFrame) -> Iterator[Recording]:
-    """Yield recordings of episodes under one seed and realisation."""
+    """Yield recordings of episodes with the same seed and realisation."""
     first = rows.iloc[0]
     condition, _ = run.conditions[first["condition"]]
     maps = tuple(rows["map"].tolist())
@@ -182,8 +182,13 @@ def _record_block(run: Run, rows: pd.DataFrame) -> Iterator[Recording]:
 def _check_unchanged(run: Run, unit: Unit, code_digest: str) -> None:
     """Reject maps or parts that differ from those of a run.
 
+    Args:
+        run: opened run folder.
+        unit: unit whose maps and parts are checked.
+        code_digest: digest of the code of the run's rows.
+
     Raises:
-        BenchnavError: If they differ.
+        BenchnavError: If maps or parts differ.
     """
     condition = unit.condition
     origin = Settings().origins().of(unit)
@@ -191,22 +196,23 @@ def _check_unchanged(run: Run, unit: Unit, code_digest: str) -> None:
     map_digests = tuple(digests[index] for index in unit.maps)
     if origin.maps[1:] != map_digests:
         raise BenchnavError(
-            f"Expected {condition.data} with the maps of {run.folder}, got other maps."
+            f"Expected {condition.data} with the maps of {run.folder}, got different "
+            "maps. Restore the dataset, or run the suite again."
         )
     parts = code_of(run, code_digest)["parts"]
     for part, digest in origin.code["parts"].items():
         if parts.get(part) != digest:
             raise BenchnavError(
-                f"Expected {part} as it was when {run.folder} was run, got a changed "
-                "one."
+                f"Expected {part} with which {run.folder} was run, got a changed one. "
+                "Restore it, or run the suite again."
             )
 
 
-def telling_map(episodes: pd.DataFrame) -> dict[str, Any]:
-    """Choose the map and draw of λ on which conditions differ most in success.
+def most_differing_map(episodes: pd.DataFrame) -> dict[str, Any]:
+    """Choose the map and the draw of λ on which the success of conditions differs most.
 
-    Successes and failures are about equally frequent there. Of equal maps, the one that
-    most conditions were run on is chosen, then the first.
+    The number of successes or of failures, whichever is smaller, is then largest. Ties
+    are decided by the number of conditions, then by the order of the rows.
 
     Args:
         episodes: rows of a run.
@@ -224,8 +230,10 @@ def telling_map(episodes: pd.DataFrame) -> dict[str, Any]:
     return best[MAP].head(1).to_dict("records")[0]
 
 
-def keep_ground(folder: Path) -> None:
-    """Write the map on which outcomes differ most, with its λ field, if steps exist.
+def write_ground(folder: Path) -> None:
+    """Write the map on which outcomes differ most, with its λ field.
+
+    If the run has no steps, nothing is written.
 
     Args:
         folder: a run with a complete table.
@@ -233,7 +241,7 @@ def keep_ground(folder: Path) -> None:
     if not has_steps(folder):
         return
     rows = read_table(folder, EPISODES)
-    map_keys = telling_map(rows)
+    map_keys = most_differing_map(rows)
     first_id = _matching(rows, map_keys)["condition"].iloc[0]
     condition, _ = open_run(folder).conditions[first_id]
     maps = [map_keys["map"]]

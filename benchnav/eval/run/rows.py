@@ -22,15 +22,16 @@ from benchnav.planning.world.world import Endpoints
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Draws:
-    """Reference values of the maps of a batch and of the λ drawn on them.
+    """Reference values of B episodes, from their maps and draws of λ.
 
     Args:
-        reference_time_s: grid reference times at 1 m/s, in seconds, shape [B]; NaN if
-            missing.
-        rejected_draws: number of draws of λ that were rejected before each episode's
-            draw, since they had no feasible path to the goal, length B.
-        lower_bound_s: lower bounds of the time to the goal, in seconds, infinite if no
-            trajectory reaches it, length B; empty if no bound was computed.
+        reference_time_s: grid reference time of each map at 1 m/s, in seconds, shape
+            [B]; NaN if missing.
+        rejected_draws: number of draws of λ that were rejected, since they had no
+            feasible path to the goal, for each episode, length B.
+        lower_bound_s: lower bound of the time to the goal for each episode, in seconds,
+            length B; infinite if no trajectory reaches the goal. Empty if no bound was
+            computed.
     """
 
     reference_time_s: np.ndarray
@@ -46,9 +47,9 @@ def finished_episodes(
     Args:
         problem: the problem of the batch.
         episodes: the episodes of the batch.
-        draws: reference values of their maps and λ.
+        draws: reference values of the episodes.
     """
-    # In the precision of the observed λ, in which planners compare.
+    # The threshold has the precision of observed λ, in which planners compare.
     dtype = episodes.traversability.dtype
     above = torch.tensor(problem.task.rules.free_space.above, dtype=dtype)
     n_episodes = len(episodes.steps)
@@ -87,7 +88,7 @@ def finished_episodes(
 def unbegun_episodes(
     task: Task, endpoints: Endpoints, time_budget_s: Tensor, outcome: Outcome
 ) -> list[Episode]:
-    """Return episodes without a step, for example because their model failed.
+    """Return episodes without steps, for a unit whose model failed.
 
     Args:
         task: task of all episodes.
@@ -132,7 +133,7 @@ def _float64(values: Tensor) -> np.ndarray:
 
 
 def _learning(episodes: Episodes, member: int) -> LearningRecord | None:
-    """Return the record of learning of one episode; None if robots do not learn."""
+    """Return the learning record of an episode; None if robots do not learn."""
     seen_cells = episodes.seen_cells
     sensed_cells = episodes.sensed_cells
     if episodes.ahead is None or seen_cells is None or sensed_cells is None:
@@ -162,7 +163,7 @@ def episode_rows(
         unit: the unit, with its metrics in addition to the built-in ones.
         groups: group index of each map, shape [B].
         finished: episodes of the unit, length B.
-        errors: message of each episode's fault in one line; empty if it had no fault.
+        errors: error of each episode in one line, length B; empty without an error.
         compiled: whether the planner ran compiled.
 
     Returns:
@@ -171,7 +172,7 @@ def episode_rows(
         of the unit's further metrics.
 
     Raises:
-        MetricError: If a metric raises, or returns an infinite number or no number.
+        MetricError: If a metric raises, or returns an infinite value or no number.
     """
     further = [part.create() for part in unit.metrics]
     rows = []
@@ -189,14 +190,14 @@ def episode_rows(
                 f"{unit.condition.description}, seed {unit.seed}, realisation "
                 f"{unit.realisation}, map {map_index}"
             )
-            message = f"{fault} It was given an episode of {origin}."
+            message = f"{fault} The episode is one of {origin}."
             raise MetricError(message) from fault
         rows.append(row)
     return _identities(unit, groups).join(pd.DataFrame(rows))
 
 
 def _identities(unit: Unit, groups: np.ndarray) -> pd.DataFrame:
-    """Return the columns that identify the unit's episodes, one row each."""
+    """Return the columns that identify the episodes of a unit, one row per episode."""
     columns: dict[str, Any] = {"condition": unit.condition.id}
     columns |= unit.condition.labels
     columns["seed"] = unit.seed
@@ -207,7 +208,7 @@ def _identities(unit: Unit, groups: np.ndarray) -> pd.DataFrame:
 
 
 def step_table(unit: Unit, problem: Problem, episodes: Episodes) -> pa.Table:
-    """Tabulate driven paths, one row for each step and one for the last state.
+    """Tabulate the steps of episodes: one row for each step and for the last state.
 
     Args:
         unit: unit that was run.
@@ -216,9 +217,9 @@ def step_table(unit: Unit, problem: Problem, episodes: Episodes) -> pa.Table:
 
     Returns:
         `seed`, `realisation`, `map`, `step`, `time_s`, `x_m`, `y_m`, `heading_rad`; a
-        column for each action; if robots learn, `AHEAD_COLUMNS` (NaN except at
-        updates); and observed `traversability`. Actions and `traversability` are NaN at
-        the last state.
+        column for each action dimension; if robots learn, `AHEAD_COLUMNS` (NaN except
+        at updates); and observed `traversability`. Actions and `traversability` are NaN
+        at the last state.
     """
     step_axis = np.arange(episodes.states.shape[1])
     n_steps = episodes.steps.numpy()[:, None]
@@ -228,7 +229,7 @@ def step_table(unit: Unit, problem: Problem, episodes: Episodes) -> pa.Table:
     n_rows = len(step)
 
     def of_steps(values: Tensor) -> np.ndarray:
-        """Return one value a row, NaN at the last state of each episode."""
+        """Return one value per row; NaN at the last state of each episode."""
         numbers = values.numpy().astype(np.float32)
         padded = np.pad(numbers, ((0, 0), (0, 1)))
         return np.where(is_step, padded, np.float32(np.nan))[is_row]

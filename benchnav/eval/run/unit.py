@@ -1,7 +1,7 @@
 """Running a unit of work: its maps, problem, simulation, episodes and files.
 
-Only the unit's block of maps is read and predicted. A process reuses the prediction for
-all planners and risk settings of the block.
+Only the unit's block of maps is read and predicted. A process reuses the prediction of
+a block for all planners and risk settings.
 """
 
 import traceback
@@ -64,7 +64,8 @@ class Settings:
     """Settings of units.
 
     Args:
-        planner_limit_s: time limit of each call of a planner; 0 for none.
+        planner_limit_s: time limit of each call of a planner in seconds; 0 for no
+            limit.
         device: device of all computation, "cpu" or "cuda".
     """
 
@@ -73,11 +74,11 @@ class Settings:
 
     @classmethod
     def on(cls, device: str, planner_limit_s: float = 0.0) -> "Settings":
-        """Return the settings for "cpu", "cuda", or "auto": CUDA if there is a GPU."""
+        """Return the settings for a device: "cpu", "cuda", or "auto" (CUDA if any)."""
         return cls(planner_limit_s=planner_limit_s, device=find_device(device).type)
 
     def origins(self) -> Origins:
-        """Return the origins of units under these settings."""
+        """Return the current origins of units with these settings."""
         return Origins(self.planner_limit_s, self.device)
 
 
@@ -91,7 +92,7 @@ def run_unit(unit: Unit, folder: Path, origin: Origin, settings: Settings) -> No
         settings: settings of the run.
 
     Raises:
-        ConfigError: If its code or its maps have changed since.
+        ConfigError: If the unit's code or maps have changed since the run was begun.
     """
     _check_origin(unit, origin, settings)
     clear_unit(folder, unit)
@@ -111,7 +112,7 @@ def run_unit(unit: Unit, folder: Path, origin: Origin, settings: Settings) -> No
         observer = recorder.observer if watched else Observer()
         episodes, compiled = simulate(unit, built, settings, observer=observer)
         bounds_s = None
-        if not all(episodes.errors):  # such as those of a planner that was not created
+        if not all(episodes.errors):  # e.g. all fail if the planner cannot be created
             bounds_s = _lower_bounds_s(unit, built)
     succeeded = (episodes.outcome == Outcome.SUCCESS).tolist()
     for member in unit.recorded(succeeded):
@@ -151,20 +152,21 @@ def _check_origin(unit: Unit, origin: Origin, settings: Settings) -> None:
         changed.append(f"maps of {unit.condition.data} {unit.condition.split}")
     if changed or now != origin:
         raise ConfigError(
-            "Expected the code and the maps that the run was begun with, got "
-            f"changes: {'; '.join(changed)}. "
-            "Give the run's command again; finished units are kept."
+            "Expected the code and the maps with which the run was begun, got "
+            f"changes: {'; '.join(changed)}. Run the run's command again; finished "
+            "units are kept."
         )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Block:
-    """A block of maps; compared by identity, so that its prediction can be cached.
+    """A block of B maps; equality is identity, so that a prediction can be cached.
 
     Args:
         terrain: the true maps.
         places: starts, goals and grid reference times.
-        groups: group index of each map, equal for overlapping maps, int64, shape [B].
+        groups: group index of each map, int64, shape [B]; overlapping maps have the
+            same index.
     """
 
     terrain: Terrain
@@ -179,7 +181,7 @@ class Block:
 
 
 def read_maps(dataset: TerrainDataset, split: str, maps: Sequence[int]) -> Block:
-    """Read some maps of a split; without stored groups, each map is a group."""
+    """Read maps of a split; if no groups are stored, each map is a group."""
     places = dataset.read(split, maps, ["start_m", "goal_m", "reference_time_s"])
     groups: Any = maps
     if "group" in dataset.field_names:
@@ -193,7 +195,7 @@ def read_maps(dataset: TerrainDataset, split: str, maps: Sequence[int]) -> Block
 
 
 def read_block(unit: Unit, origin: Origin, device: torch.device = CPU) -> Block:
-    """Return a unit's maps and endpoints on a device, cached for other settings."""
+    """Return a unit's maps and endpoints on a device, cached for later units."""
     condition = unit.condition
     return _block(condition.data, condition.split, unit.maps, origin.maps, device)
 
@@ -218,13 +220,13 @@ def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> Built:
 
     Args:
         unit: unit whose episodes are run.
-        origin: origin of the unit, which cached predictions depend on.
+        origin: origin of the unit; its digests of maps are keys of the cache.
         device: device of all computation.
 
     Raises:
         KnowledgeError: If a sensor, the model, the belief or the risk measure failed.
         DeviceError: If the GPU failed.
-        BenchnavError: If data cannot be read, or are insufficient for the world.
+        BenchnavError: If the maps cannot be read, or lack data that the world needs.
     """
     condition = unit.condition
     block = read_block(unit, origin, device)
@@ -280,7 +282,7 @@ def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> Built:
 
 
 def _learner(condition: Condition, block: Block) -> Learner:
-    """Return the sensing and belief of a unit's robots."""
+    """Return the sensors and the belief of a unit's robots."""
     dataset = condition.dataset
     world = condition.world
     sensor = call(Outcome.SENSOR_ERROR, condition.sensor.create)
@@ -311,31 +313,31 @@ def _learner(condition: Condition, block: Block) -> Learner:
 def _predict(
     model_key: str, block: Block, field: Tensor | None
 ) -> TraversabilityDistribution:
-    """Return the prediction of a block, cached unless the model is given λ."""
+    """Return the prediction of a block, cached unless the model receives λ."""
     model = loaded(model_key)
     if not isinstance(model, Clairvoyant):
         return _prediction(model_key, block)
-    assert field is not None  # suites with resampled λ are rejected
+    assert field is not None  # `check_suite` leaves out resampled λ
     return predict(model, replace(block.terrain, traversability=field))
 
 
 def noise_key(seed: int, split: str, realisation: int) -> int:
-    """Return the simulation's noise key, equal for all conditions.
+    """Return the simulation's noise key, which is the same for all conditions.
 
-    Conditions are thus compared under common random numbers.
+    Conditions are thus compared with common random numbers.
     """
     return rng.stream_key(seed, "simulation", *_draw(split, realisation))
 
 
 def _draw(split: str, realisation: int) -> tuple[str | int, ...]:
-    """Return the stream keys of a draw of λ; realisation 0 adds no key."""
+    """Return the stream keys of a draw of λ: split, and realisation unless it is 0."""
     return (split, realisation) if realisation else (split,)
 
 
 def simulate(
     unit: Unit, built: Built, settings: Settings, **options: Any
 ) -> tuple[Episodes, bool]:
-    """Run a unit's episodes, and return them and whether the planner ran compiled.
+    """Run a unit's episodes; return them, and whether the planner ran compiled.
 
     Args:
         unit: unit whose episodes are run.
@@ -354,7 +356,7 @@ def simulate(
                 planner = condition.planner.create()
         except (Exception, SystemExit) as error:
             planner = _FailedPlanner(error)
-        # Keyed by seed and split, never by the batch.
+        # The key depends on seed and split, not on the batch.
         draw = _draw(condition.split, unit.realisation)
         key = rng.stream_key(unit.seed, "planner", *draw)
         episodes = run_episodes(
@@ -369,9 +371,10 @@ def simulate(
 
 
 def _lower_bounds_s(unit: Unit, built: Built) -> list[float] | None:
-    """Return lower bounds of the time to the goal if the planner is given λ.
+    """Return lower bounds of the time to the goal, in seconds.
 
-    None if the planner is not given λ, or the robot or the world has no such bound.
+    The result is None if the planner is not given λ, or if no bound exists for the
+    robot or the world.
     """
     problem = built.problem
     field = built.simulation.field
@@ -398,7 +401,7 @@ def _lower_bounds_s(unit: Unit, built: Built) -> list[float] | None:
 
 
 class _FailedPlanner(Planner[None]):
-    """Substitute for a planner that could not be created, which raises its error."""
+    """Substitute for a planner that could not be created; it raises the error."""
 
     def __init__(self, error: BaseException) -> None:
         self.error = error
@@ -421,7 +424,7 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-# Caches are keyed by digests, so that changed maps and models are read again.
+# Keys of the caches contain digests, so that changed maps and models are read again.
 
 
 @lru_cache(maxsize=2)

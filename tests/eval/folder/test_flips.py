@@ -156,7 +156,7 @@ def test_missing_files_and_units_of_another_run_are_told(
     assert damage == []
     count = len((run / "SHA256SUMS").read_text().splitlines())
     assert notes == [
-        f"1 of {count} files in SHA256SUMS are missing, the first summary.csv"
+        f"1 of {count} files in SHA256SUMS are missing; the first is summary.csv"
     ]
     shutil.copyfile(second, first)  # a whole file, of another unit
     unit = next(
@@ -178,7 +178,7 @@ def test_steps_that_are_sealed_again_are_not_those_of_the_unit(
     changed = with_metadata(read_sealed(path).slice(1), {"key": metadata(path)["key"]})
     pq.write_table(changed, path)
     damage, _ = verify_run(copy)
-    assert damage == [f"{path.relative_to(copy)}: it holds the steps of another run"]
+    assert damage == [f"{path.relative_to(copy)}: it contains the steps of another run"]
 
 
 def test_a_damaged_viewer_file_is_written_again(run: Path, tmp_path: Path) -> None:

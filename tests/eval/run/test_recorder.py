@@ -311,7 +311,7 @@ def test_what_is_asked_for_is_recorded(
     assert recorded(other) == wanted
     # The same again finds all done.
     run(dataset, other, risks=("mean", "cvar"), **given, say=said.append)
-    assert said[-1] == "4 of 4 units were there already"
+    assert said[-1] == "4 of 4 units were already finished"
 
 
 def test_plans_after_the_moment_of_figures_are_thinned(stakes: Path) -> None:
