@@ -156,10 +156,10 @@ def collect_sheets(
         try:
             for row in _best_and_worst(rows):
                 condition = row["condition"]
-                of_condition = located[located["condition"] == condition]
-                if of_condition.empty:
+                condition_failures = located[located["condition"] == condition]
+                if condition_failures.empty:
                     continue
-                recorded = of_condition.head(_MAX_FAILURES).reset_index(drop=True)
+                recorded = condition_failures.head(_MAX_FAILURES).reset_index(drop=True)
                 recordings = record_driven(recorded)
                 at_ends = [recording.predicted_at_end for recording in recordings]
                 predicted[condition] = np.array(at_ends)

@@ -17,7 +17,7 @@ from benchnav.eval.folder.run_folder import (
     open_run,
     read_table,
 )
-from benchnav.eval.recording import GROUND, Ground
+from benchnav.eval.recording import GROUND, RecordedMap
 
 
 def find_episodes(
@@ -129,7 +129,7 @@ def propose(folder: Path) -> tuple[dict[str, list[str]], dict[str, int]]:
         predicting = [labels for labels in all_labels if labels["risk"] != NOT_USED]
         first, *_ = [*predicting, *all_labels]
         return _as_lists(first), {"map": 0}
-    map_keys = Ground.load(folder / GROUND).about
+    map_keys = RecordedMap.load(folder / GROUND).about
     indices = {name: int(map_keys[name]) for name in ("map", "seed", "realisation")}
     rows = read_table(folder, EPISODES)
     is_on_map = (rows[list(map_keys)] == pd.Series(map_keys)).all(axis=1)

@@ -39,7 +39,7 @@ _DRAW_EVERY_S = 0.5  # time between drawn plans
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ground:
+class RecordedMap:
     """A map with one draw of λ, on which figures show driven paths.
 
     Args:
@@ -100,7 +100,7 @@ class Ground:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Recording(Ground):
+class Recording(RecordedMap):
     """An episode from its start to its end, on its map.
 
     `about` contains all labels of the episode, `condition` and `outcome`, all as text.

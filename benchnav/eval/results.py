@@ -215,7 +215,7 @@ class Results:
         return read_report(self.folder, partial=self._rows.is_partial)
 
     def __repr__(self) -> str:
-        """Return up to four lines: size, success rate, folder and main members."""
+        """Return lines with size, success rate, folder and the main attributes."""
         n_conditions = len(self._rows.conditions)
         n_maps = self._rows.episodes["map"].nunique()
         rate = 100 * self._rows.episodes["success"].mean()

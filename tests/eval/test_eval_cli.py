@@ -154,9 +154,7 @@ def test_a_planner_that_fails_ends_with_status_1(
     arguments = ("run", "--data", str(dataset_path), "--out", str(out), *SMALL[2:-2])
     assert call("eval", *arguments, "--planners", f"[straight,{faulty}]") == 1
     captured = capsys.readouterr()
-    assert (
-        "failed in some episodes (1 planner_error); first error: " in captured.err
-    )
+    assert "failed in some episodes (1 planner_error); first error: " in captured.err
     assert "errors.txt" in captured.err
     assert "straight" in captured.out
 

@@ -196,5 +196,6 @@ def test_without_steps_there_is_no_sheet(tmp_path: Path) -> None:
     sheets, _ = collected(tmp_path, recorded, steps=False)
     assert sheets.shown == ()
     assert (
-        sheets.left_out == "there is no figure of failures, since the run stored no steps"
+        sheets.left_out
+        == "there is no figure of failures, since the run stored no steps"
     )

@@ -240,7 +240,10 @@ def test_a_run_that_is_extended_by_a_metric_runs_its_units_again_and_says_so(
     conditions = set(open_run(folder).conditions)
     after, said = run(dataset_path, folder, record="none", metrics=("energy",))
     assert f"{folder} is extended by metric energy" in said
-    assert "2 of 2 units have no values of new metrics (energy_j) and are run again" in said
+    assert (
+        "2 of 2 units have no values of new metrics (energy_j) and are run again"
+        in said
+    )
     assert set(open_run(folder).conditions) == conditions
     assert list(after.columns) == [*before.columns[:-1], "energy_j", "code"]
     same = [
@@ -256,7 +259,9 @@ def test_a_run_that_is_extended_by_a_metric_runs_its_units_again_and_says_so(
     _, said = run(
         dataset_path, folder, record="none", metrics=(DETOUR,), reuse_code=True
     )
-    assert "2 of 2 units have no values of new metrics (detour) and are run again" in said
+    assert (
+        "2 of 2 units have no values of new metrics (detour) and are run again" in said
+    )
 
 
 def test_other_units_wait_until_they_have_the_metric_too(
@@ -318,7 +323,10 @@ def own_metric(folder: Path, value: str, **attributes: str) -> str:
 @pytest.mark.parametrize(
     ("metrics", "message"),
     [
-        (("score",), "other than the built-in ones, which every run has, got 'score'. Leave it out"),
+        (
+            ("score",),
+            "other than the built-in ones, which every run has, got 'score'. Leave it out",
+        ),
         (("enrgy",), "Did you mean 'energy'"),
         (("energy", "energy:5"), "that differ in name and column"),
         (
@@ -370,7 +378,7 @@ def test_a_metric_that_fails_in_the_run_stops_it_with_a_line_and_units_stay(
     bad = own_metric(tmp_path, "1.0 if episode.time_budget_s > 90 else math.inf")
     with pytest.raises(
         BenchnavError,
-        match=r"from metric 'own', got inf.*given an episode of .*seed 0, .*map 0\.",
+        match=r"from metric 'own', got inf.*The episode is one of .*seed 0, .*map 0\.",
     ):
         run(dataset_path, folder, metrics=(bad,))
     assert not (folder / "episodes.parquet").exists()

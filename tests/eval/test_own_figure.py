@@ -78,10 +78,13 @@ def test_a_suite_names_figures_of_its_report(tmp_path: Path) -> None:
     ("name", "why"),
     [
         ("Broken", "the figure broken is missing: ValueError: no such column"),
-        ("Double", "Expected a figure with a unique name, got 'success'."),
+        (
+            "Double",
+            "Expected a figure with a unique name that can be a file name, got 'success'.",
+        ),
         (
             "Outside",
-            "Expected a figure with a unique name, got '../outside'.",
+            "Expected a figure with a unique name that can be a file name, got '../outside'.",
         ),
     ],
 )

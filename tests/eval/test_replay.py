@@ -13,7 +13,7 @@ from rerun.chunk import RrdReader
 
 from benchnav.eval.find_episodes import propose
 from benchnav.eval.folder.run_folder import open_run
-from benchnav.eval.recording import GROUND, Ground
+from benchnav.eval.recording import GROUND, RecordedMap
 from benchnav.eval.report.playback import video, web
 from benchnav.eval.report.playback.video import frame_times
 from tests.commands import call
@@ -135,12 +135,12 @@ def test_what_is_proposed_are_unlike_outcomes_on_the_map_where_they_differ_most(
             faulty & (rows["map"] == 1) & ((rows["risk"] == "mean") == arrived)
         )
         with pytest.MonkeyPatch.context() as patch:
-            about = {**Ground.load(folder / GROUND).about, "map": 1}
+            about = {**RecordedMap.load(folder / GROUND).about, "map": 1}
             patch.setattr(
                 "benchnav.eval.find_episodes.read_table", lambda *_, own=rows: own
             )
             patch.setattr(
-                Ground, "load", lambda _, own=about: SimpleNamespace(about=own)
+                RecordedMap, "load", lambda _, own=about: SimpleNamespace(about=own)
             )
             labels, place = propose(folder)
         assert (labels["planner"], labels["risk"]) == (["Faulty"], ["mean", "cvar:0.5"])
@@ -163,7 +163,9 @@ def test_what_is_proposed_are_unlike_outcomes_on_the_map_where_they_differ_most(
         patch.setattr(
             "benchnav.eval.find_episodes.read_table", lambda *_, own=rows: own
         )
-        patch.setattr(Ground, "load", lambda _, own=about: SimpleNamespace(about=own))
+        patch.setattr(
+            RecordedMap, "load", lambda _, own=about: SimpleNamespace(about=own)
+        )
         assert propose(folder)[0]["risk"] == ["cvar:0.5", "mean"]
     rows["success"] = True
     with pytest.MonkeyPatch.context() as patch:

@@ -12,7 +12,7 @@ import pandas as pd
 from benchnav.core.errors import BenchnavError
 from benchnav.eval.failures import RecordDriven, Sheets
 from benchnav.eval.folder.steps import STEPS, read_steps
-from benchnav.eval.recording import GROUND, Ground, Recording, read_recordings
+from benchnav.eval.recording import GROUND, RecordedMap, Recording, read_recordings
 
 MAX_PANELS = 4  # maximum number of recordings in a figure
 _EPISODE = ("condition", "seed", "realisation", "map")
@@ -30,7 +30,7 @@ class Driven:
             [N + 1, 2].
     """
 
-    ground: Ground
+    ground: RecordedMap
     rows: pd.DataFrame
     tracks: Sequence[np.ndarray]
 
@@ -123,7 +123,7 @@ def read_driven(folder: Path, episodes: pd.DataFrame) -> Driven | None:
     path = folder / GROUND
     if not path.exists() or not (folder / STEPS).is_dir():
         return None
-    ground = Ground.load(path)
+    ground = RecordedMap.load(path)
     keys = pd.Series(ground.about)
     is_on_map = (episodes[list(ground.about)] == keys).all(axis=1)
     rows = episodes[is_on_map]

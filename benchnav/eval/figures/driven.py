@@ -5,7 +5,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure as Drawing
 
 from benchnav.eval.figures.data import RunData
-from benchnav.eval.recording import Ground
+from benchnav.eval.recording import RecordedMap
 from benchnav.eval.words import (
     NAMING,
     chosen_in_words,
@@ -111,7 +111,7 @@ class DrivenPaths(Figure):
         return figure
 
 
-def _backdrop(ground: Ground) -> np.ndarray:
+def _backdrop(ground: RecordedMap) -> np.ndarray:
     """Return the colours of the map below the paths, in [0, 1], shape [H, W, 3]."""
     if ground.field is None:
         return 0.4 * np.moveaxis(ground.rgb, 0, -1) / 255 + 0.6

@@ -304,8 +304,8 @@ def write_unit(
     """
     key = origin.key(unit)
     recordings = {}
-    for member in range(len(unit.maps)):
-        path = unit.recording_path(member)
+    for episode_index in range(len(unit.maps)):
+        path = unit.recording_path(episode_index)
         digest = digest_of_path(folder / path)
         if digest:
             recordings[path.as_posix()] = digest
@@ -332,9 +332,9 @@ def write_unit(
 def clear_unit(folder: Path, unit: Unit) -> None:
     """Remove the steps and recordings of a unit, but not its rows."""
     (folder / unit.steps_path).unlink(missing_ok=True)
-    for member in range(len(unit.maps)):
+    for episode_index in range(len(unit.maps)):
         for suffix in (".npz", ".rrd"):
-            path = folder / unit.recording_path(member, suffix)
+            path = folder / unit.recording_path(episode_index, suffix)
             path.unlink(missing_ok=True)
 
 

@@ -144,7 +144,7 @@ def _fix_hypotheses(
     try:
         fixed = fix_hypotheses(suite.hypotheses, conditions, all_quantities)
         tests = fixed.get("tests", ())
-    except ConfigError:  # raised again below unless the combination is left out
+    except ConfigError:  # raised again below if it concerns runnable conditions
         tests = ()
     for test in tests:
         sides = (test["one"], test["other"])
@@ -285,7 +285,7 @@ def _check_world(condition: Condition, dataset: TerrainDataset, maps: int) -> li
         if world.noise == "frozen" and start == 0:
             first = torch.tensor([0])
             terrain = block.terrain.select(first)
-            endpoints = block.places.select(first)
+            endpoints = block.endpoints.select(first)
             draw_frozen(terrain, world, endpoints, key=0, maps=[0])
     centre_distance_m = np.linalg.norm(read["goal_m"] - read["start_m"], axis=1)
     distance_m = centre_distance_m - task.rules.goal_radius_m

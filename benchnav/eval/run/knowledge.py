@@ -47,7 +47,7 @@ class Learning:
     field_at: Callable[[int], Tensor] | None = None
 
 
-class Knowing:
+class KnowledgeTracker:
     """Knowledge of the robots of a batch, updated from step to step.
 
     Args:
@@ -64,7 +64,7 @@ class Knowing:
             belief, over the cells ahead of each robot whose λ was not measured. NaN
             without such cells.
         known: knowledge of the remaining episodes.
-        members: indices of the remaining episodes among the B episodes, int64.
+        episode_indices: indices of the remaining episodes among the B episodes, int64.
     """
 
     def __init__(self, learning: Learning, problem: Problem) -> None:
@@ -77,10 +77,10 @@ class Knowing:
         self._at_goal = cells_at_goal(
             problem.grid, problem.goal_m, problem.goal_radius_m
         )
-        self.members = torch.arange(len(problem), device=problem.start.device)
-        self.revisions = torch.zeros_like(self.members)
+        self.episode_indices = torch.arange(len(problem), device=problem.start.device)
+        self.revisions = torch.zeros_like(self.episode_indices)
         self.seen_cells = self.known.seen.flatten(1).sum(1)
-        self.sensed_cells = torch.zeros_like(self.members)
+        self.sensed_cells = torch.zeros_like(self.episode_indices)
         self.ahead: dict[int, Tensor] = {}
 
     def keep(self, indices: Tensor) -> None:
@@ -93,7 +93,7 @@ class Knowing:
         self._problem = self._problem.select(indices)
         self._truth = self._truth.select(indices)
         self._at_goal = self._at_goal[indices]
-        self.members = self.members[indices]
+        self.episode_indices = self.episode_indices[indices]
 
     def is_due(self, step: int) -> bool:
         """Return whether the knowledge is updated at a step."""
@@ -121,7 +121,7 @@ class Knowing:
         # Drawing λ of all cells is slow. Between updates, only a belief that learns
         # needs it.
         if field_at is not None and (due or learner.belief.learns):
-            field = field_at(step)[self.members]
+            field = field_at(step)[self.episode_indices]
             self._truth = replace(self._truth, field=field)
         # An ended episode senses nothing, even while it remains in the batch.
         observing = running if due else torch.zeros_like(running)
@@ -138,11 +138,11 @@ class Knowing:
 
     def _count_cells(self, running: Tensor) -> None:
         """Count the cells that the robots of running episodes have seen and measured."""
-        members = self.members[running]
+        episode_indices = self.episode_indices[running]
         seen = self.known.seen[running]
         sensed = self.known.ever_sensed[running]
-        self.seen_cells[members] = seen.flatten(1).sum(1)
-        self.sensed_cells[members] = sensed.flatten(1).sum(1)
+        self.seen_cells[episode_indices] = seen.flatten(1).sum(1)
+        self.sensed_cells[episode_indices] = sensed.flatten(1).sum(1)
 
     def _updated_problem(self, robot_state: Tensor, running: Tensor) -> Problem | None:
         """Return the problem with new maps where they changed enough; None if nowhere."""
@@ -154,7 +154,7 @@ class Knowing:
         is_updated = has_changed.flatten(1).any(1) & running
         if not bool(is_updated.any()):
             return None
-        self.revisions[self.members[is_updated]] += 1
+        self.revisions[self.episode_indices[is_updated]] += 1
         # The maps of other episodes stay, so that no episode depends on its batch.
         update_mask = is_updated[:, None, None]
         indices = is_updated.nonzero()[:, 0]
@@ -215,7 +215,7 @@ class Knowing:
             sums = values.new_zeros(len(cells), 2).index_add_(0, index, values)
             means = sums / count[:, None]
             rmse = means[:, 0].sqrt()
-            scores[self.members] = torch.stack((rmse, means[:, 1]), 1).float()
+            scores[self.episode_indices] = torch.stack((rmse, means[:, 1]), 1).float()
         self.ahead[step] = scores
 
     def _cells_ahead(self, robot_state: Tensor) -> Tensor:
@@ -232,21 +232,24 @@ class Knowing:
         is_near = torch.hypot(away_x, away_y) <= AHEAD_M
         return is_near & (turn.abs() <= math.radians(AHEAD_DEG))
 
-    def maps_of(self, step: int, members: Iterable[int]) -> dict[int, KnownMap]:
+    def maps_of(self, step: int, episode_indices: Iterable[int]) -> dict[int, KnownMap]:
         """Return the known maps of those given episodes that remain.
 
         Args:
             step: index of the step.
-            members: indices of episodes among the B episodes.
+            episode_indices: indices of episodes among the B episodes.
 
         Returns:
             Known maps by the index of the episode among the B episodes.
         """
-        indices = {member: index for index, member in enumerate(self.members.tolist())}
+        indices = {
+            episode_index: index
+            for index, episode_index in enumerate(self.episode_indices.tolist())
+        }
         return {
-            member: self._known_map(step, indices[member])
-            for member in members
-            if member in indices
+            episode_index: self._known_map(step, indices[episode_index])
+            for episode_index in episode_indices
+            if episode_index in indices
         }
 
     def _known_map(self, step: int, index: int) -> KnownMap:
@@ -257,20 +260,20 @@ class Knowing:
         cells[index] = True
         believed = self._learning.learner.at(knowledge, cells)
 
-        def of_episode(values: Tensor) -> np.ndarray:
+        def as_array(values: Tensor) -> np.ndarray:
             return values[index].cpu().numpy()
 
-        def on_grid(values: Tensor) -> np.ndarray:
+        def as_grid(values: Tensor) -> np.ndarray:
             return values.reshape(grid.shape).float().cpu().numpy()
 
-        footprint = of_episode(knowledge.footprint)
+        footprint = as_array(knowledge.footprint)
         return KnownMap(
             step=step,
-            predicted=of_episode(knowledge.risk_map),
-            free=of_episode(knowledge.free | self._at_goal),
-            mean=on_grid(believed.mean()),
-            spread=on_grid(believed.spread()),
-            seen=of_episode(knowledge.seen),
-            sensed=of_episode(knowledge.ever_sensed),
+            predicted=as_array(knowledge.risk_map),
+            free=as_array(knowledge.free | self._at_goal),
+            mean=as_grid(believed.mean()),
+            spread=as_grid(believed.spread()),
+            seen=as_array(knowledge.seen),
+            sensed=as_array(knowledge.ever_sensed),
             outline=footprint_outline(footprint, grid.resolution_m),
         )

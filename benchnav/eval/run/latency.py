@@ -83,8 +83,8 @@ def _measure(
     with one_thread():
         try:
             origin = settings.origins().of(unit)
-            built = build(unit, origin, torch.device(settings.device))
-            episodes, _ = simulate(unit, built, settings, stop=stop)
+            inputs = build(unit, origin, torch.device(settings.device))
+            episodes, _ = simulate(unit, inputs, settings, stop=stop)
         except Exception:  # The rows of the condition report the error.
             return None
     times_ms = 1e3 * episodes.planning_s[1:].numpy()

@@ -23,11 +23,11 @@ from benchnav.eval.folder.run_folder import (
     unit_rows,
 )
 from benchnav.eval.folder.steps import LAST_COLUMN, has_steps, read_steps
-from benchnav.eval.recording import GROUND, MAP, Ground, Recording
+from benchnav.eval.recording import GROUND, MAP, RecordedMap, Recording
 from benchnav.eval.run.recorder import Recorder
 from benchnav.eval.run.unit import (
-    Built,
     Settings,
+    UnitInputs,
     build,
     noise_key,
     one_thread,
@@ -40,14 +40,14 @@ from benchnav.planning.world.simulation import Simulation
 
 
 def find_recording(
-    folder: Path, unit: Unit, member: int, out: Path | None = None
+    folder: Path, unit: Unit, episode_index: int, out: Path | None = None
 ) -> Recording:
     """Return the recording of an episode; run its unit again if necessary.
 
     Args:
         folder: a run in which the unit is finished.
         unit: unit of the episode.
-        member: index of the episode in the unit.
+        episode_index: index of the episode in the unit.
         out: folder to which a new recording is written; if None, the run folder.
 
     Raises:
@@ -56,37 +56,39 @@ def find_recording(
     """
     out = out or folder
     for parent in (folder, out):
-        stored = parent / unit.recording_path(member)
+        stored = parent / unit.recording_path(episode_index)
         if stored.exists():
             return Recording.load(stored)
-    row = _row(folder, unit, unit.maps[member])
+    row = _row(folder, unit, unit.maps[episode_index])
     device = device_of_run(open_run(folder).manifest)
     # No time limit of planners, since it changes no action.
     settings = Settings(device=device.type)
     with one_thread():
-        recorder, built = _recorder(unit, settings, [member])
-        episodes, _ = simulate(unit, built, settings, observer=recorder.observer)
-    recording = recorder.recording(episodes, member)
+        recorder, inputs = _recorder(unit, settings, [episode_index])
+        episodes, _ = simulate(unit, inputs, settings, observer=recorder.observer)
+    recording = recorder.recording(episodes, episode_index)
     if not _repeats(row, recording):
         raise BenchnavError(
             f"The repeated episode differs from the stored one: {folder} was run with "
             "other versions or on another type of machine. Run the suite again on this "
             "machine to replay it."
         )
-    recording.save(out / unit.recording_path(member))
+    recording.save(out / unit.recording_path(episode_index))
     return recording
 
 
 def _recorder(
-    unit: Unit, settings: Settings, members: Sequence[int]
-) -> tuple[Recorder, Built]:
+    unit: Unit, settings: Settings, episode_indices: Sequence[int]
+) -> tuple[Recorder, UnitInputs]:
     """Return a recorder of some episodes of a unit, and the unit's inputs."""
     origin = settings.origins().of(unit)
     device = torch.device(settings.device)
-    built = build(unit, origin, device)
+    inputs = build(unit, origin, device)
     terrain = read_block(unit, origin, device).terrain
-    recorder = Recorder(unit, built.problem, built.simulation, terrain, members)
-    return recorder, built
+    recorder = Recorder(
+        unit, inputs.problem, inputs.simulation, terrain, episode_indices
+    )
+    return recorder, inputs
 
 
 def _row(folder: Path, unit: Unit, map_index: int) -> dict[str, Any]:
@@ -171,12 +173,12 @@ def _record_block(run: Run, rows: pd.DataFrame) -> Iterator[Recording]:
     driven = steps_table.groupby("map")
     commands = list(recorder.problem.robot.action_names)
     outcomes = zip(maps, rows["outcome"], strict=True)
-    for member, (map_index, outcome) in enumerate(outcomes):
+    for episode_index, (map_index, outcome) in enumerate(outcomes):
         steps = driven.get_group(map_index)
         states = steps[["x_m", "y_m", "heading_rad"]].to_numpy()
         actions = steps[commands].to_numpy()[:-1]
         traversability = steps[LAST_COLUMN].to_numpy()[:-1]
-        yield recorder.driven(member, outcome, states, actions, traversability)
+        yield recorder.driven(episode_index, outcome, states, actions, traversability)
 
 
 def _check_unchanged(run: Run, unit: Unit, code_digest: str) -> None:
@@ -248,18 +250,18 @@ def write_ground(folder: Path) -> None:
     block = read_maps(condition.dataset, condition.split, maps)
     noise = noise_key(map_keys["seed"], condition.split, map_keys["realisation"])
     simulation = Simulation(
-        block.terrain, condition.task, condition.world, block.places, noise, maps
+        block.terrain, condition.task, condition.world, block.endpoints, noise, maps
     )
     field = None
     if simulation.field is not None:
         field = simulation.field[0].cpu().numpy()
-    ground = Ground(
+    ground = RecordedMap(
         about=map_keys,
         resolution_m=block.terrain.grid.resolution_m,
         rgb=block.terrain.rgb[0].cpu().numpy(),
         field=field,
         immobilising=simulation.immobilising[0].cpu().numpy(),
-        goal_m=block.places.goal_m[0].cpu().numpy(),
+        goal_m=block.endpoints.goal_m[0].cpu().numpy(),
     )
     path = folder / GROUND
     ground.save(path)

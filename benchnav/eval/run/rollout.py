@@ -20,7 +20,7 @@ from torch import Tensor
 from benchnav.core.device import GPU_FAULTS, DeviceError, gpu_failed
 from benchnav.core.errors import BenchnavError, out_of_memory
 from benchnav.core.settings import fault
-from benchnav.eval.run.knowledge import Knowing, Learning
+from benchnav.eval.run.knowledge import KnowledgeTracker, Learning
 from benchnav.planning.objective import distance
 from benchnav.planning.planners.boundary import (
     Answer,
@@ -55,7 +55,7 @@ class Observer:
 
     plan: Callable[[int, Plan, list[int]], None] | None = None
     plan_interval: int = 1
-    knowledge: Callable[[int, Knowing], None] | None = None
+    knowledge: Callable[[int, KnowledgeTracker], None] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +88,7 @@ class Episodes:
         sensed_cells: number of cells whose λ each robot measured, int64, shape [B];
             None if robots do not learn.
         ahead: RMSE of E[λ] and mean log score over the cells ahead of the robot, as in
-            `Knowing.ahead`, shape [B, N, 2]; NaN at steps without an update. None if
+            `KnowledgeTracker.ahead`, shape [B, N, 2]; NaN at steps without an update. None if
             robots do not learn.
     """
 
@@ -197,7 +197,7 @@ class _Log:
         self.states.append(after.state)
 
     def episodes(
-        self, now: SimulationState, traceback_: str, knowing: Knowing | None
+        self, now: SimulationState, traceback_: str, tracker: KnowledgeTracker | None
     ) -> Episodes:
         """Return the episodes; `now` is the last state of the simulation."""
         track = torch.stack(self.states, dim=1)
@@ -212,13 +212,13 @@ class _Log:
         reasons = [*self._reasons, ""]  # index -1 selects the empty reason
         errors = [reasons[index] for index in self._reason_index.tolist()]
         learning: dict[str, Any] = {}
-        if knowing is None:
+        if tracker is None:
             learning["revisions"] = torch.zeros_like(now.step).cpu()
         else:
-            learning["revisions"] = knowing.revisions.cpu()
-            learning["seen_cells"] = knowing.seen_cells.cpu()
-            learning["sensed_cells"] = knowing.sensed_cells.cpu()
-            learning["ahead"] = _by_step(knowing.ahead, len(track), n_steps)
+            learning["revisions"] = tracker.revisions.cpu()
+            learning["seen_cells"] = tracker.seen_cells.cpu()
+            learning["sensed_cells"] = tracker.sensed_cells.cpu()
+            learning["ahead"] = _by_step(tracker.ahead, len(track), n_steps)
         return Episodes(
             states=track.cpu(),
             actions=actions.cpu(),
@@ -284,7 +284,7 @@ def run_episodes(
     observed = torch.full_like(now.state[:, 0], torch.nan)
     check_interval = 1 if observed.device.type == "cpu" else _CHECK_INTERVAL
     traceback_ = ""
-    knowing = None if learning is None else Knowing(learning, problem)
+    tracker = None if learning is None else KnowledgeTracker(learning, problem)
     try:
         with log.clock.timed():
             plan_state = begin(planner, problem, generator)
@@ -297,18 +297,18 @@ def run_episodes(
                 if not bool(running.any()):
                     break
                 remaining = batch.drop_ended(running)
-                if knowing is not None and remaining is not None:
-                    knowing.keep(remaining)
+                if tracker is not None and remaining is not None:
+                    tracker.keep(remaining)
             revised_problem = None
-            if knowing is not None:
+            if tracker is not None:
                 state = batch.part_of(now.state)
                 running_part = batch.part_of(now.running)
                 with log.learning.timed():
-                    revised_problem = knowing.learn(count, state, running_part)
-                if knowing.is_due(count):
-                    knowing.look_ahead(count, state, running_part)
+                    revised_problem = tracker.learn(count, state, running_part)
+                if tracker.is_due(count):
+                    tracker.look_ahead(count, state, running_part)
                     if observer.knowledge is not None:
-                        observer.knowledge(count, knowing)
+                        observer.knowledge(count, tracker)
             watched = observer.plan is not None and count % observer.plan_interval == 0
             step = Step(
                 state=now.state,
@@ -320,9 +320,9 @@ def run_episodes(
                 if revised_problem is not None:
                     batch.revise(revised_problem, generator)
                 answer = batch.act(step)
-            log.planned.append(len(batch.members))
+            log.planned.append(len(batch.episode_indices))
             if watched and observer.plan is not None:
-                observer.plan(count, answer.plan, batch.members.tolist())
+                observer.plan(count, answer.plan, batch.episode_indices.tolist())
             action, faulty, status = batch.spread(answer)
             log.record_error(now.running & faulty, answer.reason)
             now = end(now, faulty, Outcome.PLANNER_ERROR)
@@ -344,7 +344,7 @@ def run_episodes(
             else Outcome.PLANNER_ERROR
         )
         now = end(now, now.running, outcome)
-    return log.episodes(now, traceback_, knowing)
+    return log.episodes(now, traceback_, tracker)
 
 
 class _Batch:
@@ -356,18 +356,18 @@ class _Batch:
         plan_state: plan state that `begin` returned.
 
     Attributes:
-        members: indices of the planned episodes among all, int64 on the CPU.
+        episode_indices: indices of the planned episodes among all, int64 on the CPU.
     """
 
     def __init__(
         self, planner: Planner[Any], problem: Problem, plan_state: Any
     ) -> None:
-        self.members = torch.arange(len(problem))
+        self.episode_indices = torch.arange(len(problem))
         self._planner = planner
         self._all = problem
         self._part = problem
         self._state = plan_state
-        self._index = self.members.to(problem.start.device)
+        self._index = self.episode_indices.to(problem.start.device)
 
     def drop_ended(self, running: Tensor) -> Tensor | None:
         """Remove ended episodes if at least a quarter has ended.
@@ -381,16 +381,16 @@ class _Batch:
             Indices of the remaining episodes among those planned so far, int64; None if
             no episode was removed.
         """
-        remaining = running[self.members].nonzero()[:, 0]
-        if len(remaining) > _MAX_REMAINING * len(self.members):
+        remaining = running[self.episode_indices].nonzero()[:, 0]
+        if len(remaining) > _MAX_REMAINING * len(self.episode_indices):
             return None
         indices = remaining.to(self._index.device)
         state = self._planner.select(self._state, indices)
         if state is NotImplemented:
             return None
         self._state = state
-        self.members = self.members[remaining]
-        self._index = self.members.to(self._index.device)
+        self.episode_indices = self.episode_indices[remaining]
+        self._index = self.episode_indices.to(self._index.device)
         self._part = self._part.select(indices)
         return indices
 

@@ -21,7 +21,7 @@ from benchnav.planning.world.world import Endpoints
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Draws:
+class References:
     """Reference values of B episodes, from their maps and draws of λ.
 
     Args:
@@ -40,14 +40,14 @@ class Draws:
 
 
 def finished_episodes(
-    problem: Problem, episodes: Episodes, draws: Draws
+    problem: Problem, episodes: Episodes, references: References
 ) -> list[Episode]:
     """Return each episode of a batch as metrics receive it.
 
     Args:
         problem: the problem of the batch.
         episodes: the episodes of the batch.
-        draws: reference values of the episodes.
+        references: reference values of the episodes.
     """
     # The threshold has the precision of observed λ, in which planners compare.
     dtype = episodes.traversability.dtype
@@ -59,7 +59,9 @@ def finished_episodes(
     for b in range(n_episodes):
         steps = int(episodes.steps[b])
         outcome = Outcome(int(episodes.outcome[b]))
-        lower_bound_s = draws.lower_bound_s[b] if len(draws.lower_bound_s) else np.nan
+        lower_bound_s = (
+            references.lower_bound_s[b] if len(references.lower_bound_s) else np.nan
+        )
         episode = Episode(
             states=_float64(episodes.states[b, : steps + 1]),
             actions=_float64(episodes.actions[b, :steps]),
@@ -70,7 +72,7 @@ def finished_episodes(
             outcome=outcome.name.lower(),
             dt_s=problem.dt_s,
             time_budget_s=float(problem.time_budget_s[b]),
-            reference_time_s=float(draws.reference_time_s[b]),
+            reference_time_s=float(references.reference_time_s[b]),
             goal_m=_float64(problem.goal_m[b]),
             goal_radius_m=problem.goal_radius_m,
             stuck_traversability=float(above),
@@ -78,7 +80,7 @@ def finished_episodes(
             planning_s=_float64(planning_s[:steps]),
             preparing_s=preparing_s,
             learning=_learning(episodes, b),
-            rejected_draws=draws.rejected_draws[b],
+            rejected_draws=references.rejected_draws[b],
             lower_bound_s=lower_bound_s,
         )
         finished.append(episode)
@@ -132,20 +134,20 @@ def _float64(values: Tensor) -> np.ndarray:
     return np.array(values.cpu().double().numpy())
 
 
-def _learning(episodes: Episodes, member: int) -> LearningRecord | None:
+def _learning(episodes: Episodes, episode_index: int) -> LearningRecord | None:
     """Return the learning record of an episode; None if robots do not learn."""
     seen_cells = episodes.seen_cells
     sensed_cells = episodes.sensed_cells
     if episodes.ahead is None or seen_cells is None or sensed_cells is None:
         return None
-    steps = int(episodes.steps[member])
+    steps = int(episodes.steps[episode_index])
     n_planned = int(episodes.planned.sum())
     step_s = episodes.learning_s / n_planned if n_planned else np.nan
     return LearningRecord(
-        revisions=int(episodes.revisions[member]),
-        seen_cells=int(seen_cells[member]),
-        sensed_cells=int(sensed_cells[member]),
-        ahead=_float64(episodes.ahead[member, :steps]),
+        revisions=int(episodes.revisions[episode_index]),
+        seen_cells=int(seen_cells[episode_index]),
+        sensed_cells=int(sensed_cells[episode_index]),
+        ahead=_float64(episodes.ahead[episode_index, :steps]),
         step_s=step_s,
     )
 
@@ -228,7 +230,7 @@ def step_table(unit: Unit, problem: Problem, episodes: Episodes) -> pa.Table:
     step = np.broadcast_to(step_axis, is_row.shape)[is_row]
     n_rows = len(step)
 
-    def of_steps(values: Tensor) -> np.ndarray:
+    def step_values(values: Tensor) -> np.ndarray:
         """Return one value per row; NaN at the last state of each episode."""
         numbers = values.numpy().astype(np.float32)
         padded = np.pad(numbers, ((0, 0), (0, 1)))
@@ -244,9 +246,9 @@ def step_table(unit: Unit, problem: Problem, episodes: Episodes) -> pa.Table:
         numbers = episodes.states[..., index].numpy()
         columns[name] = numbers.astype(np.float32)[is_row]
     for index, name in enumerate(problem.robot.action_names):
-        columns[name] = of_steps(episodes.actions[..., index])
+        columns[name] = step_values(episodes.actions[..., index])
     if episodes.ahead is not None:
         for index, name in enumerate(AHEAD_COLUMNS):
-            columns[name] = of_steps(episodes.ahead[..., index])
-    columns[LAST_COLUMN] = of_steps(episodes.traversability)
+            columns[name] = step_values(episodes.ahead[..., index])
+    columns[LAST_COLUMN] = step_values(episodes.traversability)
     return pa.table(columns)

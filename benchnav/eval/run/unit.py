@@ -34,7 +34,7 @@ from benchnav.eval.run.knowledge import Learning
 from benchnav.eval.run.recorder import Recorder
 from benchnav.eval.run.rollout import Episodes, Observer, run_episodes
 from benchnav.eval.run.rows import (
-    Draws,
+    References,
     episode_rows,
     finished_episodes,
     step_table,
@@ -100,34 +100,34 @@ def run_unit(unit: Unit, folder: Path, origin: Origin, settings: Settings) -> No
     with one_thread():
         block = read_block(unit, origin, device)
         try:
-            built = build(unit, origin, device)
+            inputs = build(unit, origin, device)
         except KnowledgeError as error:
             rows = _failed_rows(unit, block, error)
             write_unit(folder, unit, origin, rows, [str(error)], traceback.format_exc())
             return
-        problem = built.problem
-        simulation = built.simulation
+        problem = inputs.problem
+        simulation = inputs.simulation
         watched = unit.watched()
         recorder = Recorder(unit, problem, simulation, block.terrain, watched)
         observer = recorder.observer if watched else Observer()
-        episodes, compiled = simulate(unit, built, settings, observer=observer)
+        episodes, compiled = simulate(unit, inputs, settings, observer=observer)
         bounds_s = None
         if not all(episodes.errors):  # e.g. all fail if the planner cannot be created
-            bounds_s = _lower_bounds_s(unit, built)
+            bounds_s = _lower_bounds_s(unit, inputs)
     succeeded = (episodes.outcome == Outcome.SUCCESS).tolist()
-    for member in unit.recorded(succeeded):
-        recording = recorder.recording(episodes, member)
-        recording.save(folder / unit.recording_path(member))
+    for episode_index in unit.recorded(succeeded):
+        recording = recorder.recording(episodes, episode_index)
+        recording.save(folder / unit.recording_path(episode_index))
     if unit.record != "none":
         steps = step_table(unit, problem, episodes)
         write_steps(folder, unit, origin.key(unit), steps)
     rejected = simulation.attempts - 1
-    draws = Draws(
-        reference_time_s=block.places.reference_time_s.cpu().numpy(),
+    references = References(
+        reference_time_s=block.endpoints.reference_time_s.cpu().numpy(),
         rejected_draws=rejected.tolist(),
         lower_bound_s=bounds_s or (),
     )
-    finished = finished_episodes(problem, episodes, draws)
+    finished = finished_episodes(problem, episodes, references)
     rows = episode_rows(unit, block.groups, finished, episodes.errors, compiled)
     errors = sorted({error for error in episodes.errors if error})
     write_unit(folder, unit, origin, rows, errors, episodes.traceback)
@@ -137,9 +137,9 @@ def _failed_rows(unit: Unit, block: "Block", error: KnowledgeError) -> pd.DataFr
     """Return the rows of a unit whose model, sensor or belief failed at the start."""
     task = unit.condition.task
     budgets_s = unit.condition.world.budget_s(
-        block.places.reference_time_s, task.robot.top_speed_mps
+        block.endpoints.reference_time_s, task.robot.top_speed_mps
     )
-    unbegun = unbegun_episodes(task, block.places, budgets_s, error.outcome)
+    unbegun = unbegun_episodes(task, block.endpoints, budgets_s, error.outcome)
     errors = [str(error)] * len(unbegun)
     return episode_rows(unit, block.groups, unbegun, errors, compiled=False)
 
@@ -164,32 +164,32 @@ class Block:
 
     Args:
         terrain: the true maps.
-        places: starts, goals and grid reference times.
+        endpoints: starts, goals and grid reference times.
         groups: group index of each map, int64, shape [B]; overlapping maps have the
             same index.
     """
 
     terrain: Terrain
-    places: Endpoints
+    endpoints: Endpoints
     groups: np.ndarray
 
     def to(self, device: torch.device) -> "Block":
         """Return the block on a device."""
         return replace(
-            self, terrain=self.terrain.to(device), places=self.places.to(device)
+            self, terrain=self.terrain.to(device), endpoints=self.endpoints.to(device)
         )
 
 
 def read_maps(dataset: TerrainDataset, split: str, maps: Sequence[int]) -> Block:
     """Read maps of a split; if no groups are stored, each map is a group."""
-    places = dataset.read(split, maps, ["start_m", "goal_m", "reference_time_s"])
+    endpoints = dataset.read(split, maps, ["start_m", "goal_m", "reference_time_s"])
     groups: Any = maps
     if "group" in dataset.field_names:
         groups = dataset.read(split, maps, ["group"])["group"]
-    tensors = {name: torch.from_numpy(values) for name, values in places.items()}
+    tensors = {name: torch.from_numpy(values) for name, values in endpoints.items()}
     return Block(
         terrain=dataset.terrain(split, maps),
-        places=Endpoints(**tensors),
+        endpoints=Endpoints(**tensors),
         groups=np.asarray(groups, dtype=np.int64).reshape(-1),
     )
 
@@ -201,7 +201,7 @@ def read_block(unit: Unit, origin: Origin, device: torch.device = CPU) -> Block:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Built:
+class UnitInputs:
     """Inputs of a unit's episodes.
 
     Args:
@@ -215,7 +215,7 @@ class Built:
     learning: Learning | None
 
 
-def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> Built:
+def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> UnitInputs:
     """Create the problem, the simulation and the initial knowledge of a unit.
 
     Args:
@@ -233,10 +233,10 @@ def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> Built:
     task = condition.task
     noise = noise_key(unit.seed, condition.split, unit.realisation)
     simulation = Simulation(
-        block.terrain, task, condition.world, block.places, noise, unit.maps
+        block.terrain, task, condition.world, block.endpoints, noise, unit.maps
     )
-    start_m = block.places.start_m
-    goal_m = block.places.goal_m
+    start_m = block.endpoints.start_m
+    goal_m = block.endpoints.goal_m
     try:
         learner = _learner(condition, block)
         field = block.terrain.traversability
@@ -270,7 +270,7 @@ def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> Built:
     except GPU_FAULTS as error:
         raise gpu_failed(error) from error
     if not condition.learns:
-        return Built(problem=problem, simulation=simulation, learning=None)
+        return UnitInputs(problem=problem, simulation=simulation, learning=None)
     is_resampled = simulation.field is None
     learning = Learning(
         learner=learner,
@@ -278,7 +278,7 @@ def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> Built:
         truth=truth,
         field_at=simulation.field_at if is_resampled else None,
     )
-    return Built(problem=problem, simulation=simulation, learning=learning)
+    return UnitInputs(problem=problem, simulation=simulation, learning=learning)
 
 
 def _learner(condition: Condition, block: Block) -> Learner:
@@ -335,13 +335,13 @@ def _draw(split: str, realisation: int) -> tuple[str | int, ...]:
 
 
 def simulate(
-    unit: Unit, built: Built, settings: Settings, **options: Any
+    unit: Unit, inputs: UnitInputs, settings: Settings, **options: Any
 ) -> tuple[Episodes, bool]:
     """Run a unit's episodes; return them, and whether the planner ran compiled.
 
     Args:
         unit: unit whose episodes are run.
-        built: inputs of its episodes.
+        inputs: inputs of its episodes.
         settings: settings with the time limit of planners.
         **options: further arguments of `run_episodes`.
     """
@@ -361,23 +361,23 @@ def simulate(
         key = rng.stream_key(unit.seed, "planner", *draw)
         episodes = run_episodes(
             planner,
-            built.problem,
-            built.simulation,
+            inputs.problem,
+            inputs.simulation,
             rng.generator(key),
-            learning=built.learning,
+            learning=inputs.learning,
             **options,
         )
     return episodes, bool(planner.compiled)
 
 
-def _lower_bounds_s(unit: Unit, built: Built) -> list[float] | None:
+def _lower_bounds_s(unit: Unit, inputs: UnitInputs) -> list[float] | None:
     """Return lower bounds of the time to the goal, in seconds.
 
     The result is None if the planner is not given λ, or if no bound exists for the
     robot or the world.
     """
-    problem = built.problem
-    field = built.simulation.field
+    problem = inputs.problem
+    field = inputs.simulation.field
     condition = unit.condition
     has_bound = field is not None and type(problem.robot) in BOUNDED_ROBOTS
     if not has_bound or condition.model.part != "clairvoyant":

@@ -282,7 +282,7 @@ def test_the_legend_names_what_the_ground_has(
 
 def test_the_legend_names_layers_that_are_there() -> None:
     names = names_in_legend(draw_trajectories([recording()]))
-    below = ["not free", "driven; above in the colour of the observed λ"]
+    below = ["not free", "driven path; in the top row, its colour is the observed λ"]
     assert set(names) == {
         "samples",
         "reference path",

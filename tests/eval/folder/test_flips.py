@@ -25,7 +25,7 @@ from benchnav.eval.folder.run_folder import (
 from benchnav.eval.folder.sealed import metadata, read_sealed, with_metadata
 from benchnav.eval.folder.steps import read_steps
 from benchnav.eval.folder.verify import verify_run
-from benchnav.eval.recording import GROUND, Ground, Recording
+from benchnav.eval.recording import GROUND, RecordedMap, Recording
 from benchnav.eval.report.playback.viewer_file import write_viewer_files
 from benchnav.eval.run.runner import run_suite
 from tests.commands import call
@@ -65,7 +65,7 @@ def everything(folder: Path) -> Iterator[Any]:
     for path in sorted((folder / "playback").glob("*.npz")):
         recording = Recording.load(path)
         yield recording.states, recording.predicted, recording.about
-    ground = Ground.load(folder / GROUND)
+    ground = RecordedMap.load(folder / GROUND)
     yield ground.rgb, ground.field
 
 

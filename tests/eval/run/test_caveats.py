@@ -281,7 +281,7 @@ def test_a_hypothesis_on_what_is_left_out_is_refused(
     )  # fmt: skip
     if words:
         with pytest.raises(
-            ConfigError, match=f"names one that cannot be run: .*{words}"
+            ConfigError, match=f"in which one condition cannot be run: .*{words}"
         ):
             check_suite(suite, elsewhere=False)
     else:

@@ -216,7 +216,7 @@ def test_a_shard_without_units_is_not_needed(suite: Suite, tmp_path: Path) -> No
     full = [folder for folder in folders if (folder / "units").exists()]
     assert len(full) == 1
     (line,) = [one for one in said if "measuring" not in one]
-    assert line.endswith(" holds none of the 1 units")
+    assert line.endswith(" contains none of the 1 units")
     assert len(said) == 2
     list(merge_shards(full, tmp_path / "all"))
     assert len(pd.read_parquet(tmp_path / "all" / "episodes.parquet")) == 2
@@ -339,7 +339,7 @@ def test_a_merge_that_is_killed_leaves_nothing_and_can_be_given_again(
 
 def test_a_folder_that_is_there_is_not_merged_into(parts: list[Path]) -> None:
     before = sorted(parts[0].rglob("*"))
-    with pytest.raises(ConfigError, match="the new folder as OUT"):
+    with pytest.raises(ConfigError, match="a new folder as OUT"):
         list(merge_shards(parts[1:], parts[0]))
     assert sorted(parts[0].rglob("*")) == before
 

@@ -19,9 +19,9 @@ from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.failures import failures_table
 from benchnav.eval.folder.run_folder import open_run, read_table, write_run
 from benchnav.eval.folder.steps import read_steps
-from benchnav.eval.recording import GROUND, Ground, Recording
+from benchnav.eval.recording import GROUND, RecordedMap, Recording
 from benchnav.eval.report.write import write_report
-from benchnav.eval.run.recordings import write_ground, record_driven, most_differing_map
+from benchnav.eval.run.recordings import most_differing_map, record_driven, write_ground
 from benchnav.eval.run.runner import run_suite
 from benchnav.eval.run.unit import Settings, build
 from tests.eval.forged import forge_rows
@@ -46,8 +46,10 @@ def test_the_map_that_is_kept_is_the_telling_one_with_λ_as_robots_met_it(
     dataset: Path, tmp_path: Path
 ) -> None:
     folder = run(dataset, tmp_path / "run", planners=PLANNERS, risks=("mean",))
-    kept = Ground.load(folder / GROUND)
-    assert dict(kept.about) == most_differing_map(pd.read_parquet(folder / "episodes.parquet"))
+    kept = RecordedMap.load(folder / GROUND)
+    assert dict(kept.about) == most_differing_map(
+        pd.read_parquet(folder / "episodes.parquet")
+    )
     same = on_map(folder, kept.about)
     assert len(same) == 2
     for recording in same:
@@ -78,7 +80,7 @@ def test_whichever_map_is_telling_is_kept_under_its_own_noise(
         arrived = ~here | (rows["planner"] == "straight")
         forge_rows(folder, rows.assign(outcome=np.where(arrived, "success", "timeout")))
         write_ground(folder)
-        kept = Ground.load(folder / GROUND)
+        kept = RecordedMap.load(folder / GROUND)
         asked = {"seed": seed, "realisation": realisation, "map": map_index}
         assert {name: kept.about[name] for name in asked} == asked
         same = on_map(folder, kept.about)
@@ -209,7 +211,8 @@ def test_the_report_shows_failures_and_says_what_the_planner_was_told(
     assert (failed / "figures" / "failures.png").stat().st_size > 5000
     assert "![failures](figures/failures.png)" in (failed / "summary.md").read_text()
     assert any(
-        "the predicted λ̂ was " in said for said in next(iter(report.findings.values()))
+        "these episodes ended, λ̂ was " in said
+        for said in next(iter(report.findings.values()))
     )
     assert report.warnings == () or "No sheet" not in report.warnings[-1]
 

@@ -204,7 +204,7 @@ def test_files_that_a_part_imports_or_is_named_are_seen_by_extension_resumption_
     next(steps)
     weights.write_text("3.0")
     with pytest.raises(
-        ConfigError, match=r"that the run was begun with, got changes: weights\.txt of"
+        ConfigError, match=r"with which the run was begun, got changes: weights\.txt of"
     ):
         list(steps)
     del sys.modules["helper_of_mine"]
@@ -250,7 +250,7 @@ def test_all_that_is_no_longer_there_is_told_before_anything_is_run(
     (tmp_path / "tiny.h5").unlink()
     with pytest.raises(
         ConfigError,
-        match=r"all inputs of .*run, got missing ones: .*dataset.*tiny\.h5.*mine\.py",
+        match=r"all inputs of .*run, but some are missing: .*dataset.*tiny\.h5.*mine\.py",
     ):
         repeat(run, tmp_path / "again")
     assert not (tmp_path / "again").exists()

@@ -11,7 +11,7 @@ from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.run.rollout import Episodes
 from benchnav.eval.run.rows import (
-    Draws,
+    References,
     episode_rows,
     finished_episodes,
     step_table,
@@ -97,7 +97,9 @@ def rows(
     own: Unit | None = None,
     reference_time_s: tuple[float, float] = (0.1, 20.0),
 ) -> pd.DataFrame:
-    draws = Draws(reference_time_s=np.array(reference_time_s), rejected_draws=[0, 3])
+    draws = References(
+        reference_time_s=np.array(reference_time_s), rejected_draws=[0, 3]
+    )
     finished = finished_episodes(problem, episodes, draws)
     return episode_rows(own or unit(), GROUPS, finished, episodes.errors, compiled=True)
 

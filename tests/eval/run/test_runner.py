@@ -93,7 +93,7 @@ def unused(suite: Suite, folder: Path, **options: object) -> str:
     said: list[str] = []
     rows = finish(suite, folder, say=said.append, **options)
     count = rows["condition"].nunique()
-    assert not any("were there already" in line for line in said)
+    assert not any("already finished" in line for line in said)
     (line,) = [line for line in said if "are run again" in line]
     begun = f"{count} of {count} units were run with other code or maps ("
     assert line.startswith(begun)
@@ -381,7 +381,7 @@ def test_code_that_changes_while_a_run_goes_on_makes_no_table(
     next(steps)
     mine.write_text(mine.read_text() + "# edited\n")
     with pytest.raises(
-        ConfigError, match=r"that the run was begun with, got changes: .*mine\.py"
+        ConfigError, match=r"with which the run was begun, got changes: .*mine\.py"
     ):
         list(steps)
     assert not (tmp_path / "run" / "episodes.parquet").exists()
@@ -471,7 +471,7 @@ def test_a_table_does_not_stay_beside_newer_units_than_it_holds(
     list(run_suite(narrow, tmp_path / "run", say=said.append))
     assert not (tmp_path / "run" / EPISODES).exists()
     assert "1 of 2 conditions" in said[-1]
-    assert "(1 of their units are of other code or maps)" in said[-1]
+    assert "(1 of their units were run with other code or maps)" in said[-1]
     # The units of the old code are still there and count again with it.
     monkeypatch.undo()
     list(run_suite(narrow, tmp_path / "run"))
@@ -620,13 +620,18 @@ def test_units_of_other_code_are_taken_when_asked_for_and_marked(
     assert codes[0] == first["code"].iloc[0] != codes[5]
     about = open_run(folder).manifest
     assert set(about["codes"]) == set(codes.values())
-    line = f"1 of 2 units were run with other code (planner {mine}:Mine); the column `code` identifies the code of each row"
+    line = (
+        f"1 of 2 units were run with other code (planner {mine}:Mine); the column "
+        "`code` identifies the code of each row"
+    )
     assert about["reused"] == line
     report = write_report(folder)
     assert f"warning: {line}" in report.warnings
     # Rows of other code are compared with none of this code, unless that is asked for.
     finish(replace(suite, seeds=(0, 5), risks=("cvar",)), folder, reuse_code=True)
-    with pytest.raises(ConfigError, match="got conditions that were run with different code"):
+    with pytest.raises(
+        ConfigError, match="got conditions that were run with different code"
+    ):
         compare_runs([folder], "risk", "", {}, 0.05)
     # Without it the unit is run anew, and nothing is marked.
     finish(replace(suite, seeds=(0, 5)), folder)
@@ -861,7 +866,7 @@ def test_a_run_that_lacks_maps_tells_how_they_are_made(tmp_path: Path) -> None:
         name: replace(recipe.splits[name], maps=2) for name in ("test/std", "test/hg")
     }
     path = factories.tiny_dataset(tmp_path / "few.h5", replace(recipe, splits=few))
-    made = "All maps of tiny-v1 are made with `benchnav-datagen create tiny-v1`"
+    made = "Create all maps of tiny-v1 by `benchnav-datagen create tiny-v1`"
     for changes, told in (
         ({"maps": 3}, True),
         ({"maps": 5}, False),

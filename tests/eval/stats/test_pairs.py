@@ -258,7 +258,7 @@ def test_worlds_are_paired_where_the_same_λ_is_drawn() -> None:
         {"noise": "stored"},
         {"immobile": {"below": 0.2, "for_s": 2.0}},
     ):
-        with pytest.raises(ConfigError, match="λ itself differs between their worlds"):
+        with pytest.raises(ConfigError, match="Their worlds draw different λ"):
             find_pairs([world("stakes"), world("other", **other)], by="world")
     resampled = [
         world("paper", noise="resampled"),

@@ -223,7 +223,7 @@ class Frames:
 
     def _put_robot(self, panel: Axes, index: int, step: int) -> None:
         several = len(self._recordings) > 1
-        label = "driven path, in the colour of its title" if several else "driven path"
+        label = "driven, in the colour of its title" if several else "driven"
         drive = moment.drive_at(self._recordings[index], step)
         look = {"colour": self._colours[index], "ls": line_style(index)}
         drives.draw_drive(panel, drive, 1.8, label=label, **look)
