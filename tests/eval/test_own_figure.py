@@ -116,7 +116,7 @@ def test_what_is_no_figure_is_an_error_before_anything_runs_or_is_written(
     assert "to be a subclass of benchnav.viz.Figure, got Own" in capsys.readouterr().err
     assert not (folder / "report.html").exists()
     with pytest.raises(ConfigError, match=r"subclass of benchnav\.viz\.Figure"):
-        check_suite(Suite(figures=(part,)), elsewhere=False)
+        check_suite(Suite(figures=(part,)), uses_workers=False)
 
 
 def test_shipped_figures_have_names_and_needs_and_are_listed_in_order(

@@ -71,7 +71,7 @@ class Unit:
         realisation: index of the draw of λ.
         maps: indices of maps of the condition's split, all of one block.
         record: data that are stored in addition to rows; see `Suite`.
-        leads: whether this is the first unit of its condition.
+        is_first_unit: whether this is the first unit of its condition.
         metrics: metrics in addition to the built-in ones.
     """
 
@@ -80,7 +80,7 @@ class Unit:
     realisation: int
     maps: tuple[int, ...]
     record: Record = "none"
-    leads: bool = False
+    is_first_unit: bool = False
     metrics: tuple[Part, ...] = ()
 
     @property
@@ -133,7 +133,7 @@ class Unit:
         stem = "-".join(cleaned)
         return Path("playback", f"{stem}{suffix}")
 
-    def watched(self) -> list[int]:
+    def possibly_recorded(self) -> list[int]:
         """Return the indices of the episodes that are recorded if all of them fail."""
         return self.recorded([False] * len(self.maps))
 
@@ -146,7 +146,7 @@ class Unit:
         indices = range(len(self.maps))
         if self.record == "all":
             return list(indices)
-        first = {0} if self.leads else set()
+        first = {0} if self.is_first_unit else set()
         if self.record == "first":
             return list(first)
         if self.record == "failures":
@@ -234,7 +234,7 @@ def _blocks(
     condition: Condition, extent: Extent, record: Record, metrics: tuple[Part, ...]
 ) -> Iterator[Unit]:
     """Yield the units of a condition: one for each draw of λ and block of maps."""
-    leads = True
+    is_first_unit = True
     for seed, realisation, maps in extent.draws:
         for start in range(0, maps, BLOCK_MAPS):
             end = min(start + BLOCK_MAPS, maps)
@@ -244,7 +244,7 @@ def _blocks(
                 realisation=realisation,
                 maps=tuple(range(start, end)),
                 record=record,
-                leads=leads,
+                is_first_unit=is_first_unit,
                 metrics=metrics,
             )
-            leads = False
+            is_first_unit = False

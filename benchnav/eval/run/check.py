@@ -64,12 +64,12 @@ class Checked:
         return caveats(vars(self))
 
 
-def check_suite(suite: Suite, elsewhere: bool) -> Checked:
+def check_suite(suite: Suite, uses_workers: bool) -> Checked:
     """Build the conditions of a suite, and reject a suite that cannot be run.
 
     Args:
         suite: suite, as a user wrote it.
-        elsewhere: whether other processes also create the parts.
+        uses_workers: whether other processes also create the parts.
 
     Raises:
         ConfigError: If a part, scenario or map is missing, no combination can be run,
@@ -102,7 +102,7 @@ def check_suite(suite: Suite, elsewhere: bool) -> Checked:
     robots = {condition.robot.label: condition.task.robot for condition in runnable}
     metrics = read_metrics(suite.metrics, robots.values())
     all_quantities = quantities(metric.quantity for metric in metrics)
-    if elsewhere:
+    if uses_workers:
         check_everywhere(runnable, metrics)
     conditions_by_id = {}
     for condition in conditions:

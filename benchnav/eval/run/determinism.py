@@ -55,7 +55,7 @@ def check_determinism(
         BenchnavError: If the suite cannot be run.
     """
     settings = Settings.on(device, planner_limit_s)
-    checked = check_suite(suite, elsewhere=True)
+    checked = check_suite(suite, uses_workers=True)
     metrics = [metric.part for metric in checked.metrics]
     chosen = []
     for name, condition in checked.conditions.items():

@@ -56,7 +56,7 @@ class Recorder:
             episode_index: [] for episode_index in self._plans
         }
 
-    def watch(self, step: int, plan: Plan, planned: list[int]) -> None:
+    def store_plan(self, step: int, plan: Plan, planned: list[int]) -> None:
         """Store the plan of a step; plans after the time that figures show are thinned.
 
         Args:
@@ -77,12 +77,12 @@ class Recorder:
     def observer(self) -> Observer:
         """Callbacks of this recorder, for `run_episodes`."""
         return Observer(
-            plan=self.watch,
+            plan=self.store_plan,
             plan_interval=drawing_interval(self.problem.dt_s),
-            knowledge=self.learn,
+            knowledge=self.store_knowledge,
         )
 
-    def learn(self, step: int, tracker: KnowledgeTracker) -> None:
+    def store_knowledge(self, step: int, tracker: KnowledgeTracker) -> None:
         """Store the robots' known maps from a step on.
 
         Args:
@@ -100,7 +100,7 @@ class Recorder:
         """Return the recording of an episode, by its index in the unit."""
         steps = int(episodes.steps[episode_index])
         outcome = Outcome(int(episodes.outcome[episode_index]))
-        return self.driven(
+        return self.recording_from_states(
             episode_index,
             outcome.name.lower(),
             episodes.states[episode_index, : steps + 1].numpy(),
@@ -108,7 +108,7 @@ class Recorder:
             episodes.traversability[episode_index, :steps].numpy(),
         )
 
-    def driven(
+    def recording_from_states(
         self,
         episode_index: int,
         outcome: str,

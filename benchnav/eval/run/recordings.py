@@ -178,7 +178,9 @@ def _record_block(run: Run, rows: pd.DataFrame) -> Iterator[Recording]:
         states = steps[["x_m", "y_m", "heading_rad"]].to_numpy()
         actions = steps[commands].to_numpy()[:-1]
         traversability = steps[LAST_COLUMN].to_numpy()[:-1]
-        yield recorder.driven(episode_index, outcome, states, actions, traversability)
+        yield recorder.recording_from_states(
+            episode_index, outcome, states, actions, traversability
+        )
 
 
 def _check_unchanged(run: Run, unit: Unit, code_digest: str) -> None:

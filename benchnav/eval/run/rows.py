@@ -87,7 +87,7 @@ def finished_episodes(
     return finished
 
 
-def unbegun_episodes(
+def episodes_without_steps(
     task: Task, endpoints: Endpoints, time_budget_s: Tensor, outcome: Outcome
 ) -> list[Episode]:
     """Return episodes without steps, for a unit whose model failed.
@@ -103,7 +103,7 @@ def unbegun_episodes(
     starts = robot.initial_state(poses)
     no_steps = np.empty(0)
     no_actions = np.empty((0, len(robot.action_names)))
-    unbegun = []
+    episodes = []
     for start, goal_m, budget_s in zip(
         starts, endpoints.goal_m, time_budget_s, strict=True
     ):
@@ -125,8 +125,8 @@ def unbegun_episodes(
             planning_s=no_steps,
             preparing_s=np.nan,
         )
-        unbegun.append(episode)
-    return unbegun
+        episodes.append(episode)
+    return episodes
 
 
 def _float64(values: Tensor) -> np.ndarray:

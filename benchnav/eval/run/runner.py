@@ -85,8 +85,8 @@ def run_suite(
         BenchnavError: If the cluster cannot be reached, or the connection is lost.
     """
     with sole_writer(folder, str(folder)):
-        elsewhere = jobs != 1 or settings.planner_limit_s > 0
-        checked = check_suite(suite, elsewhere)
+        uses_workers = jobs != 1 or settings.planner_limit_s > 0
+        checked = check_suite(suite, uses_workers)
         for line in checked.caveats:
             say(line)
         work = Work(
@@ -123,8 +123,8 @@ def run_work(
         shard_units = [unit for unit in all_units if unit.shard(of) == work.shard]
     named, others = _split_units(shard_units, requested)
     origins = work.settings.origins()
-    is_here = not scheduler
-    missing = _units_to_run(named, origins, folder, work.reuse_code, say, is_here)
+    is_local = not scheduler
+    missing = _units_to_run(named, origins, folder, work.reuse_code, say, is_local)
     if not shard_units:
         say(f"shard {work.shard} contains none of the {len(all_units)} units")
     run: Any = partial(_run_into, folder.resolve())
@@ -134,7 +134,7 @@ def run_work(
     for unit, origin in missing:
         calls.append(partial(run, unit, origin, work.settings))
     missing_units = [unit for unit, _ in missing]
-    steps = _Steps(named, missing_units, in_turn=jobs == 1 and is_here)
+    steps = _Steps(named, missing_units, in_turn=jobs == 1 and is_local)
     if named:
         yield steps.progress()
     for unit, files in run_calls(calls, jobs, scheduler):
@@ -162,7 +162,7 @@ def run_work(
         ordered = in_table_order(shard_units, conditions)
         finished, reused = _finished(ordered, origins, folder, work.reuse_code)
     if not work.reuse_code:
-        _check_steady([finished_unit for _, finished_unit in finished], is_here)
+        _check_unchanged([finished_unit for _, finished_unit in finished], is_local)
     if work.shard is not None:
         write_errors(folder, finished)
         note_checksums(folder, [folder / ERRORS])
@@ -269,7 +269,7 @@ def _units_to_run(
     folder: Path,
     reuse_code: bool,
     say: Say,
-    is_here: bool,
+    is_local: bool,
 ) -> list[tuple[Unit, Origin]]:
     """Return the units to run: unfinished, damaged, changed or unrecorded ones.
 
@@ -280,7 +280,7 @@ def _units_to_run(
         reuse_code: whether to accept units that were run with other code.
         say: function that receives the number of units that are run again, with
             reasons.
-        is_here: whether units run on this machine. If so, the contents that parts have
+        is_local: whether units run on this machine. If so, the contents that parts have
             read are compared with the files of this machine.
     """
     missing: list[tuple[Unit, Origin]] = []
@@ -291,7 +291,7 @@ def _units_to_run(
         finished_units = find_units(folder, unit)
         finished = _valid_file(finished_units, unit, origin, reuse_code)
         reason, lines = _why_missing(folder, unit, origin, finished_units, finished)
-        if not reason and is_here and not reuse_code and finished:
+        if not reason and is_local and not reuse_code and finished:
             lines = changes_since(finished.metadata.get(TOUCHED, {}))
             reason = "changed" if lines else ""
         if not reason and finished and not finished.has(unit):
@@ -386,7 +386,7 @@ def _differences(finished: Finished, origin: Origin) -> list[str]:
     return lines
 
 
-def _check_steady(finished: list[Finished], is_here: bool) -> None:
+def _check_unchanged(finished: list[Finished], is_local: bool) -> None:
     """Reject units whose parts read different contents of a file, package or variable.
 
     Raises:
@@ -398,7 +398,7 @@ def _check_steady(finished: list[Finished], is_here: bool) -> None:
         touched = finished_unit.metadata.get(TOUCHED, {})
         changed |= dict.fromkeys(unlike(seen, touched))
         seen |= touched
-    if is_here:
+    if is_local:
         changed |= dict.fromkeys(changes_since(seen))
     if changed:
         raise ConfigError(

@@ -36,9 +36,9 @@ from benchnav.eval.run.rollout import Episodes, Observer, run_episodes
 from benchnav.eval.run.rows import (
     References,
     episode_rows,
+    episodes_without_steps,
     finished_episodes,
     step_table,
-    unbegun_episodes,
 )
 from benchnav.models.base import predict
 from benchnav.models.predictor import Clairvoyant, loaded, nugget_of
@@ -107,9 +107,9 @@ def run_unit(unit: Unit, folder: Path, origin: Origin, settings: Settings) -> No
             return
         problem = inputs.problem
         simulation = inputs.simulation
-        watched = unit.watched()
-        recorder = Recorder(unit, problem, simulation, block.terrain, watched)
-        observer = recorder.observer if watched else Observer()
+        recordable = unit.possibly_recorded()
+        recorder = Recorder(unit, problem, simulation, block.terrain, recordable)
+        observer = recorder.observer if recordable else Observer()
         episodes, compiled = simulate(unit, inputs, settings, observer=observer)
         bounds_s = None
         if not all(episodes.errors):  # e.g. all fail if the planner cannot be created
@@ -139,9 +139,9 @@ def _failed_rows(unit: Unit, block: "Block", error: KnowledgeError) -> pd.DataFr
     budgets_s = unit.condition.world.budget_s(
         block.endpoints.reference_time_s, task.robot.top_speed_mps
     )
-    unbegun = unbegun_episodes(task, block.endpoints, budgets_s, error.outcome)
-    errors = [str(error)] * len(unbegun)
-    return episode_rows(unit, block.groups, unbegun, errors, compiled=False)
+    episodes = episodes_without_steps(task, block.endpoints, budgets_s, error.outcome)
+    errors = [str(error)] * len(episodes)
+    return episode_rows(unit, block.groups, episodes, errors, compiled=False)
 
 
 def _check_origin(unit: Unit, origin: Origin, settings: Settings) -> None:

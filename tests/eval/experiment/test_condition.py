@@ -619,7 +619,7 @@ def test_labels_of_what_robots_know_by_are_one_each() -> None:
     check_labels([probe, far, one()])
     with pytest.raises(ConfigError, match="two settings with the label 'probe'"):
         check_labels([probe, replace(far, ground=replace(far.ground, label="probe"))])
-    with pytest.raises(ConfigError, match="for one ground, got 'mine' and 'probe'"):
+    with pytest.raises(ConfigError, match="for each ground, got 'mine' and 'probe'"):
         check_labels(
             [probe, replace(probe, ground=replace(probe.ground, label="mine"))]
         )

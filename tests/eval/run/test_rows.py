@@ -13,9 +13,9 @@ from benchnav.eval.run.rollout import Episodes
 from benchnav.eval.run.rows import (
     References,
     episode_rows,
+    episodes_without_steps,
     finished_episodes,
     step_table,
-    unbegun_episodes,
 )
 from benchnav.metrics.base import Episode, Metric, MetricError
 from benchnav.metrics.shipped import SHIPPED
@@ -167,7 +167,7 @@ def test_rows_of_a_failed_model_have_the_columns_of_all_rows() -> None:
     problem, episodes = made()
     table, places = rows(problem, episodes), factories.places(torch.full((2, 2), 5.0))
     task, budget_s = problem.task, torch.tensor([50.0, 60.0])
-    unbegun = unbegun_episodes(task, places, budget_s, Outcome.MODEL_ERROR)
+    unbegun = episodes_without_steps(task, places, budget_s, Outcome.MODEL_ERROR)
     failed = episode_rows(
         unit(), GROUPS, unbegun, ["ValueError: no idea"] * 2, compiled=False
     )

@@ -218,9 +218,9 @@ def test_runs_that_share_conditions_are_compared_with_each_other() -> None:
         (
             {"risk": "mean", "planner": "cl_rrt"},
             {},
-            r"They differ in planner \(cl_rrt, mppi\): try `--by planner`",
+            r"They differ in planner \(cl_rrt, mppi\). Try `--by planner`",
         ),
-        ({}, {"by": "scenario"}, "other maps"),
+        ({}, {"by": "scenario"}, "data and scenario determine the maps"),
         ({}, {"by": "planer"}, "Did you mean 'planner'"),
         ({}, {"against": "meen"}, "Did you mean 'mean'"),
         ({}, {"by": "risk", "against": "mppi"}, "Expected `against` among mean, cvar"),
@@ -363,7 +363,7 @@ def test_what_robots_know_by_is_compared_one_thing_at_a_time() -> None:
         assert pair.members[0].labels[by] != label
     with pytest.raises(
         ConfigError,
-        match=r"They differ in .*belief \(copula, static\): try `--by belief`",
+        match=r"They differ in .*belief \(copula, static\). Try `--by belief`",
     ):
         find_pairs([learning("contact"), compared("mppi")], "risk")
 
