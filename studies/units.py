@@ -12,7 +12,7 @@ from benchnav.eval import Suite
 from benchnav.eval.experiment.condition import conditions_of
 from benchnav.eval.experiment.unit import Extent, Unit, units
 from benchnav.eval.run.rollout import Episodes
-from benchnav.eval.run.unit import Built, Settings, build, simulate
+from benchnav.eval.run.unit import Settings, UnitInputs, build, simulate
 from benchnav.planning import Prediction, Problem, Task, pose_problem
 from benchnav.planning.free_space import Immobile
 from benchnav.planning.world.outcome import Outcome
@@ -40,7 +40,7 @@ def one_unit(suite: Suite, maps: int) -> Unit:
     )[0]
 
 
-def build_unit(unit: Unit) -> Built:
+def build_unit(unit: Unit) -> UnitInputs:
     """Build the problem and the simulation of a unit."""
     return build(unit, Settings().origins().of(unit))
 
@@ -88,7 +88,7 @@ def seconds_of(episodes: Episodes, dt_s: float) -> np.ndarray:
     return np.where(has_arrived, episodes.steps.double().numpy() * dt_s, np.inf)
 
 
-def drive_unit(unit: Unit) -> tuple[np.ndarray, Built]:
+def drive_unit(unit: Unit) -> tuple[np.ndarray, UnitInputs]:
     """Run a unit; return seconds to the goal [B], infinite if not reached, and the unit."""
     built = build_unit(unit)
     episodes, _ = simulate(unit, built, Settings())

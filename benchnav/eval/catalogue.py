@@ -36,8 +36,8 @@ TITLES = {
 }
 HELP = (
     "Custom parts are named package.module:Name or path/to/file.py:Name. "
-    "NAME:VALUE sets the first option, "
-    "{part: NAME, label: LABEL, options: {...}} sets any."
+    "NAME:VALUE sets a part's first option, "
+    "{part: NAME, label: LABEL, options: {...}} sets any options."
 )
 
 
@@ -46,8 +46,8 @@ class Entry(NamedTuple):
 
     Args:
         name: name in a suite.
-        purpose: one line.
-        options: options, each `name: type = default`.
+        purpose: purpose in one line.
+        options: options, each as `name: type = default`.
     """
 
     name: str
@@ -56,13 +56,13 @@ class Entry(NamedTuple):
 
 
 def print_catalogue(*kinds: str) -> None:
-    """Print the catalogue, as tables in a terminal and as plain lines elsewhere.
+    """Print the catalogue: tables if stdout is a terminal, otherwise plain lines.
 
     Args:
-        kinds: keys of `TITLES`; by default all.
+        kinds: keys of `TITLES`; without any, all kinds are printed.
 
     Raises:
-        ConfigError: If there is no such kind.
+        ConfigError: If a kind is not in `TITLES`.
     """
     chosen = [kind for kind in kinds if kind] or list(TITLES)
     for kind in chosen:
@@ -77,7 +77,7 @@ def print_catalogue(*kinds: str) -> None:
 
 
 def list_entries(kind: str) -> list[Entry]:
-    """List the named parts of a kind, for models also checkpoints; or worlds."""
+    """List the named parts of a kind, or the worlds; models include checkpoints."""
     if kind == "world":
         return list(_worlds())
     entries = [_describe(kind, name) for name in registry.names(kind)]
@@ -85,7 +85,7 @@ def list_entries(kind: str) -> list[Entry]:
 
 
 def plain_lines(kind: str) -> list[str]:
-    """Return the catalogue of a kind as lines `KIND NAME: PURPOSE`, then options."""
+    """Return the catalogue of a kind as lines: `KIND NAME: PURPOSE`, then its options."""
     lines = []
     for entry in list_entries(kind):
         lines.append(f"{kind} {entry.name}: {entry.purpose}")
@@ -116,7 +116,10 @@ def _describe(kind: str, name: str) -> Entry:
             settings: tuple[str, ...] = ()
             if config_class(target):
                 settings = tuple(_option_lines(list_options(target)))
-            purpose += f" Trained by `benchnav-train fit {name}`; name a checkpoint."
+            purpose += (
+                f" Train it by `benchnav-train fit {name}`; a suite names the "
+                "checkpoint."
+            )
             return Entry(name, purpose, settings)
         options = registry.options_of(kind, target)
         return Entry(name, purpose, tuple(_option_lines(options)))
@@ -125,21 +128,24 @@ def _describe(kind: str, name: str) -> Entry:
 
 
 def _purpose(target: Any) -> str:
-    """Return the first line of a docstring; empty if Python generated it."""
+    """Return the first line of a docstring; empty if Python generated the docstring."""
     line = (inspect.getdoc(target) or "").partition("\n")[0]
     return "" if line.startswith(f"{getattr(target, '__name__', '')}(") else line
 
 
 def _option_lines(
-    options: dict[str, Option], prefix: str = "", holder: Any = None
+    options: dict[str, Option], prefix: str = "", instance: Any = None
 ) -> Iterator[str]:
-    """Yield options with types and defaults, those of nested dataclasses dotted.
+    """Yield each option with type and default, dotted names for nested dataclasses.
 
-    Fields of `holder`, if it has them, override defaults.
+    Args:
+        options: options by name.
+        prefix: names of the enclosing options, each followed by a dot.
+        instance: object whose attributes override the defaults.
     """
     for name, option in options.items():
         config = dataclass_in(option.kind)
-        default = getattr(holder, name, option.default)
+        default = getattr(instance, name, option.default)
         if config and default is not None:
             yield from _option_lines(list_options(config), f"{prefix}{name}.", default)
         else:
@@ -148,7 +154,7 @@ def _option_lines(
 
 
 def _type_words(kind: Any) -> str:
-    """Return a type as in code: no modules of classes, bars in literals and unions."""
+    """Return a type without module names, with `|` between literals and in unions."""
     words = re.sub(r"(\w+\.)+", "", inspect.formatannotation(kind))
     words = re.sub(r"Literal\[(.*?)\]", lambda match: match[1].replace("'", ""), words)
     union = re.fullmatch(r"Union\[(.*)\]", words)
@@ -165,7 +171,7 @@ def _default(value: Any) -> str:
 
 
 def _worlds() -> Iterator[Entry]:
-    """Yield worlds with their settings, named as in flags and suites."""
+    """Yield worlds with their settings, named as in options and suites."""
     from benchnav.planning.world.world import PRESETS
 
     for name, preset in PRESETS.items():

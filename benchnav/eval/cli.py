@@ -1,4 +1,4 @@
-"""The command `benchnav-eval`: run, merge, repeat, list, report, compare, replay."""
+"""The command `benchnav-eval`: run, merge, rerun, list, report, compare, replay."""
 
 import json
 import os
@@ -42,13 +42,14 @@ def run_command(
         overwrite: Delete the run in `out` first.
         planner_limit_s: Time limit per planner call [s]; planners then run in separate
             processes. 0 sets no limit.
-        shard: I/N runs only the I-th of N shards of the run; `merge` merges them.
-        backend: Worker processes on this machine, or those of a Dask cluster.
+        shard: I/N runs only the I-th of N shards of the run; `merge` merges shards.
+        backend: Workers: processes on this machine, or a Dask cluster.
         scheduler: Address of the Dask cluster's scheduler, tcp://HOST:PORT.
         device: Device of predictions and episodes; auto uses CUDA if there is a GPU.
-        reuse_code: Also use finished units of other code, and mark their rows.
-        check_determinism: First run a unit of each condition twice, in fresh processes
-            and in another order; if rows differ, name them and exit with status 1.
+        reuse_code: Also use finished units that were run with other code, and mark
+            their rows.
+        check_determinism: First run a unit of each condition twice, in new processes
+            and in two orders; if rows differ, name them and exit with status 1.
     """
     from benchnav.eval.run.runner import run_suite
     from benchnav.eval.run.unit import Settings
@@ -57,7 +58,7 @@ def run_command(
     shard_to_run = read_shard(shard)
     expect(
         0 <= planner_limit_s <= _MAX_LIMIT_S,
-        f"`planner_limit_s` in 0–{_MAX_LIMIT_S}, got {planner_limit_s}.",
+        f"`planner_limit_s` from 0 to {_MAX_LIMIT_S}, got {planner_limit_s}.",
     )
     folder = _run_folder(out)
     if check_determinism and not _repeats(suite, planner_limit_s, device):
@@ -75,7 +76,7 @@ def run_command(
     )
     show_progress(steps, "units")
     command = program("benchnav-eval")
-    if not _is_whole(folder):
+    if not _is_complete(folder):
         print(f"so far:  {command} report {shlex.quote(str(folder))} --partial")
         return _failed(folder)
     if shard_to_run is None:
@@ -118,7 +119,7 @@ def rerun(
         out: Run folder of the repeated run; if empty, RUN-rerun.
         jobs: Number of worker processes.
         overwrite: Delete the run in `out` first.
-        backend: Worker processes on this machine, or those of a Dask cluster.
+        backend: Workers: processes on this machine, or a Dask cluster.
         scheduler: Address of the Dask cluster's scheduler, tcp://HOST:PORT.
     """
     from benchnav.eval.run import rerun
@@ -150,8 +151,8 @@ def verify(folder: str) -> int:
         print(f"{folder}: no file is damaged")
     elif not damage[0].startswith("run.json"):
         print(
-            "Give the run's command again: it runs damaged units again and writes "
-            "tables, figures and playback."
+            "Run the run's command again: it runs damaged units again and writes "
+            "tables, figures and playback files."
         )
     return 1 if damage else 0
 
@@ -175,13 +176,13 @@ def report(
 
     Args:
         folder: Run folder.
-        out: Folder of the report, for a read-only run; if empty, the run folder, or
-            FOLDER/partial.
-        partial: Accept a run that is not finished, also while it is running; all tables
-            and figures are marked.
+        out: Folder of the report, such as for a read-only run; if empty, the run
+            folder, or FOLDER/partial for an unfinished run.
+        partial: Accept an unfinished run, even while it is running; all tables and
+            figures are marked.
         figures: Custom figures, separated by commas, such as path/to/file.py:Name. If
-            one cannot be drawn, the report is written without it, a line says why, and
-            the status is 1.
+            a figure cannot be drawn, the report is written without it, a line states
+            the reason, and the exit status is 1.
     """
     if out:
         other_folder(folder, out)
@@ -203,17 +204,18 @@ def compare(
     Args:
         labels: Labels of the conditions to compare.
         folders: Folders of finished runs, one or more.
-        against: Label with which all others are compared, such as mean or straight; if
-            empty, all pairs are compared.
+        against: Label with which all other conditions are compared, such as mean or
+            straight; if empty, all pairs are compared.
         by: Column in which the conditions of a pair differ: risk, planner, model,
-            objective, robot, sensor, ground, belief, world or run. If empty: the column
-            of `against`; run if runs have common conditions; else risk.
-        points: Difference in success rate in percentage points, for which a note states
-            the required number of maps.
+            objective, robot, sensor, ground, belief, world or run. If empty, the column
+            of `against`; without `against`, run if the runs have common conditions,
+            otherwise risk.
+        points: Difference in success rate, in percentage points. A note states the
+            number of maps that is required to detect it.
         metric: Name of the metric to compare, such as path_length or energy; if empty,
             success and T_total.
-        allow_different: code also compares conditions of different code, with a note
-            under the table.
+        allow_different: code also compares conditions that were run with different
+            code, with a note below the table.
         out: Path without a suffix, to which .csv, .md and .tex are added.
     """
     from benchnav.core.tables import print_table
@@ -221,8 +223,8 @@ def compare(
 
     if out and (out.endswith(os.sep) or Path(out).name in ("", "..")):
         raise ConfigError(
-            "Expected `out` as the path of files without a suffix, got the folder "
-            f"{out}."
+            "Expected `out` as a file path without a suffix, got the folder "
+            f"{out}. Append a file name."
         )
     runs = [Path(folder) for folder in folders]
     different = allow_different == "code"
@@ -248,8 +250,8 @@ def _check_workers(jobs: int, backend: str, scheduler: str) -> None:
     check_workers(jobs, backend, scheduler)
     if scheduler and jobs > 1:
         raise ConfigError(
-            f"Expected no `jobs` with `backend` dask, got {jobs}. The cluster has its "
-            "own workers: leave `jobs` out."
+            f"Expected no `jobs` with `backend` dask, whose cluster has its own "
+            f"workers, got {jobs}. Leave `jobs` out."
         )
 
 
@@ -265,7 +267,7 @@ def _finish(folder: Path) -> int:
 
 
 def _repeats(suite: Suite, planner_limit_s: float, device: str) -> bool:
-    """Return whether all conditions of a suite repeat, and print those that do not."""
+    """Return whether all conditions give the same rows twice; print those that do not."""
     from benchnav.eval.run.determinism import check_determinism
 
     count, lines = check_determinism(suite, _say, planner_limit_s, device)
@@ -282,8 +284,8 @@ def _say(line: str) -> None:
     tell(f"benchnav-eval: {line}")
 
 
-def _is_whole(folder: Path) -> bool:
-    """Return whether a run has its table, or a shard all its units."""
+def _is_complete(folder: Path) -> bool:
+    """Return whether a run has its table of episodes, or a shard has all its units."""
     from benchnav.eval.folder.results import newest_units
     from benchnav.eval.folder.run_folder import EPISODES, open_run
 
@@ -344,25 +346,25 @@ def _print_replay(folder: Path) -> None:
     all_labels = [
         condition.labels for condition, _ in open_run(folder).conditions.values()
     ]
-    shown, draw = propose(folder)
+    proposed, indices = propose(folder)
     words = ["replay", str(folder)]
-    for name, labels in shown.items():
+    for name, labels in proposed.items():
         values = {labels_[name] for labels_ in all_labels} - {NOT_USED}
         is_needed = name in ("planner", "scenario") or len(values) > 1
         if labels == [NOT_USED] or not is_needed:
             continue
         text = ",".join(labels)
-        if yaml.safe_load(f"[{text}]") != labels:  # such as a label with a comma
+        if yaml.safe_load(f"[{text}]") != labels:  # e.g. if a label has a comma
             text = json.dumps(labels)
         words += [f"--{name}", text]
-    for name, value in draw.items():
+    for name, value in indices.items():
         if name == "map" or value:
             words += [f"--{name}", str(value)]
     print(f"replay:  {program('benchnav-eval')} {shlex.join(words)}")
 
 
 def _failed(folder: Path) -> int:
-    """Return 1, and print a line, if a part failed in an episode of a run; else 0."""
+    """Print a warning and return 1 if a part failed in an episode; otherwise return 0."""
     from benchnav.eval.folder.run_folder import EPISODES, ERRORS, read_table
     from benchnav.planning.world.outcome import ERROR_OUTCOMES
 
@@ -375,7 +377,7 @@ def _failed(folder: Path) -> int:
         counts = faults["outcome"].value_counts()
         counted = " and ".join(f"{count} {kind}" for kind, count in counts.items())
         first = faults["error"].iloc[0]
-        message += f" ({counted}); the first fault: {first}"
+        message += f" ({counted}); first error: {first}"
     _say(f"{message}; see {folder / ERRORS}")
     return 1
 

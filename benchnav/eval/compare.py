@@ -47,10 +47,10 @@ from benchnav.eval.stats.summary import time_budgets
 from benchnav.eval.words import reading_name
 
 _CAPTION = "Differences between conditions on the same maps with the same draws of λ."
-_LISTED = 8
-_NAMED = 3
-_MIN_DIFFERENCE = 1e-5  # of success; a run has 10⁸ episodes at most
-# From _MANY pairs on, the time is estimated from that of _TIMED pairs.
+_MAX_LISTED = 8  # lines of a note
+_MAX_NAMED = 3  # draws or maps in a line
+_MIN_DIFFERENCE = 1e-5  # in success rate; a run has at most 10⁸ episodes
+# For at least _MANY pairs, the time is estimated from that of _TIMED pairs.
 _MANY = 5_000
 _TIMED = 5
 
@@ -68,18 +68,19 @@ def compare_runs(
 
     Args:
         folders: finished runs.
-        by: column in which conditions differ; see `pairs.by_what`.
-        against: label with which all others are compared; if empty, all pairs are
-            compared.
+        by: column in which the conditions of a pair differ; if empty, see
+            `pairs.by_what`.
+        against: label with which all other conditions are compared; if empty, all pairs
+            are compared.
         labels: labels that select conditions, by column; a missing column selects all.
-        difference: difference in success rate for which the required number of maps is
-            computed.
-        allow_different_code: whether to compare conditions of different code, with a
-            note. Runs that are compared with each other may always differ in code.
+        difference: difference in success rate, as a fraction, for which the required
+            number of maps is computed.
+        allow_different_code: whether to compare conditions that were run with different
+            code, with a note. With `by` "run", they are always compared.
         metric: name of a metric; if empty, success and T_total are compared.
 
     Returns:
-        The numbers, and the formatted table.
+        The numbers, one row for each pair, and the formatted table.
 
     Raises:
         ConfigError: If there is nothing to compare, conditions cannot be paired, or
@@ -98,18 +99,18 @@ def compare_runs(
     check_one_value_each(conditions)
     by = by_what(conditions, by, against)
     if by != "run":
-        conditions = _once_each(conditions)
+        conditions = _merge_runs(conditions)
     _announce(conditions, by, against, difference)
     pairs = find_pairs(conditions, by, against)
     code_by_pair = [_unlike_code(pair.members) for pair in pairs]
-    # Versions and machines may differ between pairs; the code of a part may not.
-    members = {member for pair in pairs for member in pair.members}
-    code_lines = _unlike_code(members, only_parts=not any(code_by_pair))
+    # The environment may differ between pairs, but not the code of a part.
+    compared = {condition for pair in pairs for condition in pair.members}
+    code_lines = _unlike_code(compared, only_parts=not any(code_by_pair))
     if code_lines and by != "run" and not allow_different_code:
         raise ConfigError(
-            f"Expected conditions that differ only in their {by}, got conditions "
-            f"made by different code: {'; '.join(code_lines)}. Run them with one code, "
-            "or pass --allow-different code, which names it in the table."
+            f"Expected conditions that differ only in their {by}, got conditions that "
+            f"were run with different code: {'; '.join(code_lines)}. Run them with the "
+            "same code, or pass --allow-different code, which adds a note to the table."
         )
     if quantity is None:
         table = compare(pairs, difference)
@@ -120,12 +121,12 @@ def compare_runs(
     table["different_code"] = ["; ".join(lines) for lines in code_by_pair]
     notes = _common(table)
     notes += _left_out(pairs, by)
-    notes += _no_partner(conditions, pairs, by)
+    notes += _unpaired(conditions, pairs, by)
     notes += shown.notes
     notes += [f"Different code: {line}." for line in code_lines]
     caveat_lines: list[str] = []
     for run in runs:
-        caveat_lines += caveats(_concerning(conditions, run.manifest))
+        caveat_lines += caveats(_relevant_manifest(conditions, run.manifest))
     notes += dict.fromkeys(caveat_lines)
     return table, replace(shown, notes=tuple(notes))
 
@@ -138,7 +139,7 @@ def _find_quantity(runs: Sequence[Run], name: str) -> Quantity:
     """
     for run in runs:
         known_quantities = quantities(further_quantities(run.manifest))
-        check_known(f"`metric`, of {run.folder},", name, known_quantities)
+        check_known(f"`metric` of {run.folder}", name, known_quantities)
     return known_quantities[name]
 
 
@@ -219,7 +220,9 @@ def _announce(
 def _codes(
     manifest: Mapping[str, Any], run: str, digests: Iterable[str]
 ) -> dict[str, Any]:
-    """Return the code of some rows by the run's name, with digests if it has several.
+    """Return the code of some rows, by the name of their run.
+
+    If the run may have rows of several codes, the name also contains the code's digest.
 
     Args:
         manifest: contents of `run.json`.
@@ -234,11 +237,12 @@ def _codes(
 
 
 def _names(folders: Sequence[Path]) -> list[str]:
-    """Return short names of runs: the shortest ends of their paths that differ."""
+    """Return short names of runs: the last parts of their paths, as many as differ."""
     paths = [folder.resolve() for folder in folders]
     if len(set(paths)) < len(paths):
         raise ConfigError(
-            f"Expected runs that differ, got {', '.join(map(str, folders))}."
+            f"Expected runs that differ, got {', '.join(map(str, folders))}. List each "
+            "run once."
         )
     n_parts = 1
     while len({path.parts[-n_parts:] for path in paths}) < len(paths):
@@ -264,7 +268,8 @@ def _unlike_code(conditions: Iterable[Compared], only_parts: bool = False) -> li
 
     Args:
         conditions: conditions whose code is compared.
-        only_parts: whether to ignore differences of the environment.
+        only_parts: whether to ignore differences in the environment (versions,
+            processor, device).
     """
     codes: dict[str, dict[str, dict[str, Any]]] = {}
     for condition in conditions:
@@ -281,8 +286,8 @@ def _unlike_code(conditions: Iterable[Compared], only_parts: bool = False) -> li
     return lines
 
 
-def _once_each(conditions: Iterable[Compared]) -> list[Compared]:
-    """Merge each condition that several runs contain, with the episodes of all.
+def _merge_runs(conditions: Iterable[Compared]) -> list[Compared]:
+    """Merge each condition that several runs contain, with the episodes of all runs.
 
     Raises:
         ConfigError: If an episode differs between two runs.
@@ -309,10 +314,10 @@ def _joined(a: Compared, b: Compared) -> Compared:
         reasons = "; ".join(_unlike_code((a, b)))
         explanation = f" ({reasons})" if reasons else ""
         raise ConfigError(
-            "Expected the same rows of a condition in all runs that hold it, got "
+            "Expected the same rows of a condition in all runs that contain it, got "
             f"{n_unlike} of {n_common} episodes of {words} that differ between "
-            f"{runs}{explanation}. Leave one of the runs out, or compare the runs with "
-            "each other by --by run."
+            f"{runs}{explanation}. Leave one of the runs out, or pass --by run to "
+            "compare the runs with each other."
         )
     rows = pd.concat([a.episodes, b.episodes])
     return replace(
@@ -325,7 +330,7 @@ def _joined(a: Compared, b: Compared) -> Compared:
 
 
 def _common(table: pd.DataFrame) -> list[str]:
-    """Return a note on the labels and counts that all pairs have in common."""
+    """Return a note with the labels and counts that all pairs have in common."""
     words = []
     for name in LABELS:
         if name not in table or table[name].nunique() != 1:
@@ -339,13 +344,13 @@ def _common(table: pd.DataFrame) -> list[str]:
         words.append(f"{maps} maps")
         if groups != maps:
             words.append(f"{groups} groups of maps (the statistical unit)")
-        words.append(f"{episodes} episodes a condition")
+        words.append(f"{episodes} episodes per condition")
     words.append("the same draws of λ")
     return [f"All pairs: {', '.join(words)}."]
 
 
 def _left_out(pairs: Sequence[Pair], by: str) -> list[str]:
-    """Return lines on episodes of a condition that its partner was not run on."""
+    """Return lines on episodes that only one condition of a pair has."""
     lines: dict[str, None] = {}
     for pair in pairs:
         first = reading_name(by, pair.one)
@@ -360,19 +365,19 @@ def _left_out(pairs: Sequence[Pair], by: str) -> list[str]:
                 continue
             draws = _draws_in_words(rows)
             remainder = ""
-            if len(draws) > _NAMED:
-                remainder = f" and {len(draws) - _NAMED} more draws"
+            if len(draws) > _MAX_NAMED:
+                remainder = f" and {len(draws) - _MAX_NAMED} more draws"
             line = (
                 f"{len(rows)} of {len(condition.episodes)} episodes of {name} are "
                 f"left out: {partner} was not run "
-                f"on them ({'; '.join(draws[:_NAMED])}{remainder})."
+                f"on them ({'; '.join(draws[:_MAX_NAMED])}{remainder})."
             )
             lines[line] = None
     return _first_of(list(lines), "pairs with episodes left out")
 
 
 def _draws_in_words(rows: pd.DataFrame) -> list[str]:
-    """Return the draws of episodes and their maps in words, one text for each draw."""
+    """Return a text for each draw of λ: seed, realisation and maps."""
     draws = []
     for (seed, realisation), maps in rows.groupby(["seed", "realisation"])["map"]:
         words = f"seed {seed}"
@@ -383,19 +388,19 @@ def _draws_in_words(rows: pd.DataFrame) -> list[str]:
 
 
 def _maps(maps: Sequence[int]) -> str:
-    """Return indices of maps in words, consecutive ones as a range."""
+    """Return map indices in words; consecutive indices as a range."""
     if len(maps) == 1:
         return f"map {maps[0]}"
     if maps[-1] - maps[0] == len(maps) - 1:
         return f"maps {maps[0]} to {maps[-1]}"
-    more = ", …" if len(maps) > _NAMED else ""
-    return f"{len(maps)} maps ({', '.join(map(str, maps[:_NAMED]))}{more})"
+    more = ", …" if len(maps) > _MAX_NAMED else ""
+    return f"{len(maps)} maps ({', '.join(map(str, maps[:_MAX_NAMED]))}{more})"
 
 
-def _concerning(
+def _relevant_manifest(
     conditions: Sequence[Compared], manifest: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return `run.json` with only those left-out combinations whose labels are compared."""
+    """Return `run.json`, with left-out combinations only of compared labels."""
     compared: set[tuple[str, str]] = set()
     for condition in conditions:
         compared.update(condition.labels.items())
@@ -407,11 +412,11 @@ def _concerning(
     return {**manifest, "dropped": dropped}
 
 
-def _no_partner(
+def _unpaired(
     conditions: Sequence[Compared], pairs: Sequence[Pair], by: str
 ) -> list[str]:
-    """Return a line that names the conditions without a pair."""
-    paired = {member for pair in pairs for member in pair.members}
+    """Return a line that names the conditions without a pair; empty if all have one."""
+    paired = {condition for pair in pairs for condition in pair.members}
     unpaired = [condition for condition in conditions if condition not in paired]
     varying = []
     for name in (*LABELS, "run"):
@@ -425,8 +430,8 @@ def _no_partner(
     if not names:
         return []
     return [
-        f"Not in the table, since no condition differs from them only in {by}: "
-        f"{'; '.join(_first_of(names, 'conditions'))}."
+        f"Conditions not in the table, since no other condition differs from them only "
+        f"in {by}: {'; '.join(_first_of(names, 'conditions'))}."
     ]
 
 
@@ -435,6 +440,6 @@ def _as_read(labels: Mapping[str, str]) -> dict[str, str]:
 
 
 def _first_of(lines: list[str], noun: str) -> list[str]:
-    if len(lines) <= _LISTED:
+    if len(lines) <= _MAX_LISTED:
         return lines
-    return [*lines[:_LISTED], f"and {len(lines) - _LISTED} more {noun}"]
+    return [*lines[:_MAX_LISTED], f"and {len(lines) - _MAX_LISTED} more {noun}"]

@@ -33,15 +33,15 @@ def evaluate(
 
     Parts are objects, such as `AStarDWA()` and `CVaR(0.8)`, or names as in suites. Some
     objects cannot be created again by other processes, such as a function without a
-    name or a class of a notebook. They run only in this process, the rows of their
-    conditions are marked as not reproducible, and their run cannot be resumed.
+    name or a class of a notebook. Such objects run only in this process, the rows of
+    their conditions are marked as not reproducible, and their run cannot be resumed.
 
     Args:
-        terrain: a dataset, by path, id or object; or a recipe, whose test maps are
-            generated first.
-        folder: run folder; a run that it contains is resumed or extended. If None,
-            results are stored in a temporary folder as long as the returned object
-            exists; see `Results.save`.
+        terrain: a dataset, given by path, id or object; or a recipe, whose test maps
+            are generated first.
+        folder: run folder; a run that the folder contains is resumed or extended. If
+            None, results are stored in a temporary folder, which is deleted with the
+            returned object; see `Results.save`.
         jobs: number of worker processes; it does not affect results.
         device: "cpu", "cuda", or "auto" for CUDA if there is a GPU.
         verbose: whether to show progress and notes on stderr.
@@ -68,8 +68,8 @@ def evaluate(
         experiment["task"] = plain(rules) if isinstance(rules, Rules) else rules
     expect(
         "model" in experiment or "models" in experiment or "conditions" in experiment,
-        '`models`, such as [load_model("stakes-v1")], got none. Blind planners take '
-        'models=["oracle"].',
+        '`models`, such as [load_model("stakes-v1")], got none. For blind planners, '
+        'which use no model, pass models=["oracle"].',
     )
     temporary = None if folder else tempfile.TemporaryDirectory(prefix="benchnav-")
     run_folder = Path(temporary.name, "run") if temporary else Path(str(folder))

@@ -1,6 +1,6 @@
-"""Failed episodes: outcome, time and position of their end, and sheets of examples.
+"""Failed episodes: table of outcomes, times and positions, and sheets of examples.
 
-A sheet shows failures of the best and of the worst setting of a block.
+A sheet shows failures of the best and of the worst condition of a block.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,17 +18,17 @@ from benchnav.eval.recording import Recording
 from benchnav.eval.stats.best import competing
 from benchnav.eval.words import blocks, with_names
 
-# Returns recordings of failures of one condition, rows of `failures_table`.
+# Function from rows of `failures_table` of one condition to recordings of the episodes.
 RecordDriven = Callable[[pd.DataFrame], Sequence[Recording]]
 
-ACROSS = 4  # failures of a condition that are shown
+ACROSS = 4  # maximum number of failures that a sheet shows for a condition
 _MAX_BLOCKS = 6
-# Failures of one condition whose maps are predicted again.
+# Maximum number of failures of a condition whose maps are predicted again.
 _MAX_FAILURES = 100
 
 _KEYS = ["condition", "seed", "realisation", "map"]
 _ENDS = ("x_m", "y_m", "end_traversability", "last_traversability")
-_LAST_S = 2.0
+_LAST_S = 2.0  # time before the end, for `last_traversability`
 
 
 def failures_table(folder: Path, episodes: pd.DataFrame) -> pd.DataFrame:
@@ -40,10 +40,10 @@ def failures_table(folder: Path, episodes: pd.DataFrame) -> pd.DataFrame:
 
     Returns:
         One row per failure: `condition`, `planner`, `risk`, `model`, `scenario`,
-        `world`, `seed`, `realisation`, `map`, `outcome`, `end_time_s`, `code`; `x_m`,
-        `y_m`, the robot's last position; `end_traversability`, the observed λ in the
-        last step; and `last_traversability`, the mean of observed λ in the last 2 s.
-        The last four columns are NaN if steps were not stored.
+        `world`, `seed`, `realisation`, `map`, `outcome`, `end_time_s`, `code`; `x_m`
+        and `y_m`, the robot's last position in metres; `end_traversability`, the
+        observed λ in the last step; and `last_traversability`, the mean of observed λ
+        in the last 2 s. These last four columns are NaN if steps were not stored.
     """
     columns = [
         "condition",
@@ -69,9 +69,9 @@ def failures_table(folder: Path, episodes: pd.DataFrame) -> pd.DataFrame:
 
 
 def _ends(steps: pd.DataFrame) -> pd.DataFrame:
-    """Return the last position of each episode, and λ at its end.
+    """Return the last position of each episode, and observed λ at its end.
 
-    The last state of an episode has no λ.
+    λ is observed in a step, so that the row of the last state has none.
     """
     groups = steps.groupby(_KEYS, sort=False)
     last = groups[["x_m", "y_m"]].last()
@@ -98,15 +98,15 @@ class FailedLine:
 
     Args:
         name: name of the condition.
-        failures: rows of `failures_table`, at most `ACROSS`.
+        failures: rows of `failures_table` that are shown, at most `ACROSS`.
         recordings: recordings of these failures.
-        among: number of failures of the condition from which they were chosen.
+        total: number of failures of the condition.
     """
 
     name: str
     failures: pd.DataFrame
     recordings: Sequence[Recording]
-    among: int
+    total: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,9 +115,9 @@ class Sheets:
 
     Args:
         shown: title and lines of the sheet of each block.
-        predicted: λ̂ where failed episodes ended, by condition, shape [N].
-        left_out: reason for missing sheets; empty if no sheet is missing, or no episode
-            failed.
+        predicted: λ̂ at the end of failed episodes, by condition, shape [number of
+            recorded failures].
+        left_out: reason for missing sheets; empty if no sheet is missing.
     """
 
     shown: tuple[tuple[str, tuple[FailedLine, ...]], ...]
@@ -131,15 +131,16 @@ def collect_sheets(
     """Collect the sheets of a run.
 
     Args:
-        summary: from `summary.summarise`, joined with `best.against_best`.
-        failures: from `failures_table`.
-        record_driven: records failures; may raise `BenchnavError`. If None, no sheets.
+        summary: table from `summary.summarise`, joined with `best.against_best`.
+        failures: table from `failures_table`.
+        record_driven: function that records failures; it may raise `BenchnavError`. If
+            None, there are no sheets.
     """
     located = failures[failures["x_m"].notna()]
     if record_driven is None or located.empty:
         reason = ""
         if record_driven is not None and not failures.empty:
-            reason = "there is no figure of failures, since the run kept no steps"
+            reason = "there is no figure of failures, since the run stored no steps"
         return Sheets(shown=(), predicted={}, left_out=reason)
     shown = []
     predicted: dict[str, np.ndarray] = {}
@@ -155,10 +156,10 @@ def collect_sheets(
         try:
             for row in _best_and_worst(rows):
                 condition = row["condition"]
-                of_condition = located[located["condition"] == condition]
-                if of_condition.empty:
+                condition_failures = located[located["condition"] == condition]
+                if condition_failures.empty:
                     continue
-                recorded = of_condition.head(_MAX_FAILURES).reset_index(drop=True)
+                recorded = condition_failures.head(_MAX_FAILURES).reset_index(drop=True)
                 recordings = record_driven(recorded)
                 at_ends = [recording.predicted_at_end for recording in recordings]
                 predicted[condition] = np.array(at_ends)
@@ -168,7 +169,7 @@ def collect_sheets(
                     name=row["name"],
                     failures=chosen.reset_index(drop=True),
                     recordings=[recordings[index] for index in chosen.index],
-                    among=int(is_of_condition.sum()),
+                    total=int(is_of_condition.sum()),
                 )
                 lines.append(line)
         except (BenchnavError, OSError) as error:
@@ -184,19 +185,22 @@ def collect_sheets(
 
 
 def _best_and_worst(rows: pd.DataFrame) -> list[dict[Any, Any]]:
-    """Return the best and the worst of the conditions of a block with a prediction."""
-    seeing = rows[competing(rows) & (rows["model"] != NOT_USED)]
-    best = seeing[seeing["condition"] == seeing["best"]]
-    worst = seeing.sort_values("success_rate", kind="stable").head(1)
+    """Return the best and the worst condition of a block, among those with a model."""
+    with_model = rows[competing(rows) & (rows["model"] != NOT_USED)]
+    best = with_model[with_model["condition"] == with_model["best"]]
+    worst = with_model.sort_values("success_rate", kind="stable").head(1)
     chosen = pd.concat([best, worst])
     return chosen.drop_duplicates("condition").to_dict("records")
 
 
 def choose_failures(failures: pd.DataFrame) -> pd.DataFrame:
-    """Choose failures to show, one of each outcome in turn, frequent outcomes first."""
+    """Return up to `ACROSS` failures with a position, to show many outcomes.
+
+    The outcomes take turns, frequent outcomes first.
+    """
     located = failures[failures["x_m"].notna()]
     turn = located.groupby("outcome", sort=False).cumcount()
-    often = -located.groupby("outcome")["outcome"].transform("size")
-    keyed = located.assign(turn=turn, often=often)
-    ordered = keyed.sort_values(["turn", "often"], kind="stable")
+    rarity = -located.groupby("outcome")["outcome"].transform("size")
+    keyed = located.assign(turn=turn, rarity=rarity)
+    ordered = keyed.sort_values(["turn", "rarity"], kind="stable")
     return ordered.head(ACROSS)

@@ -17,7 +17,7 @@ from benchnav.eval.folder.run_folder import (
     open_run,
     read_table,
 )
-from benchnav.eval.recording import GROUND, Ground
+from benchnav.eval.recording import GROUND, RecordedMap
 
 
 def find_episodes(
@@ -32,16 +32,18 @@ def find_episodes(
     Args:
         folder: a run folder.
         labels: labels of conditions by column; several labels of a column select
-            several conditions. Of a missing column, the first label that fits is taken.
+            several conditions. For a column without labels, the first matching label
+            is taken.
         seed: root seed; if None, the first seed of the first condition.
         realisation: index of the draw of λ.
         map_index: index of the map in its split.
 
     Returns:
-        Units, each with the index of its episode.
+        Units, each with the index of the episode within the unit.
 
     Raises:
-        ConfigError: If the run has no such episode, or episodes are on several maps.
+        ConfigError: If the run has no such episode, or the episodes are not all on the
+            same map.
     """
     run = open_run(folder)
     labels_of_run = _labels_of(run)
@@ -49,7 +51,8 @@ def find_episodes(
     for values in itertools.product(*labels.values()):
         requested = dict(zip(labels, values, strict=True))
         unit = _find(run, requested, (seed, realisation, map_index))
-        # A blind planner fits any risk setting, but the run must have that setting.
+        # A condition that does not use a setting matches every label of the setting,
+        # but the requested label must occur in the run.
         unknown = []
         for name, label in requested.items():
             if labels_of_run[name] and label not in labels_of_run[name]:
@@ -64,25 +67,27 @@ def find_episodes(
                 name = unknown[0]
                 similar = hint(requested[name], labels_of_run[name])
             raise ConfigError(
-                f"Expected an episode of the run, got {', '.join(words)}. It has "
+                f"Expected an episode of the run, got {', '.join(words)}, which the "
+                f"run does not have. The run has "
                 f"{'; '.join(_available(run, labels_of_run))}.{similar}"
             )
         seed = unit.seed
-        member = unit.maps.index(map_index)
-        chosen.setdefault(unit.condition.id, (unit, member))
+        episode_index = unit.maps.index(map_index)
+        chosen.setdefault(unit.condition.id, (unit, episode_index))
     episodes = list(chosen.values())
     maps: dict[str, None] = {}
     for unit, _ in episodes:
         maps[f"{unit.condition.data} {unit.condition.scenario}"] = None
     if len(maps) > 1:
         raise ConfigError(
-            f"Expected conditions on one map to show together, got {', '.join(maps)}."
+            "Expected conditions on the same map, which can be shown together, got "
+            f"{', '.join(maps)}. Select one dataset and one scenario."
         )
     return episodes
 
 
 def _labels_of(run: Run) -> dict[str, list[str]]:
-    """Return the labels of a run's conditions by column, without unused ones."""
+    """Return the labels of a run's conditions by column, without `NOT_USED`."""
     conditions = [condition for condition, _ in run.conditions.values()]
     labels_of_run = {}
     for name in LABELS:
@@ -105,31 +110,32 @@ def _available(run: Run, labels_of_run: Mapping[str, Sequence[str]]) -> list[str
 
 
 def propose(folder: Path) -> tuple[dict[str, list[str]], dict[str, int]]:
-    """Propose conditions with different outcomes, on the map where outcomes differ most.
+    """Propose labels of conditions for a replay, on the map where outcomes differ most.
 
     Args:
         folder: a finished run.
 
     Returns:
-        Labels by column, and `map`, `seed` and `realisation`. The labels are those of
-        two conditions that differ only in their risk setting and in their outcome
-        (conditions of the first such hypothesis take precedence), or else of one
-        condition.
+        Labels by column, and indices: `map`, and for a run with a recorded map also
+        `seed` and `realisation`. The labels are those of two conditions that differ
+        only in their risk setting and have different outcomes; conditions that the
+        run's hypotheses compare take precedence. Without such a pair, the labels are
+        those of one condition.
     """
     run = open_run(folder)
     if not (folder / GROUND).exists():
         all_labels = [condition.labels for condition, _ in run.conditions.values()]
-        # A planner that uses a prediction has more to show.
-        seeing = [labels for labels in all_labels if labels["risk"] != NOT_USED]
-        first, *_ = [*seeing, *all_labels]
+        # A replay of a planner that uses a prediction shows more.
+        predicting = [labels for labels in all_labels if labels["risk"] != NOT_USED]
+        first, *_ = [*predicting, *all_labels]
         return _as_lists(first), {"map": 0}
-    map_keys = Ground.load(folder / GROUND).about
-    draw = {name: int(map_keys[name]) for name in ("map", "seed", "realisation")}
+    map_keys = RecordedMap.load(folder / GROUND).about
+    indices = {name: int(map_keys[name]) for name in ("map", "seed", "realisation")}
     rows = read_table(folder, EPISODES)
     is_on_map = (rows[list(map_keys)] == pd.Series(map_keys)).all(axis=1)
     rows = rows[is_on_map]
     first_id = rows["condition"].iloc[0]
-    # Conditions of the first hypothesis come first.
+    # Conditions that hypotheses compare come first.
     tests = run.manifest.get("hypotheses", {}).get("tests", ())
     tested = [condition for test in tests for condition in (test["one"], test["other"])]
     ordered = list(dict.fromkeys([*tested, *rows["condition"]]))
@@ -145,12 +151,12 @@ def propose(folder: Path) -> tuple[dict[str, list[str]], dict[str, int]]:
         is_same_setting = all(a[name] == b[name] for name in columns)
         if a_succeeded != b_succeeded and is_same_setting:
             pair = {name: list(dict.fromkeys((a[name], b[name]))) for name in LABELS}
-            return pair, draw
+            return pair, indices
     if candidates:
         labels, _ = candidates[0]
-        return _as_lists(labels), draw
+        return _as_lists(labels), indices
     condition, _ = run.conditions[first_id]
-    return _as_lists(condition.labels), draw
+    return _as_lists(condition.labels), indices
 
 
 def _as_lists(labels: Mapping[str, str]) -> dict[str, list[str]]:
@@ -160,7 +166,7 @@ def _as_lists(labels: Mapping[str, str]) -> dict[str, list[str]]:
 def _find(
     run: Run, requested: Mapping[str, str], episode: tuple[int | None, int, int]
 ) -> Unit | None:
-    """Return the unit of the first matching condition; prefer one that has rows.
+    """Return the unit of the first matching condition; prefer a finished unit.
 
     A condition that does not use a part matches any label of that part, unless another
     condition has the label.
@@ -168,7 +174,8 @@ def _find(
     Args:
         run: opened run folder.
         requested: labels by column.
-        episode: seed, realisation and map; if the seed is None, each condition's first.
+        episode: seed, realisation and map index; if the seed is None, the first seed of
+            each condition.
     """
     seed, realisation, map_index = episode
     is_finished = (run.folder / EPISODES).exists()

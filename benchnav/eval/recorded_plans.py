@@ -12,9 +12,10 @@ from torch import Tensor
 
 from benchnav.core.grid import outline
 
-# Points of a layer of a plan; keeps recordings of long episodes within 3 MB.
+# Maximum number of points in a layer of a plan; a recording of a long episode then has
+# at most 3 MB.
 MAX_POINTS = 160
-# Fields of `KnownMap`: in files, numbers have steps of 1/255, and masks are bits.
+# Fields of `KnownMap`. Files store numbers in steps of 1/255, and masks as bits.
 NUMBERS = ("predicted", "mean", "spread")
 _MASKS = ("free", "seen", "sensed")
 _LEVELS = 255
@@ -35,17 +36,17 @@ class DrawnPlan:
 
 @dataclass(frozen=True, kw_only=True)
 class KnownMap:
-    """A robot's knowledge of its map from a step on.
+    """Belief of a robot about its map from a step on.
 
     Args:
-        step: first step at which it is valid.
-        predicted: λ̂ under the risk setting, shape [H, W].
+        step: first step at which the belief is valid.
+        predicted: λ̂ by the risk setting, shape [H, W].
         free: free mask S_free, bool, shape [H, W].
         mean: E[λ] of the belief, shape [H, W].
         spread: half of the range from the 16 % to the 84 % quantile of λ, shape [H, W].
         seen: cells whose appearance has been observed, bool, shape [H, W].
         sensed: cells whose λ has been measured, bool, shape [H, W].
-        outline: outline of the sensors' footprint at that step, (x, y) in metres, shape
+        outline: outline of the sensors' footprint at `step`, (x, y) in metres, shape
             [P, 2]; rows of NaN separate lines.
     """
 
@@ -70,12 +71,12 @@ class KnownMap:
         return lines
 
 
-def reach_outline(cells: np.ndarray, resolution_m: float) -> np.ndarray:
-    """Return the `KnownMap.outline` of cells within the sensors' footprint.
+def footprint_outline(cells: np.ndarray, resolution_m: float) -> np.ndarray:
+    """Return the outline of the sensors' footprint, as in `KnownMap.outline`.
 
     Args:
-        cells: bool, shape [H, W].
-        resolution_m: edge length of a cell.
+        cells: mask of cells in the footprint, bool, shape [H, W].
+        resolution_m: edge length of a cell in metres.
     """
     edges = outline(cells, resolution_m)
     one_separator = ((0, 0), (0, 1), (0, 0))
@@ -84,7 +85,7 @@ def reach_outline(cells: np.ndarray, resolution_m: float) -> np.ndarray:
 
 
 def under(prefix: str, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return values whose names start with a prefix, by name without the prefix."""
+    """Return the values whose names start with a prefix; remove it from the names."""
     chosen = {}
     for name, value in values.items():
         if name.startswith(prefix):
@@ -93,12 +94,12 @@ def under(prefix: str, values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def drawn_plan(step: int, layers: Mapping[str, Tensor]) -> DrawnPlan:
-    """Return the drawable part of a plan: finite points, lines of at least two.
+    """Return the drawable part of a plan: finite points, on lines of at least two.
 
     Args:
         step: index of the step.
-        layers: from `Plan.lines`, polylines of shape [lines, P, 2] by layer; unused
-            points are NaN.
+        layers: polylines by layer, as in `Plan.lines`, (x, y) in metres, each layer of
+            shape [lines, P, 2]; unused points are NaN.
     """
     lines: dict[str, list[np.ndarray]] = {}
     for name, layer in layers.items():
@@ -121,7 +122,7 @@ def thinned(plan: DrawnPlan) -> DrawnPlan:
 
 
 def _spread(count: int, max_count: int) -> np.ndarray:
-    """Return up to `max_count` evenly spread indices, including first and last."""
+    """Return up to `max_count` evenly spread indices in [0, count - 1]."""
     n_indices = min(count, max_count)
     return np.linspace(0, count - 1, n_indices).round().astype(int)
 
@@ -130,9 +131,9 @@ def pack_plans(plans: Sequence[DrawnPlan]) -> dict[str, np.ndarray]:
     """Pack plans, in order of steps, into few arrays, which `unpack_plans` reads.
 
     Returns:
-        `plans:steps`; and for each layer its points `plans:points/LAYER`, the number of
-        points of each line `plans:sizes/LAYER`, and the number of lines of each plan
-        `plans:counts/LAYER`.
+        Arrays by name: `plans:steps`, and for each layer `plans:points/LAYER` (all
+        points), `plans:sizes/LAYER` (number of points of each line) and
+        `plans:counts/LAYER` (number of lines of each plan).
     """
     arrays: dict[str, np.ndarray] = {}
     arrays["plans:steps"] = np.array([plan.step for plan in plans], np.int64)
@@ -152,7 +153,7 @@ def _lengths(sequences: Iterable[Sized]) -> np.ndarray:
 
 
 def unpack_plans(arrays: Mapping[str, np.ndarray]) -> list[DrawnPlan]:
-    """Return the plans that `pack_plans` packed; names are without `plans:`."""
+    """Return the plans that `pack_plans` packed; names have no prefix `plans:`."""
     layers = {}
     for name, points in under("points/", arrays).items():
         lines = _cut(points, arrays[f"sizes/{name}"])
@@ -165,7 +166,7 @@ def unpack_plans(arrays: Mapping[str, np.ndarray]) -> list[DrawnPlan]:
 
 
 def _cut(values: Any, sizes: np.ndarray) -> list[Any]:
-    """Split a sequence into consecutive parts of given sizes."""
+    """Split a sequence into consecutive slices of the given sizes."""
     ends = sizes.cumsum()
     starts = ends - sizes
     return [values[start:end] for start, end in zip(starts, ends, strict=True)]
@@ -178,9 +179,9 @@ def pack_known(known_maps: Sequence[KnownMap]) -> dict[str, np.ndarray]:
     most cells do not change.
 
     Returns:
-        `known:steps`; `known:NAME` for each field of λ (uint8) and each mask (bits);
-        the outlines' points `known:outline`, and the number of points of each outline
-        `known:sizes`. Empty if there are no maps.
+        Arrays by name: `known:steps`; `known:NAME` for each name in `NUMBERS` (uint8)
+        and each mask (bits); `known:outline` (points of all outlines) and `known:sizes`
+        (number of points of each outline). Empty if there are no maps.
     """
     if not known_maps:
         return {}
@@ -190,7 +191,7 @@ def pack_known(known_maps: Sequence[KnownMap]) -> dict[str, np.ndarray]:
         numbers = np.stack([getattr(item, name) for item in known_maps])
         levels = numbers.astype(np.float32).clip(0, 1) * _LEVELS
         bytes_ = levels.round().astype(np.uint8)
-        # Differences modulo 256 are inverted by sums.
+        # Differences are modulo 256; cumulative sums modulo 256 invert them.
         arrays[f"known:{name}"] = np.diff(bytes_, axis=0, prepend=np.uint8(0))
     for name in _MASKS:
         masks = np.stack([getattr(item, name) for item in known_maps])
@@ -203,7 +204,7 @@ def pack_known(known_maps: Sequence[KnownMap]) -> dict[str, np.ndarray]:
 
 
 def unpack_known(arrays: Mapping[str, np.ndarray]) -> tuple[KnownMap, ...]:
-    """Return the maps that `pack_known` packed; names are without `known:`."""
+    """Return the maps that `pack_known` packed; names have no prefix `known:`."""
     values = dict(arrays)
     width = values[NUMBERS[0]].shape[-1]
     for name in NUMBERS:

@@ -1,8 +1,8 @@
 """Recordings of episodes, and their files.
 
-Viewer files, videos, comparisons and figures are created only from recordings, without
-dataset or prediction. Letters in shapes: N steps, H×W cells, S state and A action
-dimensions, P points.
+Viewer files, videos and figures of episodes are created from recordings only; they need
+neither dataset nor prediction. Letters in shapes: N steps, H×W cells, S state and A
+action dimensions, P points.
 """
 
 import json
@@ -28,27 +28,26 @@ from benchnav.eval.recorded_plans import (
 )
 from benchnav.planning.world.outcome import Outcome
 
-# File of a run folder with the map that driven paths are shown on.
+# File of a run folder with the map on which figures show driven paths.
 GROUND = "ground.npz"
-# Columns that identify a map under one draw of λ.
+# Columns that identify a map with one draw of λ.
 MAP = ["data", "scenario", "world", "seed", "realisation", "map"]
-# Time that figures show: about half of most episodes. The paper shows 25 s, when most
-# robots here have reached the goal.
+# Time of the plan that figures show: about half the length of most episodes. The paper
+# shows 25 s, when most robots in BenchNav have reached the goal.
 MOMENT_S = 15.0
-_DRAW_EVERY_S = 0.5
+_DRAW_EVERY_S = 0.5  # time between drawn plans
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ground:
-    """A map under one draw of λ, which driven paths are shown on.
+class RecordedMap:
+    """A map with one draw of λ, on which figures show driven paths.
 
     Args:
-        about: identity: labels of a condition, including `seed`, `realisation` and
-            `map`.
+        about: columns that identify the map and the draw of λ (`MAP`), with values.
         resolution_m: edge length of a cell in metres.
         rgb: colour image, uint8, shape [3, H, W].
-        field: λ of all cells in the episode, shape [H, W]; None if λ was resampled.
-        immobilising: cells of the field that immobilise a robot, bool, shape [H, W].
+        field: λ of all cells, shape [H, W]; None if λ is resampled at each step.
+        immobilising: cells whose λ immobilises a robot, bool, shape [H, W].
         goal_m: position of the goal (x, y) in metres, shape [2].
     """
 
@@ -59,7 +58,7 @@ class Ground:
     immobilising: np.ndarray
     goal_m: np.ndarray
 
-    _REMEDY: ClassVar[str] = "Remove it; the run's command makes it again."
+    _REMEDY: ClassVar[str] = "Remove the file; the run's command creates it again."
 
     @property
     def grid(self) -> Grid:
@@ -101,28 +100,30 @@ class Ground:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Recording(Ground):
-    """An episode from its start to its end.
+class Recording(RecordedMap):
+    """An episode from its start to its end, on its map.
 
-    `about` also contains `condition` and `outcome`, all as text.
+    `about` contains all labels of the episode, `condition` and `outcome`, all as text.
 
     Args:
         elevation_m: elevation in metres, shape [H, W].
-        true_mean: E[λ] of the truth, shape [H, W].
-        soft: terrain with soft spots that no image shows, bool, shape [H, W].
+        true_mean: mean of the true distribution of λ, shape [H, W].
+        soft: cells of classes with soft spots, which no image shows, bool, shape
+            [H, W].
         predicted: λ̂, the planner's map at the start, shape [H, W].
-        free: free mask S_free of that map, bool, shape [H, W].
-        free_by: map that determines free cells, `risk` or `mean`.
-        free_above: threshold that the map must exceed in free cells.
+        free: free mask S_free at the start, bool, shape [H, W].
+        free_by: map that determines free cells: `risk` (λ̂) or `mean` (E[λ]).
+        free_above: threshold in [0, 1] that this map exceeds in free cells.
         dt_s: time step in seconds.
         time_budget_s: time budget T in seconds.
-        action_names: name and unit of each action, length A.
+        action_names: name and unit of each action dimension, length A.
         states: robot states, each beginning with (x, y, θ), shape [N + 1, S].
         actions: commanded actions, shape [N, A].
         traversability: observed λ, shape [N].
         plans: plans in order of steps, up to the episode's end.
-        layers: optional fields of the map, by name, each of shape [H, W].
-        known: the robot's knowledge, in order of steps; empty if it does not learn.
+        layers: optional layers of the map, by name, each of shape [H, W].
+        known: the robot's known maps, in order of steps; empty if the robot does not
+            learn.
     """
 
     elevation_m: np.ndarray
@@ -142,7 +143,9 @@ class Recording(Ground):
     layers: Mapping[str, np.ndarray] = field(default_factory=dict)
     known: tuple[KnownMap, ...] = ()
 
-    _REMEDY: ClassVar[str] = "Remove it and its .rrd; `replay` makes them again."
+    _REMEDY: ClassVar[str] = (
+        "Remove the file and its .rrd; `replay` creates both again."
+    )
 
     @property
     def title(self) -> str:
@@ -157,17 +160,17 @@ class Recording(Ground):
 
     @property
     def track(self) -> np.ndarray:
-        """Driven positions to the end, shape [N + 1, 2]."""
+        """Driven positions (x, y) in metres, shape [N + 1, 2]."""
         return self.states[:, :2]
 
     @property
     def end_s(self) -> float:
-        """Time of the end, in seconds."""
+        """Time of the end of the episode, in seconds."""
         return len(self.traversability) * self.dt_s
 
     @property
     def immobilised_at(self) -> np.ndarray | None:
-        """Position where the robot was immobilised, (x, y); None if it was not."""
+        """Position (x, y) of an immobilised robot; None for any other outcome."""
         is_immobilised = self.about["outcome"] == Outcome.IMMOBILISED.name.lower()
         return self.track[-1] if is_immobilised else None
 
@@ -181,29 +184,29 @@ class Recording(Ground):
 
     @property
     def own_plans(self) -> list[DrawnPlan]:
-        """Plans up to the last step; if no step was taken, the first plan."""
+        """Plans up to the last step; if the episode has no step, the first plan."""
         last = max(len(self.traversability) - 1, 0)
         return [plan for plan in self.plans if plan.step <= last]
 
     @property
     def plan(self) -> DrawnPlan:
-        """The plan that figures show: at `MOMENT_S`, or at half of a short episode."""
+        """The plan that figures show: at `MOMENT_S`, or at half the time of the end."""
         return self.plan_at(min(MOMENT_S, self.end_s / 2))
 
     @property
     def now(self) -> int:
-        """The step that figures show: that of `plan`, or the last if there is no plan."""
+        """The step that figures show: that of `plan`; the last step without a plan."""
         last = len(self.traversability)
         return min(self.plan.step, last) if self.own_plans else last
 
     def plan_at(self, time_s: float) -> DrawnPlan:
-        """Return the last plan up to a time; an empty plan before the first."""
-        due = time_s / self.dt_s + 1e-6
-        plans = [plan for plan in self.own_plans if plan.step <= due]
+        """Return the last plan up to a time; an empty plan before the first plan."""
+        last_step = time_s / self.dt_s + 1e-6
+        plans = [plan for plan in self.own_plans if plan.step <= last_step]
         return plans[-1] if plans else DrawnPlan(step=0, lines={})
 
     def known_at(self, step: int) -> KnownMap | None:
-        """Return the knowledge at a step; None if the robot does not learn."""
+        """Return the robot's known map at a step; None if the robot does not learn."""
         for known_map in reversed(self.known):
             if known_map.step <= step:
                 return known_map
@@ -217,9 +220,9 @@ class Recording(Ground):
         return known_map.predicted, known_map.free
 
     def _stored(self) -> dict[str, Any]:
-        """Return the values, with plans and knowledge packed into few arrays.
+        """Return the values, with plans and known maps packed into few arrays.
 
-        Plans are thinned, except the one that figures show.
+        Plans are thinned, except the plan that figures show.
         """
         values = super()._stored()
         del values["plans"]

@@ -31,29 +31,30 @@ def replay(
     video: str = "",
     out: str = "",
 ) -> int:
-    """Play back an episode, or several on one map; create missing recordings first.
+    """Play back one or several episodes on a map; create missing recordings first.
 
-    Several labels of a column, such as --risk mean,cvar:0.9, show their conditions
-    together. For a column without a label, the run's first label that fits is taken.
+    With several labels of a column, such as --risk mean,cvar:0.9, their conditions are
+    shown together. For a column without a label, the first matching label of the run
+    is taken.
 
     Args:
         labels: Labels of the conditions.
         folder: Run folder.
-        seed: Root seed; by default, the run's first.
+        seed: Root seed; by default, the run's first seed.
         realisation: Index of the draw of λ.
         map: Index of the map in the scenario.
-        view: Open the viewer; false only creates the recording.
+        view: Open the viewer; if false, only create the recording.
         web: Serve the viewer to a browser on this machine until Ctrl-C.
-        video: Write a video to this file, .mp4, instead of opening the viewer;
-            conditions are side by side.
+        video: Write a video to this .mp4 file instead of opening the viewer, with
+            conditions side by side.
         out: Folder for recordings of a read-only run; if empty, the run folder.
     """
     from benchnav.eval.find_episodes import find_episodes
 
     if video and Path(video).suffix != VIDEO:
-        raise ConfigError(f"Expected `video` as a file {VIDEO}, got {video!r}.")
+        raise ConfigError(f"Expected `video` as a {VIDEO} file, got {video!r}.")
     if video and web:
-        raise ConfigError("Expected `video` or `web`, got both.")
+        raise ConfigError("Expected `video` or `web`, got both. Leave one out.")
     run = Path(folder)
     out_folder = other_folder(folder, out)
     episodes = find_episodes(run, labels.selected, seed, realisation, map)
@@ -68,9 +69,8 @@ def replay(
     worlds = dict.fromkeys(unit.condition.labels["world"] for unit, _ in episodes)
     if len({repr(unit.condition.world) for unit, _ in episodes}) > 1:
         raise ConfigError(
-            "Expected conditions of one world to show on one map, got "
-            f"{', '.join(worlds)}. Pass --video FILE.mp4, "
-            "which shows them side by side."
+            "Expected conditions with the same world, since the viewer shows one map, "
+            f"got {', '.join(worlds)}. Pass --video FILE.mp4 to show them side by side."
         )
     path = _viewer_file(run, episodes, out_folder)
     print(f"recording: {path}")
@@ -90,14 +90,14 @@ def replay(
         return 1 if completed.returncode else 0
     reason = "no display was found; " if view else ""
     print(
-        f"{reason}view it with: {program('rerun')} {path}, in a browser with --web, "
-        f"or as --video FILE{VIDEO}"
+        f"{reason}view the recording by `{program('rerun')} {path}`, in a browser by "
+        f"--web, or as a video by --video FILE{VIDEO}"
     )
     return 0
 
 
 def program(name: str) -> str:
-    """Return the command that starts a program of this environment."""
+    """Return the command for a program of this environment: its name or its path."""
     path = Path(sys.executable).parent / name
     search_path = os.environ.get("PATH", "").split(os.pathsep)
     if path.parent in map(Path, search_path):
@@ -108,20 +108,21 @@ def program(name: str) -> str:
 
 
 def other_folder(run: str, out: str) -> Path:
-    """Return the folder for files derived from a run: the run, or another folder.
+    """Return the folder for files derived from a run: `out`, or the run folder.
 
     Args:
         run: the run folder.
-        out: another folder; empty for none.
+        out: folder for the files; if empty, the run folder.
 
     Raises:
-        ConfigError: If the other folder is another run.
+        ConfigError: If `out` is the folder of another run.
     """
     out_folder = Path(out or run)
     is_run = (out_folder / "run.json").exists()
     if is_run and out_folder.resolve() != Path(run).resolve():
         raise ConfigError(
-            f"Expected `out` as a folder that holds no other run, got {out}."
+            f"Expected `out` as a folder without another run, got {out}. Choose "
+            "another folder."
         )
     return out_folder
 
@@ -131,16 +132,16 @@ def _recordings(
 ) -> "list[Recording]":
     from benchnav.eval.run.recordings import find_recording
 
-    return [find_recording(folder, unit, member, out) for unit, member in episodes]
+    return [find_recording(folder, unit, index, out) for unit, index in episodes]
 
 
 def _viewer_file(folder: Path, episodes: "list[tuple[Unit, int]]", out: Path) -> Path:
-    """Return the path of the episodes' viewer file, creating it if it is missing."""
+    """Return the path of the episodes' viewer file; create the file if necessary."""
     from benchnav.eval.folder.checksums import is_as_noted, note_checksums
     from benchnav.eval.report.playback.viewer_file import write_rerun
 
-    unit, member = episodes[0]
-    path = out / unit.recording_path(member, ".rrd")
+    unit, index = episodes[0]
+    path = out / unit.recording_path(index, ".rrd")
     if len(episodes) > 1:
         conditions = "".join(unit_.condition.id for unit_, _ in episodes)
         digest = hashlib.sha256(conditions.encode()).hexdigest()[:8]
@@ -149,7 +150,7 @@ def _viewer_file(folder: Path, episodes: "list[tuple[Unit, int]]", out: Path) ->
             digest,
             unit.seed,
             unit.realisation,
-            f"{unit.maps[member]:05d}",
+            f"{unit.maps[index]:05d}",
         )
         path = path.with_name(f"together-{'-'.join(map(str, words))}.rrd")
     if len(episodes) > 1 or not path.exists() or not is_as_noted(out, path):

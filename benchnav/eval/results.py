@@ -30,7 +30,7 @@ class Comparison:
     """Paired differences of conditions.
 
     Args:
-        numbers: a row per pair; the columns of `compare`'s CSV.
+        numbers: one row per pair, with the columns of the CSV file of `compare`.
         table: formatted table, with notes.
     """
 
@@ -42,7 +42,7 @@ class Comparison:
         return write_comparison(Path(stem), self.numbers, self.table)
 
     def __repr__(self) -> str:
-        """Return the size, in one line."""
+        """Return one line with the number of pairs."""
         return (
             f"Comparison of {len(self.numbers)} pairs; .numbers is a DataFrame, "
             "print() shows the table"
@@ -61,7 +61,7 @@ class Results:
 
     Args:
         folder: a run folder.
-        temporary: temporary folder that contains it, which is deleted together with
+        temporary: temporary folder that contains `folder` and is deleted together with
             this object.
     """
 
@@ -86,7 +86,7 @@ class Results:
 
     @property
     def conditions(self) -> pd.DataFrame:
-        """One row per condition, by its id: the labels of its parts."""
+        """One row per condition, by id: the labels of its parts."""
         entries = self._rows.conditions
         labels = [entry["labels"] for entry in entries.values()]
         return pd.DataFrame(
@@ -116,7 +116,7 @@ class Results:
 
         Conditions are ordered by success rate. The test is a max-T bootstrap test over
         maps; see docs/concepts/statistics.md. If no condition of a block is
-        significantly worse, all competing conditions of the block are returned.
+        significantly worse, all conditions of the block that compete are returned.
         """
         summary = self._report.summary
         competing = summary[summary["best_alike"].astype(bool)]
@@ -142,12 +142,12 @@ class Results:
 
         Args:
             by: column in which the conditions of a pair differ, such as "risk"; if
-                empty, the column of `against`, or "risk".
-            against: label with which all others are compared; if empty, all pairs are
-                compared.
-            points: difference in success rate in percentage points, for which the table
-                states the required number of maps.
-            **labels: labels of the compared conditions, one or several of each column,
+                empty, the column of `against`, or "risk" without `against`.
+            against: label with which all other conditions are compared; if empty, all
+                pairs are compared.
+            points: difference in success rate, in percentage points. The table states
+                the number of maps that is required to detect it.
+            **labels: labels of the compared conditions, one or several for each column,
                 such as planner="mppi".
 
         Raises:
@@ -174,8 +174,8 @@ class Results:
 
         Args:
             folder: folder of the report; if None, the run folder.
-            figures: custom figures, after the shipped ones. One that raises is left
-                out, and the page says why.
+            figures: custom figures, after the shipped ones. A figure that raises is
+                left out, and the page states the reason.
         """
         out = Path(folder) if folder else self.folder
         if out == self.folder and not self._rows.is_partial:
@@ -198,8 +198,8 @@ class Results:
         target = Path(folder)
         if is_taken(target):
             raise ConfigError(
-                f"Expected `folder` to be new or empty, got {target}, which holds "
-                "something."
+                f"Expected `folder` to be new or empty, got {target}, which is neither."
+                " Choose another folder."
             )
         target.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(
@@ -215,7 +215,7 @@ class Results:
         return read_report(self.folder, partial=self._rows.is_partial)
 
     def __repr__(self) -> str:
-        """Return up to six lines: size, success, folder, and what to read first."""
+        """Return lines with size, success rate, folder and the main attributes."""
         n_conditions = len(self._rows.conditions)
         n_maps = self._rows.episodes["map"].nunique()
         rate = 100 * self._rows.episodes["success"].mean()
@@ -234,10 +234,10 @@ class Results:
 
 
 class Plots:
-    """Figures of a run as methods, named as their files with `_` for `-`.
+    """Figures of a run as methods, with the names of their files and `_` for `-`.
 
-    Calling the object with a figure draws that figure. A figure with several variants,
-    such as `over`, is returned as a list of all variants.
+    Calling this object with a figure draws that figure. A figure with several variants,
+    such as `over`, is drawn as a list of all variants.
     """
 
     def __init__(self, results: Results) -> None:
@@ -248,13 +248,13 @@ class Plots:
         """Draw a custom figure; return a list if it has several variants.
 
         Raises:
-            ConfigError: If the run lacks what the figure needs.
+            ConfigError: If the run lacks data that the figure needs.
         """
         variants = figure.variants(self._results._report)
         if not variants:
             raise ConfigError(
-                f"Expected a run with what figure {figure.name!r} needs, got "
-                f"{self._results.folder}."
+                f"Expected a run with the data that figure {figure.name!r} needs, got "
+                f"{self._results.folder}, which lacks them."
             )
         return self._draw_all(variants)
 
@@ -274,7 +274,7 @@ class Plots:
         return partial(self._draw, name)
 
     def _draw(self, name: str) -> Drawing | list[Drawing]:
-        """Draw the figure of a name, or all variants of a figure of that name."""
+        """Draw the figure with this name, or all variants of the figure."""
         figures = self._figures
         matching = []
         for figure_name, figure in figures.items():
@@ -283,18 +283,18 @@ class Plots:
                 matching.append(figure)
         if not matching:
             raise ConfigError(
-                f"Expected a figure among {', '.join(figures)}, got "
+                f"Expected a figure of the run ({', '.join(figures)}), got "
                 f"{name!r}.{hint(name, figures)}"
             )
         return self._draw_all(matching)
 
     def _draw_all(self, figures: Sequence[Figure]) -> Drawing | list[Drawing]:
-        drawn = [figure(self._results._report) for figure in figures]
-        return drawn[0] if len(drawn) == 1 else drawn
+        drawings = [figure(self._results._report) for figure in figures]
+        return drawings[0] if len(drawings) == 1 else drawings
 
 
 def open_results(folder: str | Path) -> Results:
-    """Open a run folder, finished or not, as the results that `evaluate` returns.
+    """Open the results of a run folder, finished or not; see `evaluate`.
 
     Raises:
         ConfigError: If the folder is no run folder, or has no finished unit.

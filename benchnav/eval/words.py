@@ -12,17 +12,18 @@ from benchnav.planning.world.outcome import FAILURES
 from benchnav.stats.tables import p_value, short
 from benchnav.viz.style import planner_name, risk_name
 
-# Columns of the summary that count failures of each outcome, and their names in text.
+# Columns of the summary with the number of failures of each outcome, and names in text.
 _FAILURES = [outcome.name.lower() for outcome in FAILURES]
 FAILURE_COUNTS = {f"{name}_count": name.replace("_", " ") for name in _FAILURES}
-_READ = {"planner": planner_name, "risk": risk_name}
-NOT_YET = "not yet a test"  # of a hypothesis, while its run is not finished
-# Labels that distinguish conditions on one map.
+# Functions from a stored label to the label as papers write it, by column.
+_NAME_OF_LABEL = {"planner": planner_name, "risk": risk_name}
+NOT_YET = "not yet a test"  # in place of p-values while the run is not finished
+# Columns whose labels distinguish conditions on one map.
 NAMING = ("planner", "risk", "model", *KNOWLEDGE, "robot", "objective", "world")
 
 
 def differ(labels: Iterable[str]) -> bool:
-    """Return whether labels differ, apart from labels of unused parts."""
+    """Return whether labels differ; `NOT_USED` is ignored."""
     return len(set(labels) - {NOT_USED}) > 1
 
 
@@ -31,24 +32,24 @@ def reading_name(column: str, label: str) -> str:
 
     Args:
         column: column of the label, such as `risk`.
-        label: label as typed and stored.
+        label: label as stored.
     """
-    written = _READ.get(column)
-    return written(label) if written else label
+    to_name = _NAME_OF_LABEL.get(column)
+    return to_name(label) if to_name else label
 
 
 def reading_names(labels: str) -> str:
-    """Return comma-separated labels, such as a hypothesis has, as papers write them."""
+    """Return comma-separated labels, as in a hypothesis, as papers write them."""
     return ", ".join(planner_name(risk_name(label)) for label in labels.split(", "))
 
 
 def naming_labels(summary: pd.DataFrame) -> list[str]:
-    """Return the columns that name a condition in addition to planner and risk."""
+    """Return the columns that differ and name a condition next to planner and risk."""
     return [name for name in ("model", *KNOWLEDGE) if differ(summary[name])]
 
 
 def blocks(summary: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
-    """Return title and rows of each block of a run."""
+    """Return the title and the rows of each block of a run, from its summary."""
     differing = [name for name in BLOCK if summary[name].nunique() > 1]
     keys = [name for name in BLOCK if name == "scenario" or name in differing]
     titled = []
@@ -58,17 +59,18 @@ def blocks(summary: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
     return titled
 
 
-def condition_name(labels: Mapping[str, Any], several: Collection[str] = ()) -> str:
+def condition_name(labels: Mapping[str, Any], differing: Collection[str] = ()) -> str:
     """Return a condition's name: planner, risk setting and labels that differ.
 
     Args:
         labels: labels of the condition by column.
-        several: columns that differ among the conditions shown: `model`, `world`,
-            sensors and belief.
+        differing: columns whose labels differ between the shown conditions; only
+            `model`, `world`, sensors and belief are used.
     """
-    columns = [name for name in ("model", *KNOWLEDGE, "world") if name in several]
-    # A planner given λ has a model but no risk setting; a blind planner has neither.
-    if labels["risk"] == NOT_USED and "model" not in several:
+    columns = [name for name in ("model", *KNOWLEDGE, "world") if name in differing]
+    # A planner that is given λ has a model but no risk setting; a blind planner has
+    # neither.
+    if labels["risk"] == NOT_USED and "model" not in differing:
         columns.insert(0, "model")
     planner = planner_name(labels["planner"])
     risk = risk_name(labels["risk"])
@@ -81,12 +83,12 @@ def episode_names(labels: Sequence[Mapping[str, str]]) -> list[str]:
     Args:
         labels: labels of each episode's condition.
     """
-    several = _differing(labels)
-    extra = [name for name in ("robot", "objective") if name in several]
+    differing = _differing(labels)
+    extra = [name for name in ("robot", "objective") if name in differing]
     names = []
     for row in labels:
         further = [row[name] for name in extra]
-        names.append(joined([condition_name(row, several), *further]))
+        names.append(joined([condition_name(row, differing), *further]))
     return names
 
 
@@ -98,14 +100,14 @@ def _differing(labels: Sequence[Mapping[str, str]]) -> list[str]:
 
 
 def with_names(summary: pd.DataFrame) -> pd.DataFrame:
-    """Return the summary with the `name` of each condition."""
-    several = naming_labels(summary)
-    names = [condition_name(row, several) for row in summary.to_dict("records")]
+    """Return the summary with a column `name` of the conditions' names."""
+    differing = naming_labels(summary)
+    names = [condition_name(row, differing) for row in summary.to_dict("records")]
     return summary.assign(name=names)
 
 
 def contender_names(labels: Sequence[Mapping[str, str]]) -> list[str]:
-    """Name conditions by the labels that differ, or by their planner if no label does.
+    """Name conditions by the labels that differ; by planner if no label differs.
 
     Args:
         labels: labels of each condition.
@@ -120,7 +122,7 @@ def contender_names(labels: Sequence[Mapping[str, str]]) -> list[str]:
 
 
 def joined(labels: Iterable[str]) -> str:
-    """Join labels by commas, without labels of unused parts."""
+    """Join labels by commas, without `NOT_USED`."""
     return ", ".join(label for label in labels if label != NOT_USED)
 
 
@@ -131,17 +133,17 @@ def unit_of_statistics(summary: pd.DataFrame) -> str:
 
 
 def maps_in_words(maps: int | str, groups: int | str) -> str:
-    """Return the number of maps in words, and the number of groups if there are any."""
+    """Return the number of maps in words, and of groups if the dataset has groups."""
     return f"{maps} maps" if groups == maps else f"{maps} maps in {groups} groups"
 
 
 def rate_in_words(row: Mapping[Any, Any]) -> str:
-    """Return a success rate in per cent, precise enough to show 1 failure of 200."""
+    """Return a success rate in per cent, with digits for 1 failure in 200 episodes."""
     return short(100 * row["success_rate"])
 
 
 def failures_in_words(row: Mapping[Any, Any]) -> str:
-    """Return counts of failures, such as `2 stuck, 1 stalled`; a dash for no failure.
+    """Return counts of failures, such as `2 stuck, 1 stalled`; a dash without failure.
 
     Args:
         row: row of the summary.
@@ -154,12 +156,12 @@ def failures_in_words(row: Mapping[Any, Any]) -> str:
 
 
 def chosen_in_words(shown: int, total: int) -> str:
-    """Describe the choice of the shown conditions; empty if all are shown."""
+    """Describe which conditions are shown; empty if all are shown."""
     if shown >= total:
         return ""
     return (
-        f" Shown are {shown} of {total} conditions, as many successes as failures if "
-        "possible."
+        f" The figure shows {shown} of {total} conditions, with equally many successes "
+        "and failures if possible."
     )
 
 

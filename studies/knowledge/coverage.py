@@ -34,9 +34,9 @@ from benchnav.core.copula import correlated_normal
 from benchnav.eval import Suite
 from benchnav.eval.experiment.condition import conditions_of
 from benchnav.eval.experiment.unit import Extent, Unit, units
-from benchnav.eval.run.knowledge import Knowing
+from benchnav.eval.run.knowledge import KnowledgeTracker
 from benchnav.eval.run.rollout import Observer
-from benchnav.eval.run.unit import Built, Settings, read_block, simulate
+from benchnav.eval.run.unit import Settings, UnitInputs, read_block, simulate
 from benchnav.planning.world.realisation import are_connected
 from studies.study import Rows, Work
 from studies.units import build_unit, one_unit, stakes_suite
@@ -56,7 +56,7 @@ class Coverage:
     the belief, log scores of the prediction.
     """
 
-    def __init__(self, unit: Unit, built: Built) -> None:
+    def __init__(self, unit: Unit, built: UnitInputs) -> None:
         """Draw the times at which the belief is checked."""
         assert built.learning is not None
         assert built.simulation.field is not None
@@ -74,9 +74,9 @@ class Coverage:
         self._rank = torch.from_numpy(rank)
         self.sums = torch.zeros(len(maps), 6, dtype=torch.float64)
 
-    def __call__(self, step: int, knowing: Knowing) -> None:
+    def __call__(self, step: int, knowing: KnowledgeTracker) -> None:
         """Add the scores of robots that are still driving and have a check now."""
-        knowledge, members = knowing.known, knowing.members
+        knowledge, members = knowing.known, knowing.episode_indices
         footprint = knowledge.footprint
         has_check = (self._steps[members] == step).any(1)
         is_checked = has_check & footprint.flatten(1).any(1)
@@ -205,12 +205,12 @@ def rejection(data: Path, maps: int) -> Rows:
             scores = correlated_normal(key, np.array(unit.maps), grid.shape, length)
             field = truth.from_normal(torch.from_numpy(scores).float()).double()
             is_immobile = field < world.immobile.below
-            is_kept = are_connected(~is_immobile, grid, block.places)
+            is_kept = are_connected(~is_immobile, grid, block.endpoints)
             drawn = torch.stack((torch.ones_like(field), field, is_immobile.double()))
             sums += torch.stack((drawn, drawn * is_kept[:, None, None]))
             n_rejected += int((~is_kept).sum())
         all_draws, kept_draws = (part[1:] / part[0].clamp(min=1) for part in sums)
-        near = _near_line(block.places.start_m, block.places.goal_m, grid)
+        near = _near_line(block.endpoints.start_m, block.endpoints.goal_m, grid)
         # Maps whose draws were all rejected have no accepted λ to compare.
         for index in sums[1, 0].flatten(1).amax(1).nonzero()[:, 0].tolist():
             change = (kept_draws - all_draws)[:, index]

@@ -70,7 +70,7 @@ def unit_of(data: Path | str, **changes: Any) -> Unit:
         realisation=0,
         maps=(0, 1),
         record="all",
-        leads=True,
+        is_first_unit=True,
     )
 
 

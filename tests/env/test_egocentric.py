@@ -15,7 +15,7 @@ from benchnav.core.batch import map_tensors
 from benchnav.core.errors import BenchnavError, ConfigError
 from benchnav.env.egocentric_batch import EgocentricBatch
 from benchnav.env.view import CHANNELS, View
-from benchnav.eval.run.knowledge import Knowing, Learning
+from benchnav.eval.run.knowledge import KnowledgeTracker, Learning
 from benchnav.models import TraversabilityModel
 from benchnav.models.predictor import Oracle
 from benchnav.planning.problem import Prediction, pose_problem
@@ -167,7 +167,7 @@ def test_what_is_known_is_what_robots_of_an_evaluation_know(
         batch._task, prediction, places.start_m[chosen], places.goal_m[chosen], 3.0
     )
     knowing, running = (
-        Knowing(Learning(learner=learner, start=start, truth=truth), problem),
+        KnowledgeTracker(Learning(learner=learner, start=start, truth=truth), problem),
         now.running,
     )
     changed = 0

@@ -84,7 +84,7 @@ def test_every_known_part_is_listed_with_a_purpose_and_all_its_options(
         assert "cannot be used" not in entries[name].purpose
         target = registry.find(kind, name).target
         if is_family(target):
-            assert f"Trained by `benchnav-train fit {name}`" in entries[name].purpose
+            assert f"Train it by `benchnav-train fit {name}`" in entries[name].purpose
             continue
         options = " ".join(entries[name].options)
         assert all(option in options for option in registry.options_of(kind, target))

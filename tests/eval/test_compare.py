@@ -204,7 +204,7 @@ def test_what_other_code_made_is_compared_only_when_asked_and_then_said_in_every
     refused = capsys.readouterr().err
     assert refused.count("\n") == 1
     assert (
-        f"only in their risk, got conditions made by different code: b differs from a in {told}. "
+        f"only in their risk, got conditions that were run with different code: b differs from a in {told}. "
         in refused
     )
     assert not list(tmp_path.glob("table*"))
@@ -296,7 +296,7 @@ def test_rows_of_one_condition_that_disagree_are_refused(tmp_path: Path) -> None
 def test_what_found_no_partner_is_named(tmp_path: Path) -> None:
     folder = run_folder(tmp_path / "run", settings())
     _, shown = compare_runs([folder], "planner", "", {"risk": ("mean", "–")}, 0.05)
-    assert not any("Not in the table" in note for note in shown.notes)
+    assert not any("Conditions not in the table" in note for note in shown.notes)
     lonely = {"part": "mppi", "options": {"theta": 5.0}}
     episodes = settings()[
         lambda rows: (rows["planner"] != "cl_rrt") | (rows["risk"] != "var")
@@ -306,12 +306,12 @@ def test_what_found_no_partner_is_named(tmp_path: Path) -> None:
         [other], "planner", "", {"planner": ("mppi", "cl_rrt")}, 0.05
     )
     assert (
-        "Not in the table, since no condition differs from them only in planner: MPPI VaR."
+        "Conditions not in the table, since no other condition differs from them only in planner: MPPI VaR."
         in shown.notes
     )
     _, shown = compare_runs([folder], "", "mean", {}, 0.05)
     assert (
-        "Not in the table, since no condition differs from them only in risk: straight."
+        "Conditions not in the table, since no other condition differs from them only in risk: straight."
         in shown.notes
     )
 
@@ -335,7 +335,7 @@ def test_maps_of_unequally_many_draws_all_count_and_what_is_left_out_is_named(
     table, shown = compare_runs([uneven], "risk", "", {}, 0.05)
     assert (table["n_maps"][0], table["n_episodes"][0]) == (12, 17)
     assert shown.notes[0].endswith(
-        ", 12 maps, 17 episodes a condition, the same draws of λ."
+        ", 12 maps, 17 episodes per condition, the same draws of λ."
     )
     assert not any("left out" in note for note in shown.notes)
     short = run_folder(
@@ -418,7 +418,7 @@ def test_runs_with_conditions_of_their_own_are_compared_across(tmp_path: Path) -
     elsewhere = run_folder(
         tmp_path / "c", episodes[episodes["risk"] == "mean"], datasets=other
     )
-    with pytest.raises(ConfigError, match="other digests"):
+    with pytest.raises(ConfigError, match="whose maps differ"):
         compare_runs([cautious, elsewhere], "", "mean", {}, 0.05)
 
 
@@ -475,7 +475,7 @@ def test_command_prints_and_writes(tmp_path: Path, capsys) -> None:  # type: ign
     )
     printed = capsys.readouterr().out
     assert "corrected over 4 pairs (Holm)" in printed
-    assert "12 maps, 12 episodes a condition" in printed
+    assert "12 maps, 12 episodes per condition" in printed
     assert "20 points need" in printed
     numbers = pd.read_csv(out.with_suffix(".csv"))
     assert list(numbers["one"]) == ["cvar", "var"] * 2

@@ -40,7 +40,7 @@ def test_run_report_and_replay(
     # The same command again finds all done; with another seed it extends the run.
     again = ("run", "--data", str(dataset_path), "--out", str(out), *SMALL)
     assert call("eval", *again) == 0
-    assert "2 of 2 units were there already" in capsys.readouterr().err
+    assert "2 of 2 units were already finished" in capsys.readouterr().err
     assert call("eval", *again, "--seed", "1") == 0
     assert f"{out} is extended by more episodes" in capsys.readouterr().err
     # A suite that cannot be run drops nothing.
@@ -154,9 +154,7 @@ def test_a_planner_that_fails_ends_with_status_1(
     arguments = ("run", "--data", str(dataset_path), "--out", str(out), *SMALL[2:-2])
     assert call("eval", *arguments, "--planners", f"[straight,{faulty}]") == 1
     captured = capsys.readouterr()
-    assert (
-        "failed in some episodes (1 planner_error); the first fault: " in captured.err
-    )
+    assert "failed in some episodes (1 planner_error); first error: " in captured.err
     assert "errors.txt" in captured.err
     assert "straight" in captured.out
 

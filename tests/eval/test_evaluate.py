@@ -230,7 +230,7 @@ def test_objects_of_one_process_are_marked_and_not_resumed(
         ConfigError, match="whose planner mine was an object of one process"
     ):
         evaluate(**given, folder=tmp_path / "run")
-    with pytest.raises(ConfigError, match="which only this process has"):
+    with pytest.raises(ConfigError, match="which exists only in this process"):
         evaluate(**given, jobs=2)
     assert call("eval", "rerun", tmp_path / "run") == 2
 

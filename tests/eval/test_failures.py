@@ -157,12 +157,12 @@ def test_the_best_and_the_worst_that_sees_are_shown(tmp_path: Path) -> None:
     sheets, conditions = collected(tmp_path, recorded)
     ((title, (best, worst)),) = sheets.shown
     assert title == "std"
-    assert (best.name, best.among, list(best.failures["map"])) == (
+    assert (best.name, best.total, list(best.failures["map"])) == (
         "MPPI, CVaR",
         2,
         [8, 9],
     )
-    assert (worst.name, worst.among, list(worst.failures["map"])) == (
+    assert (worst.name, worst.total, list(worst.failures["map"])) == (
         "MPPI, mean",
         8,
         [2, 3, 4, 5],
@@ -196,5 +196,6 @@ def test_without_steps_there_is_no_sheet(tmp_path: Path) -> None:
     sheets, _ = collected(tmp_path, recorded, steps=False)
     assert sheets.shown == ()
     assert (
-        sheets.left_out == "there is no figure of failures, since the run kept no steps"
+        sheets.left_out
+        == "there is no figure of failures, since the run stored no steps"
     )

@@ -108,7 +108,7 @@ def test_conditions_that_begin_with_other_seeds_are_shown_under_one(
         ("astar_dwa", "cvar", "std", 4), ("mppi", "cvar", "std", 4)
     ]  # fmt: skip
     with pytest.raises(
-        ConfigError, match=r"got planner 'mppi', realisation 0, map 0, seed 7\."
+        ConfigError, match=r"got planner 'mppi', realisation 0, map 0, seed 7,"
     ):
         found(folder, planner=["straight", "mppi"])
     assert [
@@ -130,7 +130,7 @@ def test_a_label_that_no_condition_has_is_refused_also_for_a_blind_planner(
 
 
 def test_other_maps_do_not_stand_together(folder: Path) -> None:
-    with pytest.raises(ConfigError, match="conditions on one map"):
+    with pytest.raises(ConfigError, match="conditions on the same map"):
         found(folder, scenario=["std", "hs"])
 
 
@@ -144,6 +144,6 @@ def test_what_is_not_there_is_refused_with_what_is(
 ) -> None:
     with pytest.raises(
         ConfigError,
-        match=r"Expected an episode of the run, got .* It has .*planner straight, .*; map 0 to \d+\.",
+        match=r"Expected an episode of the run, got .* The run has .*planner straight, .*; map 0 to \d+\.",
     ):
         found(folder, **asked)

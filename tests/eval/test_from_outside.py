@@ -124,5 +124,5 @@ def test_a_metric_of_one_process_is_marked_and_not_resumed(
     assert any("not reproducible: metric steps" in line for line in results.notes)
     with pytest.raises(ConfigError, match="metric steps was an object of one process"):
         evaluate(**given, folder=tmp_path / "run")
-    with pytest.raises(ConfigError, match="which only this process has"):
+    with pytest.raises(ConfigError, match="which exists only in this process"):
         evaluate(**given, jobs=2)

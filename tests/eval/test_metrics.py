@@ -240,7 +240,10 @@ def test_a_run_that_is_extended_by_a_metric_runs_its_units_again_and_says_so(
     conditions = set(open_run(folder).conditions)
     after, said = run(dataset_path, folder, record="none", metrics=("energy",))
     assert f"{folder} is extended by metric energy" in said
-    assert "2 of 2 units are run again for metrics that they lack (energy_j)" in said
+    assert (
+        "2 of 2 units have no values of new metrics (energy_j) and are run again"
+        in said
+    )
     assert set(open_run(folder).conditions) == conditions
     assert list(after.columns) == [*before.columns[:-1], "energy_j", "code"]
     same = [
@@ -250,13 +253,15 @@ def test_a_run_that_is_extended_by_a_metric_runs_its_units_again_and_says_so(
     # No less is recorded than was, and what has the metric stays without a word of it.
     assert len(list((folder / "playback").glob("*.npz"))) == 2
     _, said = run(dataset_path, folder, record="none")
-    assert "2 of 2 units were there already" in said
+    assert "2 of 2 units were already finished" in said
     assert pd.read_parquet(folder / "episodes.parquet")["energy_j"].notna().all()
     # Units without it are of other code, and are not taken for units that have it.
     _, said = run(
         dataset_path, folder, record="none", metrics=(DETOUR,), reuse_code=True
     )
-    assert "2 of 2 units are run again for metrics that they lack (detour)" in said
+    assert (
+        "2 of 2 units have no values of new metrics (detour) and are run again" in said
+    )
 
 
 def test_other_units_wait_until_they_have_the_metric_too(
@@ -275,10 +280,10 @@ def test_other_units_wait_until_they_have_the_metric_too(
 @pytest.mark.parametrize(
     ("metrics", "message"),
     [
-        (("energy:200",), "names and columns of their own, got 'energy'"),
+        (("energy:200",), "that differ in name and column, got 'energy'"),
         (
             ({"part": "energy", "options": {"min_traversability": 0.2}},),
-            "Give one another `name` and `column`",
+            "Give one of them a different `name` and `column`",
         ),
     ],
 )
@@ -318,9 +323,12 @@ def own_metric(folder: Path, value: str, **attributes: str) -> str:
 @pytest.mark.parametrize(
     ("metrics", "message"),
     [
-        (("score",), "that a run does not already have, got 'score'. Leave it out"),
+        (
+            ("score",),
+            "other than the built-in ones, which every run has, got 'score'. Leave it out",
+        ),
         (("enrgy",), "Did you mean 'energy'"),
-        (("energy", "energy:5"), "names and columns of their own"),
+        (("energy", "energy:5"), "that differ in name and column"),
         (
             ("benchnav.planning:Unicycle",),
             "to be an instance of benchnav.metrics.Metric, got Unicycle",
@@ -338,7 +346,7 @@ def test_a_metric_that_cannot_be_had_is_refused_before_the_run(
 @pytest.mark.parametrize(
     ("value", "attributes", "message"),
     [
-        ("1 / 0", {}, "got ZeroDivisionError: division by zero.*tried on Episode"),
+        ("1 / 0", {}, "got ZeroDivisionError: division by zero.*tested on Episode"),
         ("math.inf", {}, "got inf"),
         ("'a'", {}, "got 'a'"),
         (
@@ -346,8 +354,8 @@ def test_a_metric_that_cannot_be_had_is_refused_before_the_run(
             {"better": "more"},
             "Expected `better` as 'higher', 'lower' or 'neither'",
         ),
-        ("1.0", {"column": "score"}, "and 'score' with 'score'"),
-        ("1.0", {"column": "map"}, "and 'bookkeeping' with 'map'"),
+        ("1.0", {"column": "score"}, "and 'score' with column 'score'"),
+        ("1.0", {"column": "map"}, "and 'bookkeeping' with column 'map'"),
     ],
 )
 def test_a_metric_that_breaks_its_contract_is_refused_before_the_run(
@@ -374,7 +382,7 @@ def test_a_metric_that_fails_in_the_run_stops_it_with_a_line_and_units_stay(
     bad = own_metric(tmp_path, "1.0 if episode.time_budget_s > 90 else math.inf")
     with pytest.raises(
         BenchnavError,
-        match=r"from metric 'own', got inf.*given an episode of .*seed 0, .*map 0\.",
+        match=r"from metric 'own', got inf.*The episode is one of .*seed 0, .*map 0\.",
     ):
         run(dataset_path, folder, metrics=(bad,))
     assert not (folder / "episodes.parquet").exists()
@@ -386,7 +394,7 @@ def test_a_metric_that_fails_in_the_run_stops_it_with_a_line_and_units_stay(
     rows, said = run(
         dataset_path, folder, metrics=(own_metric(tmp_path, "2 * episode.steps"),)
     )
-    assert "were finished by other code or maps (metric own)" in said
+    assert "were run with other code or maps (metric own)" in said
     assert (rows["own"] == 2 * (rows["end_time_s"] / 0.1).round()).all()
 
 
@@ -428,7 +436,7 @@ def test_shards_merge_and_reruns_repeat_with_the_metric(
     assert rerun.compare(tmp_path / "whole", tmp_path / "again") == (
         True,
         [
-            "all 8 rows came out the same",
+            "all 8 rows are identical",
             "no difference between the recorded environments",
         ],
     )

@@ -78,10 +78,13 @@ def test_a_suite_names_figures_of_its_report(tmp_path: Path) -> None:
     ("name", "why"),
     [
         ("Broken", "the figure broken is missing: ValueError: no such column"),
-        ("Double", "Expected a figure with a unique name, got 'success'."),
+        (
+            "Double",
+            "Expected a figure with a unique name that can be a file name, got 'success'.",
+        ),
         (
             "Outside",
-            "Expected a figure with a unique name, got '../outside'.",
+            "Expected a figure with a unique name that can be a file name, got '../outside'.",
         ),
     ],
 )
@@ -115,7 +118,7 @@ def test_what_is_no_figure_is_an_error_before_anything_runs_or_is_written(
     )
     assert not (folder / "report.html").exists()
     with pytest.raises(ConfigError, match=r"subclass of benchnav\.viz\.Figure"):
-        check_suite(Suite(figures=(part,)), elsewhere=False)
+        check_suite(Suite(figures=(part,)), uses_workers=False)
 
 
 def test_shipped_figures_have_names_and_needs_and_are_listed_in_order(

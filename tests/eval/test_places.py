@@ -92,7 +92,7 @@ def test_the_folder_that_the_user_is_in_can_be_dropped_and_merged_into(
 def test_a_copy_certifies_nothing(run: Path, tmp_path: Path) -> None:
     again = Path(shutil.copytree(run, tmp_path / "again"))
     with pytest.raises(
-        ConfigError, match=r"again, where 1 of 1 units are copies of that run"
+        ConfigError, match=r"again, where 1 of 1 units are copies of units of the run"
     ):
         list(rerun(run, again))
     # Nor under another account of the run.
@@ -121,7 +121,7 @@ def test_a_column_that_one_table_has_is_a_difference(run: Path, tmp_path: Path) 
     same, lines = compare(run, tmp_path / "again")
     assert not same
     assert "column more is in only one of the two tables" in lines
-    assert not any("came out the same" in line for line in lines)
+    assert not any("rows are identical" in line for line in lines)
 
 
 def test_a_run_is_reported_and_replayed_without_being_written(
@@ -154,7 +154,7 @@ def test_a_run_is_reported_and_replayed_without_being_written(
     capsys.readouterr()
     for command in ("report", "replay"):
         assert call("eval", command, str(run), "--out", str(other)) == 2
-        assert "holds no other run" in capsys.readouterr().err
+        assert "a folder without another run" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from benchnav.eval.recorded_plans import (
     DrawnPlan,
     KnownMap,
     drawn_plan,
-    reach_outline,
+    footprint_outline,
     thinned,
 )
 from benchnav.eval.recording import Recording, drawing_interval, read_recordings
@@ -276,7 +276,7 @@ def test_forty_seconds_of_learning_are_small(tmp_path: Path) -> None:
                 step=5 * place,
                 **numbers,
                 **masks,
-                outline=reach_outline(masks["seen"], 0.5),
+                outline=footprint_outline(masks["seen"], 0.5),
             )
         )
     replace(recording, known=tuple(known)).save(tmp_path / "with.npz")
@@ -303,7 +303,7 @@ def test_an_outline_goes_around_what_was_reached_line_by_line() -> None:
     cells = np.zeros((6, 5), bool)
     cells[2, 3] = True
     (known, *_) = made.learning_recording(5).known
-    lines = replace(known, outline=reach_outline(cells, 0.5)).outlines
+    lines = replace(known, outline=footprint_outline(cells, 0.5)).outlines
     assert sorted(line.tolist() for line in lines) == [
         [[1.5, 1.0], [1.5, 1.5]], [[1.5, 1.0], [2.0, 1.0]], [[1.5, 1.5], [2.0, 1.5]], [[2.0, 1.0], [2.0, 1.5]],
     ]  # fmt: skip

@@ -13,7 +13,7 @@ from rerun.chunk import RrdReader
 
 from benchnav.eval.find_episodes import propose
 from benchnav.eval.folder.run_folder import open_run
-from benchnav.eval.recording import GROUND, Ground
+from benchnav.eval.recording import GROUND, RecordedMap
 from benchnav.eval.report.playback import video, web
 from benchnav.eval.report.playback.video import frame_times
 from tests.commands import call
@@ -121,7 +121,7 @@ def test_each_option_asks_for_what_it_names(
     assert call("eval", "replay", str(folder), *words) == 2
     labels = ", ".join(f"{name} 'some {name}'" for name in columns)
     assert (
-        f"got {labels}, realisation 3, map 4, seed {seed}." in capsys.readouterr().err
+        f"got {labels}, realisation 3, map 4, seed {seed}, " in capsys.readouterr().err
     )
 
 
@@ -135,12 +135,12 @@ def test_what_is_proposed_are_unlike_outcomes_on_the_map_where_they_differ_most(
             faulty & (rows["map"] == 1) & ((rows["risk"] == "mean") == arrived)
         )
         with pytest.MonkeyPatch.context() as patch:
-            about = {**Ground.load(folder / GROUND).about, "map": 1}
+            about = {**RecordedMap.load(folder / GROUND).about, "map": 1}
             patch.setattr(
                 "benchnav.eval.find_episodes.read_table", lambda *_, own=rows: own
             )
             patch.setattr(
-                Ground, "load", lambda _, own=about: SimpleNamespace(about=own)
+                RecordedMap, "load", lambda _, own=about: SimpleNamespace(about=own)
             )
             labels, place = propose(folder)
         assert (labels["planner"], labels["risk"]) == (["Faulty"], ["mean", "cvar:0.5"])
@@ -163,7 +163,9 @@ def test_what_is_proposed_are_unlike_outcomes_on_the_map_where_they_differ_most(
         patch.setattr(
             "benchnav.eval.find_episodes.read_table", lambda *_, own=rows: own
         )
-        patch.setattr(Ground, "load", lambda _, own=about: SimpleNamespace(about=own))
+        patch.setattr(
+            RecordedMap, "load", lambda _, own=about: SimpleNamespace(about=own)
+        )
         assert propose(folder)[0]["risk"] == ["cvar:0.5", "mean"]
     rows["success"] = True
     with pytest.MonkeyPatch.context() as patch:
@@ -265,13 +267,13 @@ def test_run_says_what_it_recorded_and_how_it_is_replayed(
     [
         (
             ("replay", "RUN", "--video", "a.avi"),
-            "Expected `video` as a file .mp4, got 'a.avi'",
+            "Expected `video` as a .mp4 file, got 'a.avi'",
         ),
         (
             ("replay", "RUN", "--video", "a.mp4", "--web"),
             "Expected `video` or `web`, got both.",
         ),
-        (("replay", "RUN", "--video", "mp4"), "Expected `video` as a file .mp4"),
+        (("replay", "RUN", "--video", "mp4"), "Expected `video` as a .mp4 file"),
         (("replay", "RUN", "--planner", "mpi"), "planner straight, Faulty; "),
         (
             ("run", "--record", "some"),

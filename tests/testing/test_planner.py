@@ -205,7 +205,7 @@ class Draws(Good):
 
 
 BAD: dict[str, tuple[Any, str]] = {
-    "no planner": (object(), "Expected the planner to be a subclass of benchnav.planning.Planner, got object"),
+    "no planner": (object(), "Expected the planner to be an instance of benchnav.planning.Planner, got object"),
     "writes into the states": (acting(lambda step, _: step.state.zero_()), "got changes in step.state."),
     "writes into what was observed": (
         acting(lambda step, _: step.traversability.zero_()),
@@ -223,7 +223,7 @@ BAD: dict[str, tuple[Any, str]] = {
     "doubles": (action_of(lambda action, _: action.double()), "got torch.float64 of shape [4, 2]"),
     "elsewhere": (action_of(lambda action, _: action.to("meta")), "on cpu, got torch.float32 of shape [4, 2] on meta"),
     "too fast": (action_of(lambda action, _: action + 0.5), "within the robot's bounds"),
-    "no plan": (plan_of(lambda plan: None), "Expected a Plan as the last output"),
+    "no plan": (plan_of(lambda plan: None), "Expected `plan` to return a Plan as its third value"),
     "an unknown status": (plan_of(lambda plan: replace(plan, status=plan.status + 3)), "values of `PlanStatus`, 0–2"),
     "a status for all": (plan_of(lambda plan: replace(plan, status=plan.status[:1])), "got torch.int64 of shape [1]"),
     "a path for all": (plan_of(lambda plan: replace(plan, path=plan.path[:1])), "shape [4, N, 2], got [1, 3, 2]"),

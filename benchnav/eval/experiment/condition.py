@@ -1,8 +1,8 @@
-"""Conditions: the cells of an experiment as values, listed from a suite.
+"""Conditions: the cells of an experiment, which a suite lists.
 
-A condition is a data split, model, risk setting, planner, robot, objective, rules and
-world. Its id is the digest of that value; its labels are for people. Seeds,
-realisations and maps belong to the suite.
+A condition is a data split, a model, a risk setting, a planner, a robot, an objective,
+sensors, a belief, rules and a world. Its id is the digest of these settings; its labels
+are names for readers. Seeds, realisations and maps are no part of a condition.
 """
 
 import itertools
@@ -34,8 +34,8 @@ from benchnav.planning.planners.planner import INPUTS
 from benchnav.planning.problem import Task
 from benchnav.planning.world.world import World, read_world
 
-# Sensing and belief. Defaults are left out of ids, so that conditions of runs made
-# before these parts existed keep their ids.
+# Default parts of sensing and belief. Ids leave them out, so that conditions of runs
+# from before these parts existed keep their ids.
 KNOWLEDGE: Mapping[str, Mapping[str, Any]] = {
     "sensor": {"part": "full", "options": {}},
     "ground": {"part": "contact", "options": {}},
@@ -56,12 +56,13 @@ LABELS = (
 )
 NOT_USED = "–"
 ANY_RISK = Part(part="mean", label=NOT_USED, kind="risk")
-# Properties of a split on which results depend in addition to its maps;
+# Properties of a split that affect results in addition to its maps;
 # `TerrainDataset.about_digest` is their digest.
 MEANING = "class table, λ_stuck, resolution or kind of truth"
-# The only input by which a setting affects a planner if no robot learns.
-_BEARS_BY: Mapping[str, str] = {"risk": "risk_map", "belief": "fields"}
-_ORDER = ("robot", "objective", "model", *KNOWLEDGE, "risk", "planner")  # of tables
+# If the robot does not learn, a setting affects the planner only by this input.
+_INPUT_OF_SETTING: Mapping[str, str] = {"risk": "risk_map", "belief": "fields"}
+# Order of the rows of tables: the last kind varies fastest.
+_ORDER = ("robot", "objective", "model", *KNOWLEDGE, "risk", "planner")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,10 +83,10 @@ class Condition:
         rules: free space, minimum λ̂, goal radius and replanning interval.
         world: draws of λ and immobilising terrain.
         world_label: label of rules and world in tables.
-        blind: whether the planner is blind, so that model and risk measure change
-            nothing.
-        stands_for: labels of other settings by kind of part: they differ only in inputs
-            that the planner does not use, and are run as this condition.
+        blind: whether the planner is blind, so that model and risk measure have no
+            effect.
+        stands_for: labels of the settings that are merged into this condition, by kind
+            of part. They differ only in inputs that the planner does not use.
     """
 
     __repr__ = short_repr
@@ -107,21 +108,17 @@ class Condition:
     stands_for: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the fields without the cached task.
-
-        A process that unpickles the condition may first have to load the task's classes
-        from a file.
-        """
+        """Return the fields without the cached task, whose classes may be unknown."""
         return {item.name: getattr(self, item.name) for item in fields(self)}
 
     @property
     def split(self) -> str:
-        """Name of the data's split."""
+        """Name of the split of the dataset."""
         return f"test/{self.scenario}"
 
     @property
     def dataset(self) -> TerrainDataset:
-        """The dataset, reopened at each access, since its file may have changed."""
+        """The dataset, opened at each access, since its file may have changed."""
         return TerrainDataset(find_dataset(self.data))
 
     @property
@@ -148,7 +145,7 @@ class Condition:
 
     @property
     def labels(self) -> dict[str, str]:
-        """Labels in tables, by column."""
+        """Labels in tables, by column; `NOT_USED` for parts without effect."""
         labels = {"data": self.data, "scenario": self.scenario}
         for kind, part in self.parts.items():
             labels[kind] = part.label
@@ -174,7 +171,7 @@ class Condition:
 
     @property
     def unreproducible(self) -> tuple[str, ...]:
-        """Kind and label of parts that are objects only this process has."""
+        """Kind and label of each part that is an object of this process only."""
         names = []
         for kind, part in self.parts.items():
             if registry.is_object(kind, part.part):
@@ -213,19 +210,21 @@ class Condition:
 
     @property
     def unused(self) -> tuple[str, ...]:
-        """Kinds of parts whose setting affects no row of a planner that is not blind.
+        """Kinds of parts without effect on rows; empty if the planner is blind.
 
-        If a robot learns, changes of λ̂ determine when its planner receives another map,
-        so that every setting affects rows.
+        If the robot learns, changes of λ̂ determine when its planner receives a new map.
+        Every setting then affects rows.
         """
         if self.blind or self.learns:
             return ()
         used = self.planner_uses
-        return tuple(kind for kind, name in _BEARS_BY.items() if name not in used)
+        return tuple(
+            kind for kind, name in _INPUT_OF_SETTING.items() if name not in used
+        )
 
     @property
     def rows_id(self) -> str:
-        """Digest of the settings that affect rows; unused settings do not change it."""
+        """Digest of the settings that affect rows."""
         any_belief = part_of("belief", KNOWLEDGE["belief"], NOT_USED)
         defaults: dict[str, Any] = {"risk": ANY_RISK, "belief": any_belief}
         unused_parts = {kind: defaults[kind] for kind in self.unused}
@@ -233,7 +232,7 @@ class Condition:
 
 
 def condition_from(entry: Mapping[str, Any]) -> Condition:
-    """Rebuild a condition from its entry in `run.json`."""
+    """Return the condition of an entry in `run.json`."""
     value = {**KNOWLEDGE, **entry["value"]}
     labels = entry["labels"]
     parts: dict[str, Any] = {
@@ -266,8 +265,8 @@ def conditions_of(
 
     Args:
         suite: suite, as a user wrote it.
-        scenarios_of: function from the path or id of a dataset to the scenarios of its
-            test splits.
+        scenarios_of: function that maps the path or id of a dataset to the scenarios of
+            its test splits.
 
     Raises:
         ConfigError: If a part cannot be created as requested, two parts share a label,
@@ -279,9 +278,11 @@ def conditions_of(
         for condition in _product(listed, scenarios_of):
             if condition.id in ids:
                 words = " ".join(label_words(condition.labels))
-                raise ConfigError(f"Expected settings that differ, got {words} twice.")
+                raise ConfigError(
+                    f"Expected settings that differ, got {words} twice. Leave one out."
+                )
             ids.add(condition.id)
-            conditions.append(_as_run_once(condition))
+            conditions.append(_without_unused(condition))
     check_labels(conditions)
     by_id = {condition.id: condition for condition in conditions}
     return merge_alike(by_id.values())
@@ -290,16 +291,15 @@ def conditions_of(
 def merge_alike(conditions: Iterable[Condition]) -> list[Condition]:
     """Merge conditions that share a `rows_id`.
 
-    Each group is merged into its first condition with the risk setting `mean`, or into
-    its first condition.
+    Each group is merged into its first condition with risk `mean`, or else its first.
     """
     groups: dict[str, list[Condition]] = defaultdict(list)
     for condition in conditions:
         groups[condition.rows_id].append(condition)
     merged = []
     for group in groups.values():
-        of_mean = [condition for condition in group if condition.risk.part == "mean"]
-        representative, *_ = [*of_mean, *group]
+        with_mean = [condition for condition in group if condition.risk.part == "mean"]
+        representative, *_ = [*with_mean, *group]
         merged.append(merge(representative, group))
     return merged
 
@@ -317,7 +317,7 @@ def merge(representative: Condition, conditions: Sequence[Condition]) -> Conditi
     """
     stands_for: dict[str, tuple[str, ...]] = {}
     parts: dict[str, Any] = {}
-    for kind in _BEARS_BY:
+    for kind in _INPUT_OF_SETTING:
         labels: dict[str, None] = {}
         for condition in conditions:
             label = getattr(condition, kind).label
@@ -329,11 +329,11 @@ def merge(representative: Condition, conditions: Sequence[Condition]) -> Conditi
 
 
 def check_labels(conditions: Iterable[Condition]) -> None:
-    """Reject two settings under one label, and two labels of one setting.
+    """Reject two settings with the same label, and two labels of the same setting.
 
     Args:
-        conditions: conditions; the labels of earlier ones take precedence, and a
-            condition may be repeated.
+        conditions: conditions, which may be repeated. Messages take the labels of
+            earlier conditions as the correct ones.
 
     Raises:
         ConfigError: If there are such settings or labels.
@@ -351,21 +351,25 @@ def check_labels(conditions: Iterable[Condition]) -> None:
             digest = text_digest(setting)
             if digests.setdefault((name, label), digest) != digest:
                 raise ConfigError(
-                    f"Expected a label for each {name}, got two settings that are "
-                    f"both called {label!r}. "
-                    f"Write them as {{part: NAME, label: LABEL, options: {{…}}}}."
+                    f"Expected a different label for each {name}, got two settings "
+                    f"with the label {label!r}. Write them as "
+                    f"{{part: NAME, label: LABEL, options: {{…}}}}."
                 )
             first = labels.setdefault((name, digest), label)
             if first != label:
                 raise ConfigError(
-                    f"Expected one label for one {name}, got {label!r} and {first!r} "
-                    "for the same setting. Write "
-                    f"label: {first}."
+                    f"Expected one label for each {name}, got {label!r} and {first!r} "
+                    f"for the same setting. Write label: {first} for both."
                 )
 
 
 def _product(listed: Mapping[str, list[Any]], scenarios_of: Any) -> Iterator[Condition]:
-    """Yield the product of listed values; see `Suite.products`."""
+    """Yield the conditions of one product of a suite.
+
+    Args:
+        listed: values by field, from `Suite.products`.
+        scenarios_of: as in `conditions_of`.
+    """
     scenarios = {}
     for data in listed["data"]:
         scenarios[data] = listed["scenarios"] or scenarios_of(data)
@@ -395,11 +399,12 @@ def _product(listed: Mapping[str, list[Any]], scenarios_of: Any) -> Iterator[Con
             )
 
 
-def _as_run_once(condition: Condition) -> Condition:
-    """Replace settings that change nothing by a default.
+def _without_unused(condition: Condition) -> Condition:
+    """Replace settings without effect by defaults.
 
-    A blind planner uses no prediction. If λ is given, each risk measure is λ itself,
-    and nothing remains to be learnt. A belief that does not learn ignores measured λ.
+    A blind planner uses no prediction. The model `clairvoyant` predicts λ itself, so
+    that every risk measure returns λ and the robot has nothing to learn. A belief that
+    does not learn ignores measured λ.
     """
     unused: dict[str, Any] = {}
     for kind, default in KNOWLEDGE.items():
@@ -424,7 +429,7 @@ def label_words(
 
 
 def condition_names(conditions: Sequence[Condition]) -> list[str]:
-    """Name conditions by scenario, planner, risk setting and other labels that differ."""
+    """Return names: scenario, planner, risk setting and other labels that differ."""
     labels = [condition.labels for condition in conditions]
     columns = []
     for name in LABELS:
@@ -435,7 +440,7 @@ def condition_names(conditions: Sequence[Condition]) -> list[str]:
 
 
 def differences(a: Any, b: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Yield differences of plain data: dotted name and both values, None if missing."""
+    """Yield the dotted name and both values of each difference; None if missing."""
     if isinstance(a, Mapping) and isinstance(b, Mapping):
         for key in dict.fromkeys([*a, *b]):
             path = f"{name}.{key}".removeprefix(".")

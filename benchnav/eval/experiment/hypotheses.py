@@ -1,8 +1,9 @@
 """Hypotheses that a suite fixes before its first unit is run.
 
-A hypothesis compares two conditions by one metric. It claims that they differ, that the
-first is not worse by a margin, that the first is better by more than a margin, or that
-they are equal to within a margin. `benchnav.eval.stats.hypotheses` tests hypotheses.
+A hypothesis compares two conditions by one metric. It claims that the conditions
+differ, that the first is not worse by a margin, that the first is better by more than a
+margin, or that they are equal to within a margin. `benchnav.eval.stats.hypotheses` tests
+hypotheses.
 """
 
 import itertools
@@ -25,17 +26,18 @@ _Pair = tuple[Condition, Condition]
 
 @dataclass(frozen=True, kw_only=True)
 class Hypothesis:
-    """A claim about two conditions, as a suite writes it and as it is tested.
+    """A claim about two conditions, as written in a suite or as stored for its test.
 
     Args:
-        one: the condition that the claim is about: labels in a suite, an id in a test.
-        other: the condition that it is compared with: labels or an id, likewise.
+        one: condition that the claim is about: labels in a suite, an id in a test.
+        other: condition that `one` is compared with: labels in a suite, an id in a
+            test.
         metric: name of a metric.
-        kind: relation that is claimed.
-        direction: for a difference, the side on which `one` lies; if empty, the test is
-            two-sided. For non-inferiority and superiority, the better direction; if
-            empty, that of the metric.
-        margin: margin of all kinds except a difference, in the metric's unit.
+        kind: claimed relation.
+        direction: for a difference, whether `one` is claimed to be higher or lower; if
+            empty, the test is two-sided. For non-inferiority and superiority, the
+            better direction; if empty, the metric's better direction.
+        margin: margin in the metric's unit, > 0; 0 for a difference.
     """
 
     one: Any
@@ -53,7 +55,7 @@ class Hypothesis:
         Args:
             first_name: name of the condition that the claim is about.
             second_name: name of the condition that it is compared with.
-            quantity: the quantity compared.
+            quantity: quantity of the metric.
         """
         margin = f"{self.margin:g} {quantity.unit}".rstrip()
         subject = f"{quantity.words} of {first_name}"
@@ -71,7 +73,7 @@ class Hypothesis:
 
 
 def digest_of_tests(tests: Sequence[Mapping[str, Any]]) -> str:
-    """Return the digest of tests as `run.json` stores them, 16 hexadecimal digits."""
+    """Return the digest of the `tests` in `run.json`, 16 hexadecimal digits."""
     return text_digest(tests)[:16]
 
 
@@ -80,7 +82,7 @@ def fix_hypotheses(
     conditions: Conditions,
     quantities: Mapping[str, Quantity] = QUANTITIES,
 ) -> dict[str, Any]:
-    """Read the hypotheses of a suite, for `run.json`.
+    """Return the entry of a suite's hypotheses in `run.json`.
 
     Args:
         specs: hypotheses as the suite lists them.
@@ -88,13 +90,14 @@ def fix_hypotheses(
         quantities: quantities by which conditions may be compared, by name.
 
     Returns:
-        `tests`, each as plain data: the fields of `Hypothesis`, `names` (the names of
-        the two conditions in text) and `claim`; `digest`, their digest; and `episodes`,
-        the number of episodes of each condition that they name. Empty if there are no
-        hypotheses.
+        A mapping with three keys; empty if there are no hypotheses. `tests` is a list
+        of tests as plain data, each with the fields of `Hypothesis`, `names` (the names
+        of the two conditions in text) and `claim`. `digest` is the digest of `tests`.
+        `episodes` is the number of episodes by id of each compared condition.
 
     Raises:
-        ConfigError: If a hypothesis names something missing, or cannot be tested.
+        ConfigError: If a hypothesis names an unknown metric or label, or cannot be
+            tested.
     """
     candidates = [condition for condition, _ in conditions.values()]
     tests: list[dict[str, Any]] = []
@@ -105,7 +108,8 @@ def fix_hypotheses(
     for test in tests:
         if tests.count(test) > 1:
             raise ConfigError(
-                f"Expected hypotheses that differ, got twice: {test['claim']}."
+                f"Expected hypotheses that differ, got the same one twice: "
+                f"{test['claim']}. Leave one out."
             )
     episodes = {}
     for test in tests:
@@ -121,7 +125,7 @@ def _read(
     conditions: Sequence[Condition],
     quantities: Mapping[str, Quantity],
 ) -> list[dict[str, Any]]:
-    """Read a hypothesis of a suite: one test for each pair of conditions it names."""
+    """Return one test for each pair of conditions that a suite's hypothesis names."""
     hypothesis = read(Hypothesis, spec, of(where))
     check_known(f"`metric` of {where}", hypothesis.metric, quantities)
     quantity = quantities[hypothesis.metric]
@@ -134,13 +138,12 @@ def _read(
     pairs = _pairs(first, second, unnamed, where)
     if hypothesis.metric == TOTAL_TIME.name and any(map(_differ_in_budget, pairs)):
         raise ConfigError(
-            f"Expected {where} to compare T_total of conditions with one time budget, "
-            "got robots of different T, as "
-            "which failures count. Compare their success, or give the world "
-            "`time_budget_s`."
+            f"Expected {where} to compare T_total of conditions with the same time "
+            "budget T, got robots with different T. A failure counts as T. Compare "
+            "success instead, or give the world `time_budget_s`."
         )
-    # Text names conditions by the labels that the hypothesis names, and by other labels
-    # that vary between the pairs.
+    # The name of a condition in text consists of the labels that the hypothesis gives
+    # and of the other labels that vary between the pairs.
     labels = [condition.labels for pair in pairs for condition in pair]
     varying = [name for name in unnamed if _varies(labels, name)]
     tests = []
@@ -160,13 +163,13 @@ def _check_margin(hypothesis: Hypothesis, quantity: Quantity, where: str) -> Non
     max_margin = 100 if quantity.unit == "points" else math.inf
     if kind == "difference" and margin:
         raise ConfigError(
-            f"Expected no `margin` of {where}, a difference, got {margin:g}. Leave it "
-            "out."
+            f"Expected no `margin` in {where}, which claims a difference, got "
+            f"{margin:g}. Leave `margin` out."
         )
     if kind != "difference" and not 0 < margin < max_margin:
         raise ConfigError(
-            f"Expected `margin` of {where}, a test of {kind}, above 0 and below "
-            f"{max_margin} {quantity.unit}, got {margin:g}."
+            f"Expected `margin` of {where} above 0 and below {max_margin} "
+            f"{quantity.unit}, since it claims {kind}, got {margin:g}."
         )
 
 
@@ -177,15 +180,16 @@ def _with_direction(
     kind = hypothesis.kind
     if kind == "equivalence" and hypothesis.direction:
         raise ConfigError(
-            f"Expected no `direction` of {where}, an equivalence, got "
-            f"{hypothesis.direction!r}."
+            f"Expected no `direction` in {where}, which claims an equivalence, got "
+            f"{hypothesis.direction!r}. Leave `direction` out."
         )
     if kind not in ("non-inferiority", "superiority") or hypothesis.direction:
         return hypothesis
     if quantity.better == "neither":
         raise ConfigError(
-            f"Expected `direction` of {where}, a test of {kind}, since no direction is "
-            f"better for {hypothesis.metric!r}, got none. Say higher or lower."
+            f"Expected `direction` in {where}, which claims {kind}, since neither "
+            f"direction of {hypothesis.metric!r} is better, got none. Set higher or "
+            "lower."
         )
     return replace(hypothesis, direction=quantity.better)
 
@@ -228,7 +232,7 @@ def _named(
 
 
 def _labels_of(condition: Condition, name: str) -> tuple[str, ...]:
-    """Return the labels in a column of a condition and of settings it stands for."""
+    """Return the labels of a condition and of merged conditions, in one column."""
     return condition.labels[name], *condition.stands_for.get(name, ())
 
 
@@ -247,20 +251,21 @@ def _pairs(
     for name in ("data", "scenario", "world"):
         if any(getattr(a, name) != getattr(b, name) for a, b in pairs):
             raise ConfigError(
-                f"Expected {where} to compare conditions on the same maps under the "
-                f"same λ, got two of another {name}. Name one {name} in both."
+                f"Expected {where} to compare conditions on the same maps with the "
+                f"same draws of λ, got two that differ in {name}. Name the same {name} "
+                "in `one` and `other`."
             )
     return pairs
 
 
 def _agree(a: Condition, b: Condition, columns: Iterable[str]) -> bool:
-    """Return whether labels agree; a label that is not used agrees with any."""
+    """Return whether the labels in all columns agree; `NOT_USED` agrees with any."""
     labels = [{a.labels[name], b.labels[name]} - {NOT_USED} for name in columns]
     return all(len(values) <= 1 for values in labels)
 
 
 def _check_one_to_one(pairs: Sequence[_Pair], where: str) -> None:
-    """Reject a condition with several partners."""
+    """Reject pairs in which a condition is compared with several others."""
     for index, side in enumerate(("other", "one")):
         partners = defaultdict(list)
         for pair in pairs:
@@ -273,9 +278,9 @@ def _check_one_to_one(pairs: Sequence[_Pair], where: str) -> None:
                 if len(set(values)) > 1:
                     break
             raise ConfigError(
-                f"Expected {where} to name one condition to compare with another, got "
-                f"{len(labels)} that differ in {name} ({', '.join(values)}). Name the "
-                f"{name} in `{side}`."
+                f"Expected {where} to compare each condition with one other, got "
+                f"{len(labels)} others that differ in {name} ({', '.join(values)}). "
+                f"Name the {name} in `{side}`."
             )
 
 
@@ -290,11 +295,11 @@ def _raise_no_pair(
             settings.append(f"{kind} {', '.join(labels)}")
         raise ConfigError(
             f"Expected {where} to compare two conditions, got one: planner "
-            f"{a.labels['planner']!r} does not use {' and '.join(settings)}. Leave the "
-            "hypothesis out."
+            f"{a.labels['planner']!r} does not use {' and '.join(settings)}, so that "
+            "both sides name the same condition. Leave the hypothesis out."
         )
-    equal = ", ".join(unnamed) or "all else"
+    equal = ", ".join(unnamed) or "all other columns"
     raise ConfigError(
-        f"Expected {where} to name two conditions that are the same in {equal}, got "
-        "none. Name the same labels in `one` and `other`."
+        f"Expected {where} to name two conditions with the same labels in {equal}, got "
+        "none. Name these labels in `one` and `other`."
     )

@@ -29,7 +29,7 @@ _BOOKKEEPING = (
     "code",
     "time_budget_s",
 )
-# Fields of a metric's description on which results and hypotheses depend.
+# Fields of a metric's quantity that affect results and hypotheses.
 _FIXED = ("name", "column", "unit", "scale", "of_arrivals")
 
 
@@ -62,14 +62,14 @@ class NamedMetric:
 
     @property
     def is_object(self) -> bool:
-        """Whether the metric is an object that only this process has."""
+        """Whether the metric is an object of this process only."""
         return registry.is_object("metric", self.part.part)
 
 
 def read_metrics(
     specs: Sequence[PartSpec], robots: Iterable[Robot]
 ) -> tuple[NamedMetric, ...]:
-    """Read the metrics of a suite and measure each on an episode of each robot.
+    """Read the metrics of a suite, and test each on sample episodes of each robot.
 
     Args:
         specs: metrics as the suite lists them.
@@ -88,8 +88,8 @@ def read_metrics(
         metric: Metric = part.object
         if type(metric) in map(type, SHIPPED):
             raise ConfigError(
-                "Expected `metrics` that a run does not already have, got "
-                f"{part.part!r}. Leave it out."
+                "Expected `metrics` other than the built-in ones, which every run has, "
+                f"got {part.part!r}. Leave it out."
             )
         faults = attribute_faults(metric)
         if faults:
@@ -100,20 +100,26 @@ def read_metrics(
             try:
                 measure(metric, episode)
             except MetricError as error:
-                message = f"{error} It was tried on {episode} before the run."
+                message = f"{error} It was tested on {episode} before the run."
                 raise ConfigError(message) from error
         named = add_metric(named, NamedMetric(part=part, quantity=metric.quantity))
     return tuple(named)
 
 
 def add_metric(metrics: Sequence[NamedMetric], new: NamedMetric) -> list[NamedMetric]:
-    """Add a metric to those of a run.
+    """Return the metrics of a run with a new one.
 
-    A metric that the run already has keeps its position and takes the new description.
+    A metric that the run already has keeps its position and takes the new label and
+    quantity.
+
+    Args:
+        metrics: metrics of the run in addition to the built-in ones.
+        new: the new metric.
 
     Raises:
-        ConfigError: If another metric, or a column of every run, has the new metric's
-            name or column; or if the metric's name, column or unit has changed.
+        ConfigError: If another metric has the new metric's name or column, if each run
+            has a column of that name, or if the metric's name, column or unit has
+            changed.
     """
     quantity = new.quantity
     taken = [(builtin.name, builtin.column) for builtin in QUANTITIES.values()]
@@ -125,11 +131,11 @@ def add_metric(metrics: Sequence[NamedMetric], new: NamedMetric) -> list[NamedMe
     for name, column in taken:
         if name == quantity.name or column == quantity.column:
             raise ConfigError(
-                "Expected metrics with names and columns of their own, got "
-                f"{new.part.part!r} named {quantity.name!r} "
-                f"with column {quantity.column!r}, and {name or 'bookkeeping'!r} with "
-                f"{column!r}. Give one another "
-                "`name` and `column`, or another `out` to the run."
+                "Expected metrics that differ in name and column, got "
+                f"{new.part.part!r} with name {quantity.name!r} and column "
+                f"{quantity.column!r}, and {name or 'bookkeeping'!r} with column "
+                f"{column!r}. Give one of them a different `name` and `column`, or the "
+                "run a different `out`."
             )
     return [*metrics, new]
 
@@ -167,5 +173,5 @@ def further_quantities(manifest: Mapping[str, Any]) -> list[Quantity]:
 
 
 def quantities(further: Iterable[Quantity]) -> dict[str, Quantity]:
-    """Return all quantities by name: the built-in ones and further ones."""
+    """Return the built-in quantities and further ones, by name."""
     return {**QUANTITIES, **{quantity.name: quantity for quantity in further}}

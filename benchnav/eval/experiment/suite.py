@@ -42,12 +42,12 @@ _SEEDS = 2**63  # limit of an int64 column
 
 @dataclass(frozen=True, kw_only=True)
 class Suite:
-    """The product of everything listed, or of each mapping in `conditions`.
+    """An evaluation suite: the product of all listed values, or several products.
 
     A planner, model, risk measure, robot, objective, sensor, belief, metric or figure
     is given as NAME, package.module:Name, path/to/file.py:Name, or {part: NAME, label:
-    LABEL, options: {...}}; in a program also as an object, which is replaced by the
-    description that creates it again.
+    LABEL, options: {...}}. A program can also give an object; the suite stores the
+    description from which the object can be created again.
 
     Args:
         data: Path or id of a dataset with splits test/SCENARIO.
@@ -62,25 +62,27 @@ class Suite:
         sensors: Appearance sensors: `full` observes the whole map before the start,
             `near` the cells around the robot.
         grounds: Traversability sensors: `contact` measures λ under the robot, `probe`
-            also around it.
-        beliefs: Updates of the prediction by measured λ: `static`, no update; `copula`,
-            of λ of nearby cells; `classes`, also of the class of look-alike cells.
+            also around the robot.
+        beliefs: Updates of the prediction by measured λ: `static` updates nothing;
+            `copula` updates λ of nearby cells; `classes` also updates the classes of
+            look-alike cells.
         world: Draws of λ: a preset by name, paper or stakes, or {preset: NAME, noise:
             resampled | stored | frozen, correlation_m: 1.5, kernel: gaussian |
             matern32, immobile: {below: 0.1, for_s: 2}, time_budget_s: T or
-            time_budget_ratio: T over the map's reference time}; or a list of several.
+            time_budget_ratio: ratio of T to the map's reference time}; or a list.
         task: Changes to the preset's rules: {free_space: {by: risk | mean, above: 0.3},
             min_traversability: 0.3, goal_radius_m: 1.0, unseen: prior | optimistic |
             pessimistic, replan_every_s: 0.5}.
-        maps: Number of maps of each scenario, from the start of its split; 0 takes all.
+        maps: Number of maps of each scenario, from the start of its split; 0 for all.
         seed: Root seed of all draws.
         seeds: Several root seeds; not together with `seed`.
         realisations: Number of draws of λ for each map and seed.
         record: Data stored in addition to rows; each level includes the levels before
-            it: none; steps of all episodes; recordings for playback of each condition's
-            first map; of failures; of all episodes.
-        conditions: Several products: mappings of the keys above. A missing key takes
-            the value above.
+            it: none; steps, of all episodes; first, recordings of each condition's
+            first map; failures, also recordings of failures; all, recordings of all
+            episodes.
+        conditions: Several products: mappings with the keys above. A missing key takes
+            the suite's value.
         hypotheses: Hypotheses, fixed before the first unit is run: mappings of `one`
             and `other`, conditions by their labels, such as {planner: mppi, risk:
             mean}; `metric`: success, T_total, score, traversability, path_length or the
@@ -125,7 +127,10 @@ class Suite:
         object.__setattr__(self, "model", _as_plain("model", self.model))
         for name in (*PART_FIELDS, "world"):
             if name != "models" and not getattr(self, name):
-                raise ConfigError(f"Expected one or more `{name}`, got none.")
+                raise ConfigError(
+                    f"Expected one or more `{name}`, got none. Leave the key out for "
+                    "its default."
+                )
         for name in ("model", "seed"):
             value = getattr(self, name)
             values = getattr(self, f"{name}s")
@@ -157,7 +162,7 @@ class Suite:
 
     @property
     def products(self) -> list[dict[str, list[Any]]]:
-        """Values that each product lists, by field; the suite's values by default.
+        """Listed values by field, for each product; by default the suite's values.
 
         Raises:
             ConfigError: If a mapping of `conditions` has an unknown key, or a key both
@@ -168,16 +173,16 @@ class Suite:
         products = []
         for product in self.conditions or ({},):
             listed = dict(defaults)
-            spelt: dict[str, str] = {}
+            spelling_of: dict[str, str] = {}
             for spelling, values in product.items():
                 spellings = (spelling, f"{spelling}s", str(spelling).removesuffix("s"))
                 key = next((key for key in spellings if key in listed), spelling)
                 check_known("keys of `conditions`", key, listed)
-                first = spelt.setdefault(key, spelling)
+                first = spelling_of.setdefault(key, spelling)
                 expect(
                     first == spelling,
-                    f"`{first}` or `{spelling}` in one of `conditions`, got both. Leave "
-                    "one out.",
+                    f"`{first}` or `{spelling}` in each mapping of `conditions`, got "
+                    "both. Leave one out.",
                 )
                 listed[key] = values
             products.append({key: _as_list(values) for key, values in listed.items()})
@@ -195,7 +200,7 @@ class Suite:
 
 
 def _as_plain(kind: str, spec: Any) -> PartSpec:
-    """Describe a part as text or mapping, so that `run.json` can store it."""
+    """Describe a part as text or as a mapping, which `run.json` can store."""
     if isinstance(spec, str):
         return spec
     if not isinstance(spec, dict):
@@ -225,7 +230,7 @@ def check_size(
     maps: int,
     block_maps: int = MAX_EPISODES,
 ) -> None:
-    """Reject a run that is larger than any study needs, before it is built.
+    """Reject a run that is larger than any study needs, before its units are listed.
 
     Args:
         conditions: number of conditions.
@@ -235,7 +240,8 @@ def check_size(
         block_maps: maximum number of maps of a unit.
 
     Raises:
-        ConfigError: If it has more than `MAX_EPISODES` episodes or `MAX_UNITS` units.
+        ConfigError: If the run has more than `MAX_EPISODES` episodes or `MAX_UNITS`
+            units.
     """
     draws = conditions * seeds * realisations
     episodes = draws * maps
@@ -244,18 +250,18 @@ def check_size(
         raise ConfigError(
             f"Expected a run of at most {MAX_EPISODES:,} episodes in {MAX_UNITS:,} "
             f"units, got {episodes:,} episodes in {n_units:,}: {conditions} conditions "
-            f"× {seeds} seeds × {realisations} `realisations` × {maps} `maps`. Request "
-            "fewer."
+            f"× {seeds} seeds × {realisations} `realisations` × {maps} `maps`. Reduce "
+            "one of these numbers."
         )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Labels:
-    """Labels that select conditions of a run: one or several of each column.
+    """Labels that select conditions of a run: one or several for each column.
 
     Args:
-        planner: Planners, separated by commas, such as astar_dwa; a planner in a file
-            by the name of its class. Other columns are given in the same way.
+        planner: Planners, separated by commas, such as astar_dwa; for a planner in a
+            file, the name of its class. Other columns are given in the same way.
         risk: Risk settings.
         scenario: Scenarios.
         model: Models.

@@ -36,7 +36,7 @@ def part_of(kind: str, spec: Mapping[str, Any], label: str) -> Part:
 
 
 def read_parts(kind: str, spec: Any) -> list[Part]:
-    """Read one entry of a suite; an option given a list yields several parts.
+    """Read one entry of a suite; an option with a list of values yields several parts.
 
     Args:
         kind: one of `registry.KINDS`.
@@ -63,7 +63,7 @@ def read_parts(kind: str, spec: Any) -> list[Part]:
 
 
 def _with_folder_label(model: ModelPart, folder: Path) -> ModelPart:
-    """Label a checkpoint by its address or folder unless the suite labels it."""
+    """Label a checkpoint by its address or folder, unless the suite gives a label."""
     if model.label not in (model.part, model.part.rpartition(":")[2]):
         return model
     if hub.is_address(model.part):
@@ -72,7 +72,7 @@ def _with_folder_label(model: ModelPart, folder: Path) -> ModelPart:
 
 
 def _check_options(kind: str, part: Part) -> None:
-    """Let a part reject its options, also if no condition uses it."""
+    """Create or call a part so that it rejects invalid options, even if it is unused."""
     if kind == "risk" and part.found.shipped:
         cell = torch.full((1, 1, 1, 1), 0.5)
         weight = torch.ones_like(cell)
@@ -84,16 +84,16 @@ def _check_options(kind: str, part: Part) -> None:
 def each_part(kind: str, part: Part) -> list[Part]:
     """Return a part for each combination of swept option values.
 
-    A list that the option itself accepts, such as a pair of bounds, is one value. Each
-    part is labelled by its values: `cvar:0.9` for the first option, which follows a
-    colon, `astar_dwa lookahead_m=4` for others.
+    A list that the option itself accepts, such as a pair of bounds, is one value. The
+    label of each part contains its values: `cvar:0.9` for the first option,
+    `astar_dwa lookahead_m=4` for other options.
 
     Args:
         kind: kind of the part, one of `registry.KINDS`.
         part: part whose options may contain lists.
 
     Returns:
-        Parts in the order of the product; only the part itself if nothing is swept.
+        Parts in the order of the product; only the given part if no option is swept.
     """
     options = registry.options_of(kind, registry.find(kind, part.part).target)
     first = next(iter(options), "")
@@ -128,13 +128,13 @@ def _choices(mapping: Mapping[str, Any]) -> Iterator[_Chosen]:
 
 
 def check_count(counts: Iterable[int]) -> None:
-    """Reject a product of more than `MAX_CONDITIONS` settings before it is built.
+    """Reject a product of more than `MAX_CONDITIONS` settings before it is formed.
 
     Args:
         counts: number of values in each list of the product.
 
     Raises:
-        ConfigError: If the product is larger.
+        ConfigError: If the product has more settings.
     """
     counts = [count for count in counts if count > 1]
     if math.prod(counts) > MAX_CONDITIONS:
@@ -146,7 +146,7 @@ def check_count(counts: Iterable[int]) -> None:
 
 
 def _accepts(kind: str, source: str, name: str, option: Any, value: Any) -> bool:
-    """Return whether an option accepts a value as it is, such as a pair of bounds."""
+    """Return whether an option accepts a value unswept, such as a pair of bounds."""
     try:
         read(option.kind, value, of(f"{kind} {source!r}"), name)
     except ConfigError:
@@ -157,11 +157,12 @@ def _accepts(kind: str, source: str, name: str, option: Any, value: Any) -> bool
 def _lists(
     value: Any, path: tuple[str, ...]
 ) -> Iterator[tuple[tuple[str, ...], list[Any]]]:
-    """Yield the lists in a value, at any depth, each with its path."""
+    """Yield the path and the values of each list in a value, at any depth."""
     if isinstance(value, list | tuple):
         if not value:
             raise ConfigError(
-                f"Expected one or more values of `{'.'.join(path)}`, got an empty list."
+                f"Expected one or more values of `{'.'.join(path)}`, got an empty "
+                "list. Leave it out for the default."
             )
         yield path, list(value)
     elif isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""Units of work: a block of maps of a condition, run as one batch."""
+"""Units of work: blocks of maps of a condition, each run as one batch."""
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -11,25 +11,25 @@ from benchnav.core.store import Shard
 from benchnav.eval.experiment.condition import Condition, condition_names
 from benchnav.eval.experiment.suite import Record
 
-BLOCK_MAPS = 50  # maps of a block
+BLOCK_MAPS = 50  # maximum number of maps of a block
 # Columns that identify an episode of a condition.
 DRAW = ["seed", "realisation", "map"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Extent:
-    """Seeds, realisations and maps that a condition is run on.
+    """Seeds, realisations and maps on which a condition is run.
 
     Args:
-        draws: (seed, realisation, maps) of each draw of λ; `maps` counts maps from the
-            start of the split.
+        draws: (seed, realisation, maps) of each draw of λ; `maps` is the number of maps
+            from the start of the split.
     """
 
     draws: tuple[tuple[int, int, int], ...]
 
     @classmethod
     def product(cls, seeds: Iterable[int], realisations: int, maps: int) -> "Extent":
-        """Return the extent of the same maps under each seed and realisation."""
+        """Return the extent with the same maps for each seed and realisation."""
         draws = [(seed, r, maps) for seed in seeds for r in range(realisations)]
         return cls(draws=tuple(draws))
 
@@ -70,9 +70,8 @@ class Unit:
         seed: root seed.
         realisation: index of the draw of λ.
         maps: indices of maps of the condition's split, all of one block.
-        record: data that are stored in addition to rows: the `steps` of all episodes;
-            recordings of the condition's `first` map, of `failures`, or of `all`.
-        leads: whether this is the first unit of its condition.
+        record: data that are stored in addition to rows; see `Suite`.
+        is_first_unit: whether this is the first unit of its condition.
         metrics: metrics in addition to the built-in ones.
     """
 
@@ -81,7 +80,7 @@ class Unit:
     realisation: int
     maps: tuple[int, ...]
     record: Record = "none"
-    leads: bool = False
+    is_first_unit: bool = False
     metrics: tuple[Part, ...] = ()
 
     @property
@@ -92,10 +91,9 @@ class Unit:
     def shard(self, of: int) -> Shard:
         """Return the shard that contains the unit if a run has `of` shards.
 
-        The shard depends only on the unit and `of`, so that extending a run moves no
-        unit to another shard. Blocks, realisations and seeds of a condition are
-        assigned to the shards in turn, from the shard that the condition's id (a
-        digest) selects.
+        The shard depends only on the unit and `of`. Extending a run therefore moves no
+        unit to another shard. Consecutive blocks, realisations and seeds of a condition
+        are assigned to consecutive shards; the id of the condition selects the first.
         """
         first = int(self.condition.id, 16)
         turn = first + self.seed + self.realisation + self.block
@@ -108,14 +106,18 @@ class Unit:
 
     @property
     def steps_path(self) -> Path:
-        """Path of the unit's steps in a run folder, one partition a condition."""
+        """Path of the unit's steps in a run folder; each condition is a partition."""
         return steps_path(self.condition.id, self.name)
 
-    def recording_path(self, member: int, suffix: str = ".npz") -> Path:
+    def recording_path(self, index: int, suffix: str = ".npz") -> Path:
         """Return the path of an episode's recording in a run folder.
 
-        The Rerun viewer (suffix `.rrd`) shows the file's name; it accepts letters,
-        digits, `_` and `-` without a warning, and all else becomes `-`.
+        The Rerun viewer (suffix `.rrd`) shows the file's name, and warns of characters
+        other than letters, digits, `_` and `-`. They are replaced by `-`.
+
+        Args:
+            index: index of the episode in the unit.
+            suffix: suffix of the file.
         """
         labels = self.condition.labels
         words = [
@@ -125,14 +127,14 @@ class Unit:
             self.condition.id[:8],
             f"{self.seed}",
             f"{self.realisation}",
-            f"{self.maps[member]:05d}",
+            f"{self.maps[index]:05d}",
         ]
         cleaned = [re.sub(r"[^A-Za-z0-9_-]+", "-", word) for word in words]
         stem = "-".join(cleaned)
         return Path("playback", f"{stem}{suffix}")
 
-    def watched(self) -> list[int]:
-        """Return the episodes that may be recorded if all of them fail."""
+    def possibly_recorded(self) -> list[int]:
+        """Return the indices of the episodes that are recorded if all of them fail."""
         return self.recorded([False] * len(self.maps))
 
     def recorded(self, succeeded: Sequence[bool]) -> list[int]:
@@ -141,14 +143,14 @@ class Unit:
         Args:
             succeeded: whether each episode succeeded.
         """
-        members = range(len(self.maps))
+        indices = range(len(self.maps))
         if self.record == "all":
-            return list(members)
-        first = {0} if self.leads else set()
+            return list(indices)
+        first = {0} if self.is_first_unit else set()
         if self.record == "first":
             return list(first)
         if self.record == "failures":
-            failed = {member for member in members if not succeeded[member]}
+            failed = {index for index in indices if not succeeded[index]}
             return sorted(first | failed)
         return []
 
@@ -163,9 +165,10 @@ def units(
 ) -> list[Unit]:
     """Split conditions into units of work, ordered so that predictions are reused.
 
-    Units of blind planners need no prediction, are the shortest and come last in their
-    block: a worker's memory is measured after its first unit, and a worker whose memory
-    grows much thereafter is replaced, which takes long.
+    Units of blind planners come last in their block. They are the shortest and need no
+    prediction, so that they use the least memory. A worker's memory is measured after
+    its first unit; a worker whose memory grows much thereafter is replaced, which takes
+    long.
 
     Args:
         conditions: conditions by id, each with its extent.
@@ -188,7 +191,7 @@ def units(
 
 
 def in_table_order(units_: Iterable[Unit], conditions: Conditions) -> list[Unit]:
-    """Return units in the order of tables, regardless of the order of running."""
+    """Return units in the order of tables, which differs from the order of running."""
     order = {condition_id: index for index, condition_id in enumerate(conditions)}
 
     def table_order(unit: Unit) -> tuple[int, ...]:
@@ -199,10 +202,10 @@ def in_table_order(units_: Iterable[Unit], conditions: Conditions) -> list[Unit]
 
 
 def unit_names(units_: Sequence[Unit]) -> Callable[[Unit], str]:
-    """Return a function that names units by the labels that differ and their maps.
+    """Return a function that names a unit by its maps and the labels that differ.
 
     Args:
-        units_: all units that must be distinguished.
+        units_: all units that the names must distinguish.
     """
     conditions = {unit.condition.id: unit.condition for unit in units_}
     labels = condition_names(list(conditions.values()))
@@ -230,8 +233,8 @@ def _n_values(units_: Sequence[Unit], name: str) -> int:
 def _blocks(
     condition: Condition, extent: Extent, record: Record, metrics: tuple[Part, ...]
 ) -> Iterator[Unit]:
-    """Yield the units of a condition, one per draw and block of maps."""
-    leads = True
+    """Yield the units of a condition: one for each draw of λ and block of maps."""
+    is_first_unit = True
     for seed, realisation, maps in extent.draws:
         for start in range(0, maps, BLOCK_MAPS):
             end = min(start + BLOCK_MAPS, maps)
@@ -241,7 +244,7 @@ def _blocks(
                 realisation=realisation,
                 maps=tuple(range(start, end)),
                 record=record,
-                leads=leads,
+                is_first_unit=is_first_unit,
                 metrics=metrics,
             )
-            leads = False
+            is_first_unit = False

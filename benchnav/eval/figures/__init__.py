@@ -1,6 +1,6 @@
-"""Figures of a run: one file a figure, each an object that is drawn from `RunData`.
+"""Figures of a run: one module per figure, each an object that is drawn from `RunData`.
 
-`figures_of` lists those that a run has; a user's own stand after the shipped ones.
+`figures_of` lists the figures of a run: first the shipped ones, then custom ones.
 """
 
 from benchnav.core.public_names import face

@@ -12,29 +12,30 @@ import pandas as pd
 from benchnav.core.errors import BenchnavError
 from benchnav.eval.failures import RecordDriven, Sheets
 from benchnav.eval.folder.steps import STEPS, read_steps
-from benchnav.eval.recording import GROUND, Ground, Recording, read_recordings
+from benchnav.eval.recording import GROUND, RecordedMap, Recording, read_recordings
 
-MAX_PANELS = 4  # recordings of a figure
+MAX_PANELS = 4  # maximum number of recordings in a figure
 _EPISODE = ("condition", "seed", "realisation", "map")
 _SAME_MAP = ["data", "scenario", "map", "seed", "realisation"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Driven:
-    """Whole driven paths on one map.
+    """Driven paths of several conditions on one map.
 
     Args:
         ground: the map.
-        rows: one episode per condition.
-        tracks: positions of each episode, shape [N + 1, 2].
+        rows: rows of the episodes, one per condition.
+        tracks: positions (x, y) in metres of each episode with N steps, shape
+            [N + 1, 2].
     """
 
-    ground: Ground
+    ground: RecordedMap
     rows: pd.DataFrame
     tracks: Sequence[np.ndarray]
 
     def chosen(self, max_count: int) -> list[int]:
-        """Return up to `max_count` indices of rows, balancing successes and failures."""
+        """Return up to `max_count` indices of rows: successes and failures in turn."""
         turn = self.rows.groupby("success", sort=False).cumcount().to_numpy()
         return sorted(np.argsort(turn, kind="stable")[:max_count].tolist())
 
@@ -44,19 +45,20 @@ class RunData:
     """Data of the figures of a run; files of the folder are read on first access.
 
     Args:
-        about: contents of `run.json`; if the run is not finished, only with conditions
-            that have rows.
+        about: contents of `run.json`; if the run is not finished, conditions without
+            rows are left out.
         summary: one row per condition, from `summary.summarise`, joined with
             `best.against_best`.
         episodes: rows of episodes.
         tests: one row per hypothesis, from `hypotheses.test_hypotheses`; empty without
             hypotheses.
-        regret: from `regret.split_regret`; empty if the run has no chain.
-        failures: one row per failed episode.
-        sheets: failures on their maps.
-        folder: the run folder; None if the run was not saved and has no steps or
-            recordings.
-        record_driven: records driven episodes again, such as
+        regret: one row per step of a chain, from `regret.split_regret`; empty without a
+            chain.
+        failures: one row per failed episode, from `failures.failures_table`.
+        sheets: sheets of failures.
+        folder: the run folder; None if the run was not saved, so that it has no steps
+            or recordings.
+        record_driven: function that records driven episodes again, such as
             `run.recordings.record_driven`.
     """
 
@@ -79,15 +81,15 @@ class RunData:
 
     @cached_property
     def driven(self) -> Driven | None:
-        """Driven paths on the map stored with the run; None without map or steps."""
+        """Driven paths on the run's stored map; None if map or steps are missing."""
         return read_driven(self.folder, self.episodes) if self.folder else None
 
     @cached_property
     def on_one_map(self) -> list[Recording]:
-        """Recordings of up to `MAX_PANELS` conditions, where outcomes differ most.
+        """Recordings of up to `MAX_PANELS` conditions on the run's stored map.
 
-        A recording is read from the folder, with plans, or recreated from stored steps.
-        The list is empty if one cannot be recreated.
+        A recording is read from the folder, or if missing, recreated from stored steps
+        without plans. If one cannot be recreated, the list is empty.
         """
         if self.driven is None:
             return []
@@ -112,7 +114,7 @@ def _episode_key(labels: Any) -> tuple[str, ...]:
 
 
 def read_driven(folder: Path, episodes: pd.DataFrame) -> Driven | None:
-    """Read driven paths on the map stored with a run; None without map or steps.
+    """Read driven paths on a run's stored map; None if map or steps are missing.
 
     Args:
         folder: a finished run.
@@ -121,7 +123,7 @@ def read_driven(folder: Path, episodes: pd.DataFrame) -> Driven | None:
     path = folder / GROUND
     if not path.exists() or not (folder / STEPS).is_dir():
         return None
-    ground = Ground.load(path)
+    ground = RecordedMap.load(path)
     keys = pd.Series(ground.about)
     is_on_map = (episodes[list(ground.about)] == keys).all(axis=1)
     rows = episodes[is_on_map]
@@ -141,12 +143,13 @@ def choose_recordings(
 ) -> list[Recording]:
     """Choose one recording per condition, up to `MAX_PANELS`, on one map if possible.
 
-    The map is one that the first condition was recorded on: the first on which outcomes
-    differ, else the first on which an episode failed.
+    The map is chosen among those on which the first condition was recorded: the first
+    map on which outcomes differ, else the first on which an episode failed, else the
+    first map.
 
     Args:
         recordings: all recordings.
-        conditions: ids in order.
+        conditions: ids of conditions, in the order in which they are chosen.
     """
     labels = [recording.about for recording in recordings]
     table = pd.DataFrame(labels, columns=["condition", "outcome", *_SAME_MAP])
@@ -158,10 +161,10 @@ def choose_recordings(
     outcomes = table.groupby(_SAME_MAP)["outcome"]
     table["differing"] = outcomes.transform("nunique") > 1
     table["failed"] = outcomes.transform(lambda names: set(names) != {"success"})
-    of_first = table[table["condition"] == table["condition"].iloc[0]]
+    candidates = table[table["condition"] == table["condition"].iloc[0]]
     order = ["differing", "failed"]
-    of_first = of_first.sort_values(order, ascending=False, kind="stable")
-    shown = of_first.iloc[0]
+    candidates = candidates.sort_values(order, ascending=False, kind="stable")
+    shown = candidates.iloc[0]
     table["other"] = (table[_SAME_MAP] != shown[_SAME_MAP]).any(axis=1)
     table = table.sort_values(["condition", "other"], kind="stable")
     chosen = table.drop_duplicates("condition")

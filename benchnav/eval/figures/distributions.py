@@ -18,8 +18,8 @@ _QUANTITIES = {
     "total_time_s": "T_total [s], a failure counts as T",
     "traversability": "λ̄, mean observed λ",
 }
-_ENDS = {"success": (BLUE, "o"), "failure": (ORANGE, "x")}  # colour and marker of a dot
-_SPREAD = 0.32  # maximum offset of a dot from the middle of its row
+_DOTS = {"success": (BLUE, "o"), "failure": (ORANGE, "x")}  # colour and marker of a dot
+_MAX_OFFSET = 0.32  # of a dot from the middle of its row, in rows
 
 
 class Distributions(Figure):
@@ -33,7 +33,7 @@ class Distributions(Figure):
     )
 
     def draw(self, data: RunData) -> Drawing:
-        """Draw the episodes of each condition at its height."""
+        """Draw the episodes of each condition in the condition's row."""
         labels = list(_QUANTITIES.values())
         figure, panels = lay_out(data.summary, labels, legend_in=0.15)
         columns = itertools.cycle(_QUANTITIES)
@@ -48,7 +48,7 @@ class Distributions(Figure):
 
 def _handles() -> list[Line2D]:
     handles = []
-    for label, (colour, marker) in _ENDS.items():
+    for label, (colour, marker) in _DOTS.items():
         look: dict[str, Any] = {"ls": "none", "ms": 3, "marker": marker}
         handles.append(Line2D([], [], color=colour, label=label, **look))
     look = {"marker": "|", "ms": 6, "lw": 1.2}
@@ -60,15 +60,15 @@ def _handles() -> list[Line2D]:
 def _draw_dots(
     panel: Axes, rows: pd.DataFrame, episodes: pd.DataFrame, name: str
 ) -> None:
-    """Draw a quantity of all episodes, each condition at its height."""
+    """Draw a quantity of all episodes, each at the height of its condition."""
     dots = rows[["condition", "height"]].merge(episodes, on="condition")
     index_in_condition = dots.groupby("condition").cumcount()
-    offsets = jitter(len(dots), _SPREAD)
+    offsets = jitter(len(dots), _MAX_OFFSET)
     dots["up"] = dots["height"] + offsets[index_in_condition]
     dots = dots[dots[name].notna()]
     is_success = dots["success"].astype(bool)
     groups = (dots[is_success], dots[~is_success])
-    for (colour, marker), group in zip(_ENDS.values(), groups, strict=True):
+    for (colour, marker), group in zip(_DOTS.values(), groups, strict=True):
         is_cross = marker == "x"
         look: dict[str, Any] = {
             "color": colour,

@@ -1,11 +1,11 @@
-"""Whole driven paths of all settings on the map on which outcomes differ most."""
+"""Driven paths of several conditions on the map on which outcomes differ most."""
 
 import numpy as np
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure as Drawing
 
 from benchnav.eval.figures.data import RunData
-from benchnav.eval.recording import Ground
+from benchnav.eval.recording import RecordedMap
 from benchnav.eval.words import (
     NAMING,
     chosen_in_words,
@@ -23,7 +23,7 @@ from benchnav.viz.style import (
 )
 
 _MAX_PATHS = 8
-_DARKEST = 0.35  # grey of λ = 0
+_GREY_OF_ZERO = 0.35  # grey of λ = 0; white is λ = 1
 
 
 class DrivenPaths(Figure):
@@ -33,17 +33,17 @@ class DrivenPaths(Figure):
     trim = True
 
     def needs(self, data: RunData) -> bool:
-        """Return whether the run has steps and a map."""
+        """Return whether the run has steps and a stored map."""
         return data.driven is not None
 
     def caption(self, data: RunData) -> str:
-        """Return which map is shown and why."""
+        """Return a caption that names the map and the reason for its choice."""
         assert data.driven is not None
         map_keys = data.driven.ground.about
         rows = data.driven.rows
-        reason = "Outcomes differ on no map."
+        reason = "Outcomes do not differ on any map."
         if rows["success"].nunique() > 1:
-            reason = "On this map outcomes differ most."
+            reason = "Outcomes differ most on this map."
         n_shown = min(len(rows), _MAX_PATHS)
         template = "{scenario}, map {map}, seed {seed}, realisation {realisation}"
         return (
@@ -52,7 +52,7 @@ class DrivenPaths(Figure):
         )
 
     def draw(self, data: RunData) -> Drawing:
-        """Draw at most eight paths, with a legend at the side of the map."""
+        """Draw at most eight paths, with a legend next to or below the map."""
         driven = data.driven
         assert driven is not None
         ground = driven.ground
@@ -61,7 +61,7 @@ class DrivenPaths(Figure):
         tracks = [driven.tracks[index] for index in indices]
         high, wide = ground.grid.shape
         is_wide = wide >= 2 * high
-        # The legend stands at the side of a map, and below a wide one.
+        # The legend is to the right of the map, or below a wide map.
         width = ONE_COLUMN_IN
         legend_in = 0.0
         if is_wide:
@@ -75,7 +75,7 @@ class DrivenPaths(Figure):
         names = contender_names(labels.to_dict("records"))
         colours = condition_colours(list(rows["planner"]), LINE_COLOURS)
         for index, row in enumerate(rows.to_dict("records")):
-            # Later paths are thinner, so that all of several coinciding ones are seen.
+            # Later paths are thinner, so that coinciding paths are all visible.
             thickness = 0.9 + 2.2 * (1 - index / max(len(rows), 2))
             outcome = outcome_in_words(row["outcome"])
             label = f"{names[index]}: {outcome}, {row['end_time_s']:.0f} s"
@@ -111,10 +111,11 @@ class DrivenPaths(Figure):
         return figure
 
 
-def _backdrop(ground: Ground) -> np.ndarray:
-    """Return colours in [0, 1] that paths stand out from, shape [H, W, 3]."""
+def _backdrop(ground: RecordedMap) -> np.ndarray:
+    """Return the colours of the map below the paths, in [0, 1], shape [H, W, 3]."""
     if ground.field is None:
         return 0.4 * np.moveaxis(ground.rgb, 0, -1) / 255 + 0.6
-    grey = _DARKEST + (1 - _DARKEST) * np.repeat(ground.field[..., None], 3, axis=-1)
+    values = np.repeat(ground.field[..., None], 3, axis=-1)
+    grey = _GREY_OF_ZERO + (1 - _GREY_OF_ZERO) * values
     grey[ground.immobilising] = to_rgb(maps.IMMOBILISING)
     return grey

@@ -1,4 +1,4 @@
-"""Sheets of failures: the predicted λ̂, the driven path on it, and its end."""
+"""Sheets of failures: maps of predicted λ̂, with the driven path and its end."""
 
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -23,10 +23,10 @@ _LINE_IN = 0.12  # height of a line of a title
 
 
 class Failures(Figure):
-    """Failures of the best and the worst setting of a block, one line per condition.
+    """Failures of the best and the worst condition of a block, one line per condition.
 
     Attributes:
-        index: index of the sheet among those of the run.
+        index: index of the shown sheet among the run's sheets.
     """
 
     name = "failures"
@@ -37,43 +37,43 @@ class Failures(Figure):
         return self.numbered(len(data.sheets.shown))
 
     def caption(self, data: RunData) -> str:
-        """Return which failures are shown."""
+        """Return a caption that describes which failures are shown."""
         title, _ = data.sheets.shown[self.index]
         return (
             "Failures of the settings with the highest and the lowest success rate, "
             f"{title}: predicted λ̂ (colour), driven path and its end. In the titles, "
-            "λ̂ is the prediction for the last cell, and observed λ is the mean of the "
-            "last 2 s."
+            "λ̂ is the prediction for the last cell, and observed λ is the mean over "
+            "the last 2 s."
         )
 
     def draw(self, data: RunData) -> Drawing:
         """Draw a line of panels for each condition, with one panel per failure."""
         _, lines = data.sheets.shown[self.index]
-        across = max(len(line.recordings) for line in lines)
+        n_columns = max(len(line.recordings) for line in lines)
         height, width = lines[0].recordings[0].grid.shape
-        page_in = TWO_COLUMNS_IN if across > 2 else ONE_COLUMN_IN
-        panel_in = page_in / (across + 0.9)
+        page_in = TWO_COLUMNS_IN if n_columns > 2 else ONE_COLUMN_IN
+        panel_in = page_in / (n_columns + 0.9)
         letters = int(panel_in / _LETTER_IN)
         titles = [_titles(line, letters) for line in lines]
-        all_titles = [title for of_line in titles for title in of_line]
+        all_titles = [title for line_titles in titles for title in line_titles]
         title_in = _LINE_IN * max(title.count("\n") + 1 for title in all_titles)
         map_in = panel_in * min(height / width, 2.0)
         tall_in = (map_in + title_in + 0.16) * len(lines) + 0.6
         figure = Drawing(figsize=(page_in, tall_in), layout="constrained")
-        panels = figure.subplots(len(lines), across, squeeze=False)
+        panels = figure.subplots(len(lines), n_columns, squeeze=False)
         for panel in panels.flat:
             panel.set_visible(False)
-        for row_of_panels, line, of_line in zip(panels, lines, titles, strict=True):
+        for line_panels, line, line_titles in zip(panels, lines, titles, strict=True):
             n_shown = len(line.recordings)
-            shown_panels = row_of_panels[:n_shown]
+            shown_panels = line_panels[:n_shown]
             for panel, recording, title in zip(
-                shown_panels, line.recordings, of_line, strict=True
+                shown_panels, line.recordings, line_titles, strict=True
             ):
                 _draw_failure(panel, recording)
                 panel.set_title(title, fontsize="small")
             name = textwrap.fill(line.name, int(map_in / _LETTER_IN))
-            count = f"({len(line.failures)} of {line.among} failures)"
-            row_of_panels[0].set_ylabel(f"{name}\n{count}", fontsize="small")
+            count = f"({len(line.failures)} of {line.total} failures)"
+            line_panels[0].set_ylabel(f"{name}\n{count}", fontsize="small")
         maps.draw_scale(panels[-1, 0], lines[-1].recordings[0].grid.extent_m)
         maps.draw_bar(figure, "predicted λ̂", aspect=30, alpha=_LIGHT)
         legend_outside(figure, columns=6)
@@ -110,7 +110,7 @@ def _traversability(recording: Recording, row: Mapping[Any, Any]) -> str:
 
 
 def _unbroken(words: str) -> str:
-    """Return words that stay in one line of a wrapped title."""
+    """Return text with non-breaking spaces, so that it stays in one line of a title."""
     return words.replace(" ", "\N{NO-BREAK SPACE}")
 
 

@@ -24,8 +24,8 @@ from benchnav.viz.figure import Figure
 from benchnav.viz.panels import GRID, draw_interval
 from benchnav.viz.style import BLUE, TEXT, TWO_COLUMNS_IN, legend_outside
 
-_TEST_IN = 0.3  # height of a hypothesis
-_METRIC_IN = 0.55  # height of a panel without its hypotheses
+_TEST_IN = 0.3  # height of a row for a hypothesis, in inches
+_METRIC_IN = 0.55  # height of a panel without rows, in inches
 _MARGIN = "0.88"  # colour of the band that a margin allows
 _THIN, _THICK = 0.9, 2.6  # widths of 95 % and 90 % intervals, in points
 _POINT: dict[str, Any] = {"marker": "o", "ms": 4, "lw": 0}
@@ -41,7 +41,7 @@ class Forest(Figure):
         return not data.tests.empty
 
     def caption(self, data: RunData) -> str:
-        """Return the meaning of points, lines and bands that are drawn."""
+        """Return a caption that explains the drawn points, lines and bands."""
         tests = data.tests
         sentences = [
             "Paired differences of the hypotheses that were fixed before the run.",
@@ -49,13 +49,14 @@ class Forest(Figure):
         ]
         if tests["low"].notna().any():
             sentences.append(
-                "Thick lines are 90 % intervals and thin lines 95 % intervals of one "
-                "difference, not corrected."
+                "Thick lines are 90 % intervals and thin lines 95 % intervals of single "
+                "differences, without correction."
             )
         if tests["low"].isna().any():
             sentences.append(
-                f"Below {LEAST_MAPS} maps, or groups of maps, only differences of "
-                "success have an interval: a bootstrap over fewer is not reliable."
+                f"With fewer than {LEAST_MAPS} maps, or groups of maps, only "
+                "differences in success have an interval, since a bootstrap is not "
+                "reliable."
             )
         if (tests["margin"] > 0).any():
             sentences.append(
@@ -64,7 +65,7 @@ class Forest(Figure):
         return " ".join(sentences)
 
     def draw(self, data: RunData) -> Drawing:
-        """Draw one row per hypothesis, one panel per metric, and bands of margins."""
+        """Draw a panel for each metric, with a row for each hypothesis."""
         all_quantities = quantities(further_quantities(data.about))
         numbered = data.tests.assign(number=range(1, len(data.tests) + 1))
         panels = {
@@ -84,7 +85,7 @@ class Forest(Figure):
 
 
 def _handles(tests: pd.DataFrame) -> list[Artist]:
-    """Return the entries of the legend for all that is drawn."""
+    """Return the entries of the legend for the drawn points, lines and bands."""
     open_point = {**_POINT, "mfc": "white"}
     looks: dict[str, Any] = {NOT_YET: open_point}
     if tests["p_holm"].notna().all():
@@ -101,7 +102,7 @@ def _handles(tests: pd.DataFrame) -> list[Artist]:
 
 
 def _draw_tests(panel: Axes, rows: pd.DataFrame, quantity: Quantity) -> None:
-    # A difference without episodes is NaN.
+    # Without episodes, a difference is NaN, and so is the maximum below.
     ends = rows[["low", "high", "difference", "margin"]].astype(float).abs()
     reach = max(ends.max().max(), 1e-9) * 1.08
     panel.set(xlim=(-reach, reach), ylim=(len(rows) - 0.4, -0.6))
@@ -128,7 +129,7 @@ def _draw_tests(panel: Axes, rows: pd.DataFrame, quantity: Quantity) -> None:
     panel.grid(axis="x", color=GRID, zorder=0)
     unit = f" [{quantity.unit}]" if quantity.unit else ""
     panel.set(xlabel=f"Δ {quantity.words}{unit}", axisbelow=True)
-    # The better direction, at its end of the axis.
+    # Each note is at the end of the axis to which its arrow points.
     style: dict[str, Any] = {"transform": panel.transAxes, "color": "0.35"}
     if quantity.better == "higher":
         panel.text(1, 1, "better →", va="bottom", ha="right", **style)
@@ -148,7 +149,7 @@ def _draw_margin(
 
 
 def _explain_missing_interval(panel: Axes, difference: float, height: float) -> None:
-    """Write next to a point why it has no interval, on the side with more space."""
+    """Write the reason for a missing interval next to a point, towards zero."""
     if np.isnan(difference):
         return
     words = f"no interval: fewer than {LEAST_MAPS} maps"

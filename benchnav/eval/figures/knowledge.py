@@ -22,14 +22,14 @@ _SHOWN = {
     "mean": ("E[λ]", maps.TRAVERSABILITY_COLOURS, 1.0),
     "spread": ("spread of λ", maps.SPREAD_COLOURS, maps.MAX_SPREAD),
 }
-_MOMENTS = 4
+_N_TIMES = 4
 
 
 class KnowledgeMaps(Figure):
     """E[λ] and spread of a robot's belief at four times, for up to four conditions.
 
     Attributes:
-        index: index of the recording among those shown.
+        index: index of the shown recording among the chosen ones.
     """
 
     name = "knowledge"
@@ -41,14 +41,14 @@ class KnowledgeMaps(Figure):
         return self.numbered(len(_learners(data)))
 
     def caption(self, data: RunData) -> str:
-        """Return which condition is shown, and what the maps mean."""
+        """Return a caption that names the condition and explains the maps."""
         shown = _learners(data)
         labels = shown[self.index].about
         name = contender_names([recording.about for recording in shown])[self.index]
         return (
             f"Belief of a robot on {labels['scenario']}, map {labels['map']}, during "
-            f"its episode ({name}). Above: E[λ]. Below: its spread, half of the range "
-            "from the 16 % to the 84 % quantile of λ."
+            f"its episode ({name}). Above: E[λ]. Below: spread of λ, half of the range "
+            "from the 16 % to the 84 % quantile."
         )
 
     def draw(self, data: RunData) -> Drawing:
@@ -62,11 +62,11 @@ def _learners(data: RunData) -> list[Recording]:
 
 
 def draw_knowledge(recording: Recording) -> Drawing:
-    """Draw the belief of a recording that has it, as `KnowledgeMaps` does."""
+    """Draw the belief of a robot that learns, from its recording."""
     last = len(recording.traversability)
-    steps = sorted({round(step) for step in np.linspace(0, last, _MOMENTS)})
+    steps = sorted({round(step) for step in np.linspace(0, last, _N_TIMES)})
     ratio = min(max(recording.grid.height / recording.grid.width, 0.3), 2.0)
-    tall = (TWO_COLUMNS_IN - 0.9) / _MOMENTS * ratio
+    tall = (TWO_COLUMNS_IN - 0.9) / _N_TIMES * ratio
     figure = Drawing(figsize=(TWO_COLUMNS_IN, 2 * tall + 1.1), layout="compressed")
     panels = figure.subplots(2, len(steps), squeeze=False, sharex=True, sharey=True)
     for row, (name, look) in zip(panels, _SHOWN.items(), strict=True):

@@ -1,4 +1,4 @@
-"""Accuracy of the belief ahead of robots that learn, over the episode's time."""
+"""Accuracy of the belief about the terrain ahead of robots that learn, over time."""
 
 import textwrap
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ _TITLES = (
     "RMSE of E[λ] ahead\n(lower is better)",
     "log score ahead\n(higher is better)",
 )
-# Title of each column's panels, with the better direction.
+# Titles of panels by column of steps, with the better direction.
 METRICS = dict(zip(AHEAD_COLUMNS, _TITLES, strict=True))
 _BIN_S = 2.0  # length of a time bin
 _PANEL_COLUMNS = ((), ("model",), ("planner", "model"), ("planner", "risk", "model"))
@@ -32,29 +32,29 @@ _EPISODE = ["condition", "seed", "realisation", "map"]
 
 
 class Learning(Figure):
-    """RMSE and log score of the belief ahead of robots, over seconds of experience."""
+    """RMSE and log score of the belief ahead of robots, over time since the start."""
 
     name = "learning"
     text = (
         "Accuracy of the belief about the terrain ahead of a robot: cells within "
         f"{AHEAD_M:g} m and {AHEAD_DEG:g}° to either side whose λ was not measured. "
         "RMSE of E[λ] and mean log score, over the time since the start. Lines are "
-        f"means for every {_BIN_S:g} s, over the maps on which a robot still drives. "
-        "Bands are 95 % intervals (bootstrap over maps). Times with fewer than "
+        f"means in bins of {_BIN_S:g} s, over the maps on which a robot still drives. "
+        "Bands are 95 % intervals (bootstrap over maps). Bins with fewer than "
         f"{LEAST_MAPS} maps are left out."
     )
 
     curves = pd.DataFrame()
 
     def variants(self, data: RunData) -> Sequence[Self]:
-        """Return one figure if robots learnt on enough maps and steps were stored."""
+        """Return one figure if robots learnt on enough maps and the run has steps."""
         curves = self.curves
         if data.folder:
             curves = read_learning(data.folder, data.episodes)
         return [self.variant(curves=curves)] if len(curves) else []
 
     def draw(self, data: RunData) -> Drawing:
-        """Draw a line with a band for each condition, in several panels if many."""
+        """Draw a line with a band for each condition; many lines fill several panels."""
         has_curve = data.summary["condition"].isin(self.curves["condition"])
         rows = data.summary[has_curve].reset_index(drop=True)
         panel_columns = [(*BLOCK, *extra) for extra in _PANEL_COLUMNS]
@@ -67,8 +67,8 @@ class Learning(Figure):
         for title, shown in groups:
             panel = textwrap.fill(title, letters)
             for index in shown:
-                is_of_line = self.curves["condition"] == rows["condition"][index]
-                curve = self.curves[is_of_line]
+                is_on_curve = self.curves["condition"] == rows["condition"][index]
+                curve = self.curves[is_on_curve]
                 points.append(curve.assign(panel=panel, line=names[index]))
         curves = Curves(
             table=pd.concat(points).rename(columns={"time_s": "x"}),
@@ -84,7 +84,7 @@ class Learning(Figure):
 
 
 def _line_names(rows: pd.DataFrame, titled: Sequence[str]) -> list[str]:
-    """Name lines by the labels that differ and are in no panel's title."""
+    """Name lines by the labels that differ and that no panel's title contains."""
     columns = [name for name in dict.fromkeys((*BLOCK, *NAMING)) if name in rows]
     differing = [name for name in columns if rows[name].nunique() > 1]
     named = [name for name in differing if name not in titled]
@@ -104,9 +104,10 @@ def read_learning(folder: Path, episodes: pd.DataFrame) -> pd.DataFrame:
 
     Returns:
         One row per condition and time bin with at least `LEAST_MAPS` maps, or groups of
-        maps: `condition`; `time_s`, the middle of the bin; `maps`, their number; and
-        the mean of each of `METRICS` over them, with its 95 % interval in the columns
-        `_low` and `_high`. Empty if no robot learnt or no steps were stored.
+        maps: `condition`; `time_s`, the middle of the bin; `maps`, the number of maps
+        or groups; and for each of `METRICS` the mean over maps, with its 95 % interval
+        in columns that end in `_low` and `_high`. Empty if no robot learnt or the run
+        has no steps.
     """
     names = list(METRICS)
     first_name = names[0]
@@ -121,7 +122,7 @@ def read_learning(folder: Path, episodes: pd.DataFrame) -> pd.DataFrame:
         return pd.DataFrame(columns=columns)
     steps = pd.concat(tables).merge(episodes[[*_EPISODE, "group"]], on=_EPISODE)
     steps["bin"] = (steps["time_s"] / _BIN_S + 1e-6).astype(int)
-    # Each episode counts once in a bin, and each map once, however many episodes.
+    # In a bin, all episodes of a map have the same weight, and so have all maps.
     by_episode = steps.groupby([*_EPISODE, "group", "bin"])[names].mean()
     by_map = by_episode.groupby(["condition", "bin", "group"])[names].mean()
     points = []

@@ -1,4 +1,4 @@
-"""Maps, plan and driven path of an episode at a step, for figures, videos and viewers.
+"""Maps, plan and driven path at one step of an episode, for figures and playback.
 
 Letters in shapes: H×W cells.
 """
@@ -11,24 +11,25 @@ from benchnav.eval.recording import Recording
 from benchnav.viz import drives, maps, plans
 from benchnav.viz.style import bytes_of
 
-# Red, green and blue of unobserved cells, observed cells, and cells with measured λ.
+# RGB colours of unobserved cells, observed cells, and cells with measured λ.
 _SEEN_COLOURS = np.array(
     [bytes_of(colour)[:3] for colour in (maps.UNSEEN, maps.SEEN, maps.SENSED)], np.uint8
 )
 
 
 def has_ended(recording: Recording, step: int) -> bool:
-    """Return whether an episode ended by a step."""
+    """Return whether an episode has ended at a step."""
     return step == len(recording.traversability)
 
 
 def known_colours(recording: Recording, step: int) -> dict[str, np.ndarray]:
-    """Return colours of the planner's maps at a step, uint8 of shape [H, W, 3] each.
+    """Return colours of the planner's maps at a step.
 
     Returns:
-        `risk`, λ̂ with non-free cells. If the robot learns, also `mean` and `spread` of
-        the belief, all three veiled in unobserved cells; and `seen`, light in observed
-        cells and blue where λ was measured.
+        Colours by name, uint8, each of shape [H, W, 3]. `risk` is λ̂ with non-free
+        cells. If the robot learns, `mean` and `spread` are those of the belief, and
+        these three are veiled in unobserved cells; `seen` is light in observed cells
+        and blue in cells with measured λ.
     """
     predicted, free = recording.given_at(step)
     risk = maps.shades(predicted)
@@ -47,7 +48,10 @@ def known_colours(recording: Recording, step: int) -> dict[str, np.ndarray]:
 
 
 def true_colours(recording: Recording) -> np.ndarray:
-    """Return colours of the λ field with immobilising cells, or of E[λ] if resampled."""
+    """Return colours of the λ field and its immobilising cells, uint8, [H, W, 3].
+
+    If λ is resampled, the colours are those of E[λ].
+    """
     if recording.field is None:
         return maps.shades(recording.true_mean)
     return maps.field_colours(recording.field, recording.immobilising)
@@ -56,7 +60,14 @@ def true_colours(recording: Recording) -> np.ndarray:
 def show_known(
     panel: Axes, recording: Recording, step: int, name: str = "risk"
 ) -> None:
-    """Show a map of `known_colours`, with unobserved cells and the sensors' footprint."""
+    """Show a map of `known_colours`, with unobserved cells and the sensors' footprint.
+
+    Args:
+        panel: axes to draw on.
+        recording: recording of the episode.
+        step: index of the step.
+        name: key of `known_colours`.
+    """
     colours = known_colours(recording, step)[name]
     maps.show_map(panel, colours, recording.grid.extent_m)
     known_map = recording.known_at(step)
@@ -96,7 +107,7 @@ def show_truth(panel: Axes, recording: Recording) -> None:
 
 
 def draw_plan(panel: Axes, recording: Recording, step: int) -> None:
-    """Draw the plan of a step; nothing once the episode has ended."""
+    """Draw the plan of a step; draw nothing if the episode has ended."""
     if not has_ended(recording, step):
         plan = recording.plan_at(step * recording.dt_s)
         plans.draw_plan(panel, plan.lines)

@@ -11,8 +11,8 @@ from benchnav.eval.words import outcome_in_words
 from benchnav.viz.figure import Figure
 from benchnav.viz.style import AMBER, BLUE, GREEN, ORANGE, PINK, SKY, legend_outside
 
-# Colour of each failure, and its white hatching, so that outcomes of equal lightness
-# differ in grey. Causes in the terrain come before faults of the code.
+# Colour and white hatching of each failure. The hatching distinguishes outcomes of equal
+# lightness in grey. Failures caused by terrain come before errors of code.
 LOOKS = {
     "immobilised": (ORANGE, ""),
     "stuck": (AMBER, "/////"),
@@ -26,11 +26,11 @@ LOOKS = {
     "belief_error": ("#A6A6A6", "+++++"),
 }
 SUCCESS_COLOUR = "#E4E4E4"
-_BAR = 0.78  # thickness of a bar over the distance of rows
+_BAR = 0.78  # thickness of a bar divided by the distance of rows
 
 
 class Outcomes(Figure):
-    """Fractions of outcomes in one order for all conditions, success last."""
+    """Fractions of outcomes, in the same order for all conditions; success is last."""
 
     name = "outcomes"
     text = "Outcomes of the episodes."

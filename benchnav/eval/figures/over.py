@@ -1,4 +1,4 @@
-"""Sweeps of a run as curves: conditions that differ in one number only."""
+"""Sweeps of a run as curves: conditions that differ only in one number."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -31,20 +31,21 @@ from benchnav.viz.style import (
 )
 
 SEVERITY = "severity"
-MIN_VALUES = 3
+MIN_VALUES = 3  # minimum number of values of a sweep
 
 _LEVEL = "risk.options.level"
 _NAMES = {_LEVEL: "level α", SEVERITY: "severity of the scenario"}
-_LABEL_IN = 0.26  # width of the label of a tick, with a gap
-_SIDE_IN = 0.35  # between the axes of neighbouring panels
-# Columns of the summary of each measure, and their factor.
+_LABEL_IN = 0.26  # width of the label of a tick and a gap, in inches
+_SIDE_IN = 0.35  # distance between the axes of neighbouring panels, in inches
+# Columns of the summary (mean, lower and upper limit) and their factor, by measure.
 _MEASURES = {
     "success [%]": ("success_rate", "success_low", "success_high", 100.0),
     "T_total [s]": ("total_time_mean_s", "total_time_low_s", "total_time_high_s", 1.0),
 }
 _SAME = ("data", "scenario", "world", "robot", "objective")
 
-# Columns in titles of panels; planner and risk setting only if there are many lines.
+# Columns in titles of panels. Planner (`who`) and risk setting are used only if there
+# are many lines.
 _LABELS = (
     "scenario",
     "data",
@@ -64,11 +65,11 @@ _PANEL_COLUMNS = [
 
 @dataclass(frozen=True, kw_only=True)
 class Line:
-    """Conditions of a sweep that differ only in its number.
+    """Conditions that differ only in the number of a sweep.
 
     Args:
         values: values of the number, ascending.
-        conditions: ids, one per value.
+        conditions: ids of the conditions, one per value.
         rest: all other settings of the conditions, by dotted name.
     """
 
@@ -82,9 +83,9 @@ class Reference:
     """A setting without the number of a sweep, drawn as a horizontal line.
 
     Args:
-        condition: id.
+        condition: id of the condition.
         name: name of the setting in the legend.
-        look: style of the line, as in `Axes.axhline`.
+        look: style of the line, as keywords of `Axes.axhline`.
     """
 
     condition: str
@@ -95,14 +96,15 @@ class Reference:
 def find_sweeps(conditions: Mapping[str, Mapping[str, Any]]) -> dict[str, list[Line]]:
     """Find the sweeps of a run.
 
-    Numbers that change together are no sweep.
+    A sweep has at least `MIN_VALUES` values of one number, while all other settings are
+    constant.
 
     Args:
         conditions: entries of `run.json` by id, with `value`.
 
     Returns:
-        Lines in the order of the run, by the dotted name of their number, such as
-        `risk.options.level`; `severity` is that of scenarios.
+        Lines in the order of the run, by the dotted name of the number, such as
+        `risk.options.level`; for series of scenarios, the name is `severity`.
     """
     values = {
         name: _with_defaults(entry["value"])
@@ -130,7 +132,10 @@ def find_sweeps(conditions: Mapping[str, Mapping[str, Any]]) -> dict[str, list[L
 
 
 def _series_tables(values: pd.DataFrame) -> list[pd.DataFrame]:
-    """Return the rows of each series of scenarios, with their `severity`."""
+    """Return a table for each series of scenarios, with a column `severity`.
+
+    In this table, `split` is the name of the series.
+    """
     splits = dict.fromkeys(values.get("split", ()))
     tables = []
     for scenario, pairs in find_series(splits).items():
@@ -143,7 +148,7 @@ def _series_tables(values: pd.DataFrame) -> list[pd.DataFrame]:
 
 
 def _with_defaults(value: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a condition's value completed by default rules and planner options."""
+    """Return a condition's value, completed by defaults of rules and planner options."""
     planner = value["planner"]
     later_options = {}
     if planner["part"] in registry.names("planner"):
@@ -158,16 +163,16 @@ def _is_number(value: Any) -> bool:
 
 
 def sweep_name(number: str) -> str:
-    """Return the name of a number in figures and files: its last word, as `level`."""
+    """Return the last word of a number's dotted name, such as `level`, for figures."""
     return number.rpartition(".")[2]
 
 
 class Over(Figure):
-    """Success and T_total over a number that otherwise equal conditions differ in.
+    """Success and T_total over the number of a sweep.
 
     Attributes:
-        number: a name from `find_sweeps`.
-        lines: lines of that number.
+        number: dotted name of the number, from `find_sweeps`.
+        lines: lines of the sweep.
     """
 
     name = "over"
@@ -188,15 +193,15 @@ class Over(Figure):
         return figures
 
     def caption(self, data: RunData) -> str:
-        """Return the name of the number, and the meaning of bands, lines and axis."""
+        """Return a caption that names the number and explains bands, lines and axis."""
         sentences = [
             f"Success and T_total over {self.name.removeprefix('over-')}.",
             "Points are conditions, and bands are their 95 % intervals.",
         ]
         if self.number.startswith("risk."):
             sentences.append(
-                "Horizontal broken lines are settings without this number: in the "
-                "colour of their planner, or grey for a blind planner."
+                "Horizontal broken lines are settings without this number, in the "
+                "colour of their planner, or in grey for a blind planner."
             )
         if self.number == _LEVEL:
             sentences.append(
@@ -206,11 +211,11 @@ class Over(Figure):
         return " ".join(sentences)
 
     def draw(self, data: RunData) -> Drawing:
-        """Draw success above with Wilson's band, T_total below with the bootstrap's.
+        """Draw success above and T_total below, with bands of 95 % intervals.
 
-        There is a panel for each scenario, world, model and so on, and for each planner
-        if there are many lines. Over a number of a risk setting, other settings of the
-        same planner are horizontal lines.
+        There is a panel for each scenario, world, model and so on; if there are many
+        lines, also for each planner. If the number belongs to a risk setting, other
+        settings of the same planner are horizontal lines.
         """
         rows = data.summary.set_index("condition", drop=False)
         labels = _label_lines(self.number, self.lines, rows)
@@ -225,9 +230,9 @@ class Over(Figure):
             for index in shown:
                 line = self.lines[index]
                 x = _positions(self.number, line.values)
-                of_line = measured.loc[list(line.conditions)]
+                line_points = measured.loc[list(line.conditions)]
                 name = labels["name"][index]
-                points.append(of_line.assign(panel=title, line=name, x=x))
+                points.append(line_points.assign(panel=title, line=name, x=x))
         curves = Curves(
             table=pd.concat(points),
             measures={name: name for name in _MEASURES},
@@ -259,12 +264,12 @@ class Over(Figure):
         width_in = TWO_COLUMNS_IN / max(across, 2) - _SIDE_IN
         min_gap = (positions[-1] - positions[0]) * _LABEL_IN / width_in
         labels = [""] * len(ticks)
-        # From the last value on, since high levels are the closest to each other.
-        following = np.inf
+        # The loop starts at the last value, since high levels matter most.
+        next_position = np.inf
         for index in reversed(range(len(ticks))):
-            if following - positions[index] >= min_gap:
+            if next_position - positions[index] >= min_gap:
                 labels[index] = f"{ticks[index]:g}"
-                following = positions[index]
+                next_position = positions[index]
         for panel in panels:
             panel.set_xticks(positions, labels)
             ticks_of(panel, "y", 5)
@@ -276,15 +281,16 @@ class Over(Figure):
         looks: Looks,
         shown: Sequence[int],
     ) -> list[Reference]:
-        """Return the lines of a panel for settings without the number.
+        """Return the horizontal lines of a panel, for settings without the number.
 
-        A setting is shown with its planner's line; a blind one with any line.
+        A setting is shown if the panel has a line of its planner. A blind planner is
+        shown in all panels of its block.
 
         Args:
             rows: rows of the summary, by condition.
-            names: name of each line of the sweep.
-            looks: style by name.
-            shown: indices of the panel's lines of the sweep.
+            names: names of the lines of the sweep.
+            looks: styles of lines by name.
+            shown: indices of the lines in the panel.
         """
         swept = [condition for line in self.lines for condition in line.conditions]
         others = rows.drop(swept)
@@ -300,7 +306,7 @@ class Over(Figure):
                 if (row[shared] != first_row[shared]).any():
                     continue
                 colour = BLIND if is_blind else line_colour
-                # Dashes with an increasing number of dots distinguish settings.
+                # The number of dots after a dash distinguishes settings.
                 dashes = (0, (6, 2, *(1, 1.5) * order.index(name)))
                 look = {"color": colour, "ls": dashes, "lw": 1, "zorder": 1}
                 reference = Reference(condition=str(condition), name=name, look=look)
@@ -315,7 +321,7 @@ def _looks_of_lines(labels: pd.DataFrame) -> dict[str, dict[str, Any]]:
 
 
 def _measured(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return each measure of `_MEASURES` with the ends of its interval, by condition."""
+    """Return the measures `_MEASURES` and their interval limits, by condition."""
     measured: dict[str, pd.Series] = {}
     for name, (*columns, scale) in _MEASURES.items():
         for end, column in zip(("", "_low", "_high"), columns, strict=True):
@@ -330,15 +336,15 @@ def _setting_name(row: Mapping[Any, Any]) -> str:
 
 
 def _reference_handles(references: Sequence[Reference]) -> list[Line2D]:
-    """Return an entry of the legend for each setting.
+    """Return a legend entry for each setting.
 
-    An entry is black if its lines have the colours of several planners.
+    An entry is black if the lines of its setting have several colours.
     """
     handles = []
     for name in dict.fromkeys(reference.name for reference in references):
-        of_name = [line.look for line in references if line.name == name]
-        look = dict(of_name[0])
-        if len({line_look["color"] for line_look in of_name}) > 1:
+        line_looks_ = [line.look for line in references if line.name == name]
+        look = dict(line_looks_[0])
+        if len({line_look["color"] for line_look in line_looks_}) > 1:
             look["color"] = "black"
         handles.append(Line2D([], [], label=name, **look))
     return handles
@@ -347,9 +353,10 @@ def _reference_handles(references: Sequence[Reference]) -> list[Line2D]:
 def _label_lines(
     number: str, lines: Sequence[Line], rows: pd.DataFrame
 ) -> pd.DataFrame:
-    """Return `_LABELS`, `planner` and `name` in one row per line.
+    """Return one row per line, with the columns `_LABELS`, `planner` and `name`.
 
-    A swept part is named without its label, which contains the number.
+    A part with a swept option has its name instead of its label, which contains the
+    number.
     """
     first_conditions = [line.conditions[0] for line in lines]
     labelled = rows.loc[first_conditions].reset_index(drop=True)
@@ -371,7 +378,7 @@ def _label_lines(
     for _, group in labelled.groupby(list(_LABELS), sort=False):
         rests = {index: lines[index].rest for index in group.index}
         for index, rest in rests.items():
-            # Settings that no label shows are appended if lines would coincide.
+            # Names that would be the same get the settings that differ.
             differing = [key for key in rest if _differs(key, rests.values())]
             extra = [f"{sweep_name(key)} {rest[key]}" for key in differing]
             words = [group["who"][index], group["risk"][index], *extra]
@@ -384,7 +391,7 @@ def _differs(key: str, settings: Iterable[Mapping[str, Any]]) -> bool:
 
 
 def _positions(number: str, values: Sequence[float]) -> np.ndarray:
-    """Return positions of values; levels by the logarithm of the tail's weight."""
+    """Return positions of values on the axis: −log(1 − α) for levels α below 1."""
     numbers = np.asarray(values)
     is_level = number == _LEVEL and numbers.max() < 1
     return -np.log(1 - numbers) if is_level else numbers

@@ -1,4 +1,4 @@
-"""Waterfall of regret: change of success and time in each step of a chain."""
+"""Waterfall of regret: changes of success and T_total in each step of a chain."""
 
 from collections.abc import Sequence
 from itertools import pairwise, starmap
@@ -29,11 +29,11 @@ from benchnav.viz.style import (
 )
 
 MAX_CHAINS = 6
-_ROW_IN = 0.24  # height of a row
-_ENDS = "0.75"  # colour of the first and the last bar
+_ROW_IN = 0.24  # height of a row in inches
+_GREY = "0.75"  # colour of the first and the last bar
 _BOUND: dict[str, Any] = {"color": "0.25", "ls": "--", "lw": 1.1}
 _BAR: dict[str, Any] = {"height": 0.7, "lw": 0}
-# Axis label, factor, and whether more is worse, for each measure.
+# Axis label, factor, and whether a higher value is worse, for each measure.
 _MEASURES = {
     "success": ("success [%]", 100.0, False),
     "time": ("T_total [s]", 1.0, True),
@@ -50,10 +50,10 @@ class Regret(Figure):
         return not data.regret.empty
 
     def caption(self, data: RunData) -> str:
-        """Return the meaning of a step, and how many chains are shown."""
+        """Return a caption that explains steps, lines and the choice of chains."""
         chains = data.regret["chain"].nunique()
         sentences = [
-            "Regret against the near-optimal reference, which plans on λ itself and is "
+            "Regret against the near-optimal reference, which plans on λ itself but is "
             "not a bound: paired differences in each step from a planner to the "
             "reference, on common episodes.",
             "Black lines are 95 % intervals.",
@@ -63,15 +63,15 @@ class Regret(Figure):
                 "The dashed line is a lower bound of T_total, and an upper bound of success."
             )
         sentences.append(
-            "A step may be negative, and another order of steps would give other "
-            "values, so that no step is a cause."
+            "Steps are not causes: a step may be negative, and another order of steps "
+            "would give other values."
         )
         if chains > MAX_CHAINS:
             sentences.append(f"The first {MAX_CHAINS} of {chains} chains are shown.")
         return " ".join(sentences)
 
     def draw(self, data: RunData) -> Drawing:
-        """Draw each chain from its planner (top) to the reference: success, T_total."""
+        """Draw each chain from the planner (top) to the reference (bottom)."""
         chains = [rows for _, rows in data.regret.groupby("chain", sort=True)]
         chains = chains[:MAX_CHAINS]
         n_rows = 2 + max(len(rows) for rows in chains)
@@ -94,7 +94,7 @@ class Regret(Figure):
             panel.set_xlabel(label)
             panel.set_xlim(left=0)
         handles: list[Artist] = [
-            Patch(color=_ENDS, label="first planner, reference"),
+            Patch(color=_GREY, label="first planner, reference"),
             Patch(color=ORANGE, label="the step improves"),
             Patch(color=BLUE, label="the step worsens"),
         ]
@@ -106,7 +106,7 @@ class Regret(Figure):
 
 
 def _row_names(rows: pd.DataFrame) -> list[str]:
-    """Name the first condition of a chain, the change of each step, and the last."""
+    """Return names of rows: first condition, changes in each step, last condition."""
     planners = [rows["one_planner"].iloc[0], *rows["other_planner"]]
     models = [rows["one_model"].iloc[0], *rows["other_model"]]
     conditions = list(zip(map(planner_name, planners), models, strict=True))
@@ -115,18 +115,18 @@ def _row_names(rows: pd.DataFrame) -> list[str]:
 
 
 def _change(before: Sequence[str], after: Sequence[str]) -> str:
-    """Return the changed labels of a step, a line each."""
+    """Return the changed labels of a step, one line per label."""
     pairs = zip(before, after, strict=True)
     return "\n".join(f"{old} → {new}" for old, new in pairs if old != new)
 
 
 def _draw_chain(panel: Axes, rows: pd.DataFrame, measure: str) -> None:
-    """Draw bars of the first and last mean, and the differences between them."""
+    """Draw bars for the first and the last mean, and for the difference in each step."""
     _, factor, more_is_worse = _MEASURES[measure]
     last_mean = rows[f"{measure}_other"].iloc[-1]
     means = factor * np.array([*rows[f"{measure}_one"], last_mean])
     for height, value in ((0, means[0]), (len(rows) + 1, means[-1])):
-        panel.barh(height, value, color=_ENDS, **_BAR)
+        panel.barh(height, value, color=_GREY, **_BAR)
         _write(panel, height, f"{value:.1f}")
     for height, row in enumerate(rows.to_dict("records"), start=1):
         difference = factor * row[f"{measure}_difference"]
@@ -141,7 +141,7 @@ def _draw_chain(panel: Axes, rows: pd.DataFrame, measure: str) -> None:
         from_x, to_x = np.clip([start - high, start - low], 0, maximum)
         draw_interval(panel, from_x, to_x, height, "black", 0.9)
         words = signed(-difference)
-        if not np.isnan(low):  # few maps have no interval
+        if not np.isnan(low):  # with few maps, there is no interval
             words += f" ({signed_interval(-high, -low)})"
         _write(panel, height, words.replace("-", "−"))
     for height, value in enumerate(means):

@@ -1,6 +1,6 @@
-"""Panels with a row for each setting and a panel for each block of a run.
+"""Layout of figures with a panel for each block of a run and a row for each setting.
 
-Names are at the left, so that any number of planners, models and risk settings fits.
+Names are to the left of the rows, so that any number of settings fits.
 """
 
 from collections.abc import Sequence
@@ -16,29 +16,29 @@ from benchnav.eval.words import blocks, with_names
 from benchnav.viz.panels import GRID, panel_grid
 from benchnav.viz.style import TWO_COLUMNS_IN
 
-_ROW_IN = 0.145  # height of a row
-_GAP_ROWS = 0.6  # between planners
-_PANELS_A_LINE = 4
-_MAX_LETTERS = 30  # of a name at the side of a single panel
+_ROW_IN = 0.145  # height of a row in inches
+_GAP_ROWS = 0.6  # gap between planners, in rows
+_MAX_ACROSS = 4  # panels side by side
+_MAX_LETTERS = 30  # a single panel with a longer name is two columns wide
 _SETTING = ["planner", "model", *KNOWLEDGE, "risk"]
 
 
 def lay_out(
     summary: pd.DataFrame, measures: Sequence[str], legend_in: float = 0.0
 ) -> tuple[Figure, list[tuple[Axes, pd.DataFrame]]]:
-    """Create the panels, with names of settings at the left of each line.
+    """Create the panels, with names of settings to the left of each line of panels.
 
     Args:
-        summary: from `summary.summarise`.
-        measures: labels of the quantities, a panel each for each block, side by side.
+        summary: table from `summary.summarise`.
+        measures: axis labels of the quantities; each block has a panel for each.
         legend_in: height reserved for a legend, in inches.
 
     Returns:
-        The figure, and for each panel the rows of its block, with the `height` that
-        each is drawn at.
+        The figure; and each panel with the rows of its block, which have a column
+        `height` with their position on the y-axis.
     """
     settings = with_names(summary[_SETTING].drop_duplicates())
-    # A gap separates planners.
+    # There is a gap between planners.
     planner, _ = settings["planner"].factorize()
     settings = settings.assign(gap=_GAP_ROWS * planner)
     settings = settings.sort_values("gap", kind="stable")
@@ -47,7 +47,7 @@ def lay_out(
     columns = len(measures)
     blocks_of_run = blocks(summary.merge(settings, on=_SETTING, how="left"))
     block_panels = [block for block in blocks_of_run for _ in measures]
-    across = min(len(block_panels), _PANELS_A_LINE)
+    across = min(len(block_panels), _MAX_ACROSS)
     shared = "all"
     if columns > 1:
         across = columns
@@ -55,7 +55,7 @@ def lay_out(
     tall = _ROW_IN * (lowest + 1.4) + 0.5
     titles = [title for title, _ in block_panels]
     ends_in = 0.2 + legend_in
-    # Long names would leave little of a column's width for a single panel.
+    # In one column, long names would leave little space for a single panel.
     is_wide = settings["name"].str.len().max() > _MAX_LETTERS
     width_in = TWO_COLUMNS_IN if is_wide else 0.0
     figure, grid = panel_grid(

@@ -27,11 +27,11 @@ def figures_of(data: RunData, more: Sequence[Figure] = ()) -> list[Figure]:
 
     Args:
         data: data of the run.
-        more: figures after the shipped ones; one of a shipped class is drawn only
-            once.
+        more: custom figures, after the shipped ones; figures of shipped classes are
+            ignored.
 
     Returns:
-        Figures whose needs the run meets.
+        Figures whose data the run has.
     """
     figures: list[Figure] = [cls() for cls in SHIPPED]
     figures += [figure for figure in more if type(figure) not in SHIPPED]

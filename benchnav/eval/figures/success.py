@@ -18,7 +18,7 @@ from benchnav.viz.figure import Figure
 from benchnav.viz.panels import draw_interval
 from benchnav.viz.style import BLIND, legend_outside, planner_colours
 
-_BAND = 0.12  # opacity
+_BAND_ALPHA = 0.12  # opacity of a band
 _POINT: dict[str, Any] = {"marker": "o", "ms": 4, "ls": "none", "color": "0.2"}
 
 
@@ -28,13 +28,13 @@ class Success(Figure):
     name = "success"
     text = (
         "Success rates (points) with 95 % intervals (lines). Filled points are not "
-        "significantly worse than the best of their panel; all are open if nothing is "
-        "significantly worse. Grey planners are blind: the dashed line and the grey "
-        "band extend their rate and its 95 % interval through the panel."
+        "significantly worse than the best setting of their panel; all points are open "
+        "if no setting is significantly worse. Blind planners are grey: a dashed line "
+        "and a grey band extend their rate and its 95 % interval through the panel."
     )
 
     def draw(self, data: RunData) -> Drawing:
-        """Draw one point per condition, and blind planners as lines through panels."""
+        """Draw a point for each condition, and lines for blind planners."""
         handles = _handles(data.summary)
         legend_in = 0.15 * len(handles)
         figure, panels = lay_out(data.summary, ["success [%]"], legend_in)
@@ -49,8 +49,9 @@ class Success(Figure):
 
 
 def _handles(summary: pd.DataFrame) -> list[Artist]:
-    """Return the entries of the legend for the kinds of points and lines drawn."""
-    # The clairvoyant has a model and no risk setting, so risk cannot decide.
+    """Return the entries of the legend for the drawn points and lines."""
+    # A planner is blind if it uses no model. The model `clairvoyant` has no risk
+    # setting, so that the risk label cannot decide.
     is_blind = summary["model"] == NOT_USED
     unmarked = pd.Series(False, summary.index)
     marks = summary.get("best_marked", unmarked)
@@ -66,12 +67,12 @@ def _handles(summary: pd.DataFrame) -> list[Artist]:
         line: dict[str, Any] = {"lw": 0.8, "ls": "--"}
         handles.append(Line2D([], [], color=BLIND, label="blind planner", **line))
         words = "its 95 % interval"
-        handles.append(Patch(color=BLIND, alpha=_BAND, lw=0, label=words))
+        handles.append(Patch(color=BLIND, alpha=_BAND_ALPHA, lw=0, label=words))
     return handles
 
 
 def _draw_rate(panel: Axes, row: Mapping[Any, Any], planner_colour: str) -> None:
-    """Draw a success rate with its interval; a blind planner's through the panel."""
+    """Draw a success rate with its interval, through the panel for a blind planner."""
     blind = row["model"] == NOT_USED
     colour = BLIND if blind else planner_colour
     face = colour if row.get("best_marked") else "white"
@@ -83,4 +84,4 @@ def _draw_rate(panel: Axes, row: Mapping[Any, Any], planner_colour: str) -> None
     panel.plot(rate, height, "o", color=colour, ms=4, mfc=face)
     if blind:
         panel.axvline(rate, color=colour, lw=0.8, ls="--", zorder=0)
-        panel.axvspan(low, high, color=colour, alpha=_BAND, lw=0, zorder=0)
+        panel.axvspan(low, high, color=colour, alpha=_BAND_ALPHA, lw=0, zorder=0)

@@ -24,8 +24,8 @@ from benchnav.viz.style import (
     stack_panels,
 )
 
-_PANELS_A_LINE = 4
-_UNIT = "\N{NO-BREAK SPACE}s"  # stays next to its number in wrapped titles
+_MAX_ACROSS = 4  # recordings side by side
+_UNIT = "\N{NO-BREAK SPACE}s"  # seconds, in the same line of a title as the number
 _LETTER_IN = 0.048  # mean width of a letter of a title
 
 
@@ -41,11 +41,11 @@ class Trajectories(Figure):
         )
 
     def needs(self, data: RunData) -> bool:
-        """Return whether there are recordings, or steps that can be recorded again."""
+        """Return whether there are recordings, or steps from which to create them."""
         return bool(self._shown(data))
 
     def caption(self, data: RunData) -> str:
-        """Return which map is shown, and how conditions were chosen."""
+        """Return a caption that names the map and the choice of conditions."""
         shown = self._shown(data)
         labels = [recording.about for recording in shown]
         map_names = {f"{label['scenario']}, map {label['map']}" for label in labels}
@@ -56,11 +56,11 @@ class Trajectories(Figure):
         if any(recording.own_plans for recording in shown):
             subject = "Plans and driven paths"
         caption = (
-            f"{subject}{where}, over the terrain and over the λ̂ that the planner "
-            "was given."
+            f"{subject}{where}, over the terrain and over λ̂, which the planner was "
+            "given."
         )
         if any(recording.field is not None for recording in shown):
-            caption += " Below: the whole driven path over the λ field."
+            caption += " Below: complete driven path over the λ field."
         if data.on_one_map and data.driven:
             caption += chosen_in_words(len(shown), len(data.driven.rows))
         return caption
@@ -68,15 +68,15 @@ class Trajectories(Figure):
     def draw(self, data: RunData) -> Drawing:
         """Draw the terrain with the plan above, and the planner's map below.
 
-        If λ did not change during an episode, a third row shows it with the driven path.
+        If λ was constant, a third row shows the λ field with the driven path.
         """
         return draw_trajectories(self._shown(data))
 
 
 def draw_trajectories(recordings: Sequence[Recording]) -> Drawing:
-    """Draw recordings, one or more, as `Trajectories` does."""
-    lines = -(-len(recordings) // _PANELS_A_LINE)
-    across = -(-len(recordings) // lines)  # as full as lines can be
+    """Draw one or more recordings side by side, with the layout of `Trajectories`."""
+    lines = -(-len(recordings) // _MAX_ACROSS)
+    across = -(-len(recordings) // lines)  # equally many recordings per line
     layers = 2 if all(recording.field is None for recording in recordings) else 3
     width = ONE_COLUMN_IN if across == 1 else TWO_COLUMNS_IN
     panel_in = (width - 0.9) / across - 0.1
@@ -111,7 +111,7 @@ def draw_trajectories(recordings: Sequence[Recording]) -> Drawing:
 
 
 def _headings(recordings: Sequence[Recording]) -> list[str]:
-    """Return titles: labels that differ, time shown, and outcome."""
+    """Return titles with the labels that differ, the shown time and the outcome."""
     names = episode_names([recording.about for recording in recordings])
     labels = [recording.about for recording in recordings]
     map_names = [f", {label['scenario']}, map {label['map']}" for label in labels]
@@ -128,7 +128,7 @@ def _headings(recordings: Sequence[Recording]) -> list[str]:
 
 
 def _draw_terrain(panel: Axes, recording: Recording, title: str) -> None:
-    """Draw the terrain, and the driven path so far in colours of the observed λ."""
+    """Draw the terrain, and the path up to the shown step in colours of observed λ."""
     maps.show_map(panel, np.moveaxis(recording.rgb, 0, -1), recording.grid.extent_m)
     if recording.field is not None and recording.soft.any():
         for lines_of in (outline, maps.hatching):
@@ -144,10 +144,10 @@ def _draw_terrain(panel: Axes, recording: Recording, title: str) -> None:
 
 
 def _draw_predicted(panel: Axes, recording: Recording) -> None:
-    """Draw the planner's current λ̂, and the path in black over the colours of λ."""
+    """Draw the planner's λ̂ at the shown step, with the plan and the driven path."""
     moment.show_known(panel, recording, recording.now)
     moment.draw_plan(panel, recording, recording.now)
-    words = "driven; above in the colour of the observed λ"
+    words = "driven path; in the top row, its colour is the observed λ"
     drives.draw_drive(panel, moment.drive_at(recording, recording.now), label=words)
     panel.set_title(moment.known_in_words(recording))
 
@@ -156,4 +156,4 @@ def _draw_field(panel: Axes, recording: Recording) -> None:
     """Draw the λ field and the driven path."""
     moment.show_truth(panel, recording)
     drives.draw_drive(panel, moment.drive_at(recording, len(recording.traversability)))
-    panel.set_title("whole path, over the λ field")
+    panel.set_title("complete path over the λ field")

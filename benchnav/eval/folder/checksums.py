@@ -1,8 +1,8 @@
 """Checksums of files derived from a run: reports, figures, playback, map, tracebacks.
 
-They are stored in `SHA256SUMS` of the run folder, which `sha256sum --check` also reads.
-Other files need no checksum: `run.json`, units and steps contain their own digests, and
-`run.json` contains the digest of the table of episodes.
+Checksums are stored in `SHA256SUMS` of the run folder, which `sha256sum --check` can
+read. Other files need no checksum: `run.json`, units and steps contain their own
+digests, and `run.json` contains the digest of the table of episodes.
 """
 
 import re
@@ -18,9 +18,9 @@ _LINE = re.compile(r"([0-9a-f]{64})  (.+)")
 
 
 def read_checksums(folder: Path) -> dict[str, str]:
-    """Return the recorded SHA-256 of files of a run folder, by path in it.
+    """Return the recorded SHA-256 of files of a run folder, by path in the folder.
 
-    A line that is no checksum is returned as a path with an empty SHA-256.
+    A line without a checksum is returned as a path with an empty SHA-256.
     """
     path = folder / SUMS
     text = path.read_text(errors="replace") if path.is_file() else ""
@@ -35,7 +35,7 @@ def read_checksums(folder: Path) -> dict[str, str]:
 
 
 def note_checksums(folder: Path, files: Iterable[Path]) -> None:
-    """Record the SHA-256 of files in a run folder; do nothing in other folders.
+    """Record the SHA-256 of files of a run folder; do nothing in other folders.
 
     Args:
         folder: folder of the files.
@@ -56,7 +56,7 @@ def note_checksums(folder: Path, files: Iterable[Path]) -> None:
 
 
 def is_as_noted(folder: Path, file: Path) -> bool:
-    """Return whether a file of a run folder agrees with its recorded SHA-256, if any."""
+    """Return whether a file agrees with its recorded SHA-256; True without a record."""
     if not file.is_relative_to(folder):
         return True
     name = file.relative_to(folder).as_posix()

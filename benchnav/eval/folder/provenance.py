@@ -1,9 +1,9 @@
 """Provenance of rows: code, maps, machine and commands.
 
 A unit of work is identified by a key: the digest of its condition, seed, realisation,
-maps and code. Code comprises all modules of this package that a unit of the condition
-imports (see `digests_of_package_modules`), the parts' own code and files, versions of installed
-packages, and the arithmetic of the processor.
+maps and code. The code comprises all modules of benchnav that the unit imports (see
+`digests_of_package_modules`), the code and files of its parts, versions of installed packages, and
+the vector instructions of the processor.
 """
 
 import itertools
@@ -47,7 +47,8 @@ _MAX_NAMED = 3
 
 Code = dict[str, dict[str, Any]]
 METRICS = "metrics"  # group of the code of further metrics
-# Stored with the groups of code: what parts read, which is known only after a run.
+# Key next to the groups of code: files, packages and environment variables that custom
+# parts read, which are known only after a run.
 TOUCHED = "touched"
 
 
@@ -56,9 +57,9 @@ class Origin:
     """Inputs of a unit's rows in addition to its condition, seed and realisation.
 
     Args:
-        code: `environment` (versions, processor, device, time limit of planners),
-            `modules` of this package with their digests, `parts`, the digests of other
-            code and files, and, if rows have further metrics, `metrics` from
+        code: values by group: `environment` (versions, processor, device, time limit of
+            planners); `modules` (digests of benchnav's modules); `parts` (digests of
+            other code and files); and, if rows have further metrics, `metrics` from
             `describe_metrics`.
         maps: digest of the split's properties, followed by digests of the maps.
     """
@@ -81,7 +82,8 @@ class Origins:
     """Current origins of units, cached.
 
     Args:
-        planner_limit_s: time limit of each call of a planner; 0 for none.
+        planner_limit_s: time limit of each call of a planner in seconds; 0 for no
+            limit.
         device: device of all computation, "cpu" or "cuda".
     """
 
@@ -117,7 +119,7 @@ class Origins:
 
 
 def describe_parts(condition: Condition) -> Code:
-    """Return the imported `modules` of this package, and digests of other `parts`."""
+    """Return two groups of a condition's code: `modules` of benchnav, and `parts`."""
     modules = [_UNIT]
     parts: dict[str, Any] = {}
     for kind, part in condition.parts.items():
@@ -140,7 +142,7 @@ def describe_parts(condition: Condition) -> Code:
 
 
 def describe_metrics(metrics: Iterable[Part]) -> dict[str, Any]:
-    """Return part, options and digest of each metric's code and files, by its column."""
+    """Return part, options and digest of code and files of each metric, by column."""
     described = {}
     for part in metrics:
         target = part.found
@@ -157,7 +159,7 @@ def describe_metrics(metrics: Iterable[Part]) -> dict[str, Any]:
 
 
 def lacks_metrics(code: Mapping[str, Any], expected: Code) -> list[str]:
-    """Return the columns of further metrics that rows of some code lack.
+    """Return the columns of further metrics that rows lack, according to their code.
 
     Args:
         code: code of the rows.
@@ -168,13 +170,16 @@ def lacks_metrics(code: Mapping[str, Any], expected: Code) -> list[str]:
 
 
 def touches(condition: Condition, metrics: Iterable[Part] = ()) -> Touches:
-    """Return what custom parts read in this process; see `benchnav.core.touched`."""
+    """Return the files, packages and variables that custom parts read in this process.
+
+    See `benchnav.core.touched`.
+    """
     sources = [part.found for part in (*metrics, *condition.parts.values())]
     return touches_of(source.target for source in sources if not source.shipped)
 
 
 def describe_datasets(conditions: Conditions) -> dict[str, Any]:
-    """Return the id and the digests by split of each dataset's maps and properties."""
+    """Return each dataset's id, and digests of its maps and properties by split."""
     described: dict[str, Any] = {}
     for condition, extent in conditions.values():
         dataset = condition.dataset
@@ -194,11 +199,11 @@ def map_digests(dataset: TerrainDataset, split: str, maps: Sequence[int]) -> lis
 
 
 def code_differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """Describe entries that differ between two codes and that both have.
+    """Describe the entries that two codes have in common and that differ.
 
     Args:
         earlier: code as in `Origin.code`; it may also contain `TOUCHED`.
-        now: the other code, likewise.
+        now: the code that is compared with it, in the same form.
     """
     lines = []
     modules = _differing(earlier, now, "modules")
@@ -219,7 +224,7 @@ def code_differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list
 def _differing(
     earlier: Mapping[str, Any], now: Mapping[str, Any], group: str
 ) -> list[str]:
-    """Return the names of entries of a group that differ and that both codes have."""
+    """Return the names of entries of a group that both codes have and that differ."""
     values = now.get(group, {})
     return [
         name
@@ -231,11 +236,11 @@ def _differing(
 def dataset_differences(
     earlier: Mapping[str, Any], now: Mapping[str, Any]
 ) -> list[str]:
-    """Describe maps that differ between two runs and that both have.
+    """Describe the maps that two runs have in common and that differ.
 
     Args:
         earlier: datasets of a run, from `describe_datasets`.
-        now: datasets of the other run.
+        now: datasets of the run that is compared with it.
     """
     changed = []
     for data, entry in earlier.items():
@@ -252,7 +257,7 @@ def dataset_differences(
 
 
 def describe_machine() -> dict[str, Any]:
-    """Return processor, cores and host, for readers."""
+    """Return the names of processor and host, and the number of cores."""
     return {"processor": _processor(), "cores": os.cpu_count(), "host": platform.node()}
 
 
@@ -261,12 +266,13 @@ def extend_history(
 ) -> list[Mapping[str, Any]]:
     """Append an entry for this command to a history, unless the command is repeated.
 
-    An entry has command, suite, date, machine, version and git commit of this package.
-    The commit ends in `+` if files differ from it, and is empty without a repository.
+    An entry has command, suite, date, machine, version and git commit of benchnav. The
+    commit ends in `+` if files differ from it; it is empty if benchnav is not in a git
+    repository of its own.
 
     Args:
         earlier: existing entries.
-        suite: suite of this command, as it was written.
+        suite: suite of this command, as the user wrote it.
     """
     program, *arguments = sys.argv
     request = {
@@ -294,7 +300,7 @@ def join(*lists: Iterable[Any]) -> list[Any]:
 
 
 def command_lines(manifest: Mapping[str, Any]) -> list[str]:
-    """Return the commands of a run from its `run.json`, without repetitions."""
+    """Return the commands in the history of a `run.json`, without repetitions."""
     return list(dict.fromkeys(entry["command"] for entry in manifest["history"]))
 
 
@@ -319,7 +325,7 @@ def _commit() -> str:
         return completed.stdout.strip()
 
     try:
-        # Fails if the repository is another project's.
+        # This command fails if the repository belongs to another project.
         git("ls-files", "--error-unmatch", "__init__.py")
         changed = git("status", "--porcelain", "--", ".")
         mark = "+" if changed else ""

@@ -1,7 +1,7 @@
-"""Rows of a run: its table if the run is finished, else its finished units.
+"""Rows of a run: from its table if the run is finished, else from its finished units.
 
-Nothing is locked or written, so that a run can be read while another process works on
-it: each unit is one file, which is written atomically.
+A run can be read while another process works on it. Reading locks and writes nothing,
+and each unit is one file, which is written atomically.
 """
 
 from collections.abc import Mapping
@@ -25,7 +25,7 @@ from benchnav.eval.folder.run_folder import (
     read_table,
 )
 
-_NAMED = 3
+_MAX_NAMED = 3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -33,12 +33,13 @@ class Results:
     """Rows of a run, and the number of its finished units.
 
     Args:
-        run: the run; if it is not finished, its manifest has the `codes` of finished units.
+        run: the run; if it is not finished, `codes` in its manifest are those of the
+            finished units.
         episodes: one row per episode.
-        finished: number of units with rows.
-        units: number of units of the run.
+        finished: number of finished units; 0 if the run is finished.
+        units: number of units of the run; 0 if the run is finished.
         without: names of the conditions without an episode.
-        is_partial: whether the run is not finished, even if all its units are.
+        is_partial: whether the run has no table yet, even if all units are finished.
     """
 
     run: Run
@@ -50,14 +51,14 @@ class Results:
 
     @property
     def mark(self) -> str:
-        """Mark of tables and figures of a run that is not finished; else empty."""
+        """Mark for tables and figures of an unfinished run; empty for a finished run."""
         if not self.is_partial:
             return ""
         return f"partial: {self.finished} of {self.units} units"
 
     @property
     def conditions(self) -> dict[str, Any]:
-        """Entries of `run.json` of conditions that have rows, by id, in its order."""
+        """Entries in `run.json` of the conditions that have rows, by id."""
         with_rows = set(self.episodes["condition"])
         entries = self.run.manifest["conditions"]
         return {i: entry for i, entry in entries.items() if i in with_rows}
@@ -69,20 +70,20 @@ class Results:
         planned = sum(extent.episodes for _, extent in self.run.conditions.values())
         lines = [
             f"{self.mark}, {len(self.episodes)} of {planned} episodes. Conditions may "
-            "have different episodes: rates "
-            "do not compare them. Intervals and p-values hold for a finished run, not "
-            "for one that is read repeatedly as it grows"
+            "have different episodes, so that their rates cannot be compared. Intervals "
+            "and p-values are valid for a finished run, not for a run that is read "
+            "repeatedly as it grows"
         ]
         if self.without:
-            named = "; ".join(self.without[:_NAMED])
-            if len(self.without) > _NAMED:
-                named += f" and {len(self.without) - _NAMED} more"
+            named = "; ".join(self.without[:_MAX_NAMED])
+            if len(self.without) > _MAX_NAMED:
+                named += f" and {len(self.without) - _MAX_NAMED} more"
             lines.append(f"{self.mark}, no episode yet: {named}")
         n_codes = len(self.run.manifest["codes"])
         if n_codes > 1:
             lines.append(
-                f"{self.mark}, made by {n_codes} versions of the code; column `code` "
-                "indicates which rows"
+                f"{self.mark}, run with {n_codes} versions of the code; the column "
+                "`code` identifies the version of each row"
             )
         return lines
 
@@ -95,8 +96,8 @@ def read_results(folder: Path, partial: bool = False) -> Results:
         partial: whether to accept a run that is not finished, or a shard.
 
     Raises:
-        ConfigError: If the folder is no run folder, its run is not finished and
-            `partial` is false, or no unit is.
+        ConfigError: If the folder is no run folder, if its run is not finished and
+            `partial` is false, or if no unit is finished.
     """
     run = open_run(folder)
     if (folder / EPISODES).exists() or not partial:
@@ -104,15 +105,15 @@ def read_results(folder: Path, partial: bool = False) -> Results:
     all_units = newest_units(run)
     finished = []
     tables = []
-    for unit, making in all_units:
-        if making is not None:
-            finished.append(making)
-            tables.append(labelled_rows(unit, making))
+    for unit, finished_unit in all_units:
+        if finished_unit is not None:
+            finished.append(finished_unit)
+            tables.append(labelled_rows(unit, finished_unit))
     if not finished:
         raise ConfigError(
             f"Expected a run with a finished unit, got {folder}, where 0 of "
-            f"{len(all_units)} units are finished. Wait for the first, or give its "
-            "`benchnav-eval run` command."
+            f"{len(all_units)} units are finished. Wait for the first unit, or run the "
+            "run's `benchnav-eval run` command."
         )
     episodes = pd.concat(tables, ignore_index=True)
     with_rows = set(episodes["condition"])
@@ -133,11 +134,14 @@ def read_results(folder: Path, partial: bool = False) -> Results:
 
 
 def newest_units(run: Run) -> list[tuple[Unit, Finished | None]]:
-    """Return the units of a run in the order of its table, with their newest making."""
+    """Return the units of a run in the order of its table, each with its newest file.
+
+    Unfinished units have None.
+    """
     newest = []
     for unit in in_table_order(units(run.conditions), run.conditions):
-        makings = find_units(run.folder, unit)
-        newest.append((unit, makings[0] if makings else None))
+        finished_units = find_units(run.folder, unit)
+        newest.append((unit, finished_units[0] if finished_units else None))
     return newest
 
 
@@ -149,14 +153,18 @@ def code_of(run: Run, digest: str) -> Mapping[str, Any]:
         digest: digest of the code.
     """
     codes = run.manifest.get("codes", {})
-    if digest not in codes:  # of a unit that is not yet in the table
-        makings = [making for _, making in newest_units(run) if making is not None]
-        codes = _codes(makings)
+    if digest not in codes:  # if the unit is not yet in the table
+        finished_units = [
+            finished_unit
+            for _, finished_unit in newest_units(run)
+            if finished_unit is not None
+        ]
+        codes = _codes(finished_units)
     code: Mapping[str, Any] = codes[digest]
     return code
 
 
 def _codes(finished: list[Finished]) -> dict[str, Any]:
     """Return the codes of finished units by digest."""
-    codes = [making.metadata["code"] for making in finished]
+    codes = [finished_unit.metadata["code"] for finished_unit in finished]
     return {code_digest(code): code for code in codes}

@@ -1,11 +1,11 @@
 """Run folders, format version 6: layout, reading and writing.
 
 A run folder contains `run.json` (conditions and provenance), `units/` (one Parquet file
-for each finished unit, by condition and key, with rows and metadata), `steps/`,
-`playback/` and, when the run is finished, `episodes.parquet`, `errors.txt` if a
-planner, model, sensor or belief failed, and the report. All files are written
-atomically. `run.json` contains its own digest and those of the run's tables, so that an
-edit of either is detected.
+for each finished unit, by condition and key, with rows and metadata), `steps/` and
+`playback/`. A finished run also has `episodes.parquet`, the report, and `errors.txt` if
+a planner, model, sensor or belief failed. All files are written atomically. `run.json`
+contains its own digest and the digests of the run's tables, so that a change of any of
+these files is detected.
 """
 
 import json
@@ -48,7 +48,7 @@ FORMAT_VERSION = 6
 RUN = "run.json"
 EPISODES = "episodes.parquet"
 ERRORS = "errors.txt"
-KEYS = ["condition", *DRAW]  # of a row
+KEYS = ["condition", *DRAW]  # columns that identify a row
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,9 +57,9 @@ class Run:
 
     Args:
         folder: path of the folder.
-        manifest: contents of its `run.json`.
+        manifest: contents of `run.json`.
         conditions: conditions by id, each with its extent.
-        shard: shard of the run that the folder contains; None for a whole run.
+        shard: shard of the run that the folder contains; None for an unsharded run.
     """
 
     folder: Path
@@ -76,10 +76,10 @@ def open_run(folder: Path) -> Run:
     """
     if not (folder / RUN).is_file():
         raise ConfigError(
-            f"Expected a run folder with {RUN}, got {folder}. Make one with "
+            f"Expected a run folder with {RUN}, got {folder}. Create one by "
             "`benchnav-eval run`."
         )
-    remedy = "Take it from a copy, or run the suite again into another folder."
+    remedy = "Restore it from a copy, or run the suite again with another `--out`."
     with damaged(folder / RUN, remedy):
         text = (folder / RUN).read_text()
         version = _format_version(json.loads(text))
@@ -107,12 +107,12 @@ def _run_of(folder: Path, manifest: dict[str, Any]) -> Run:
 def _format_version(manifest: Any) -> int:
     """Return the format version of `run.json`."""
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
-        raise DamageError("it does not say that it is a run")
+        raise DamageError(f"its `format` is not {FORMAT!r}")
     return int(manifest["format_version"])
 
 
 def is_taken(folder: Path) -> bool:
-    """Return whether a path is not an empty folder, so that no run can begin there."""
+    """Return whether something exists at a path, other than an empty folder."""
     return folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
 
 
@@ -122,7 +122,7 @@ def write_run(folder: Path, manifest: Mapping[str, Any]) -> None:
 
 
 def caveats(manifest: Mapping[str, Any]) -> list[str]:
-    """Return warnings and left-out combinations, for readers of a run's tables.
+    """Return lines with the warnings and the left-out combinations of a run.
 
     Args:
         manifest: contents of `run.json`, at least `warnings` and `dropped`.
@@ -161,17 +161,16 @@ def read_table(folder: Path, name: str) -> pd.DataFrame:
     if not path.exists():
         if run.shard is not None:
             raise ConfigError(
-                f"Expected a whole run, got {folder}, which is shard {run.shard} of a "
-                "run and has no tables. Merge all "
-                "shards with `benchnav-eval merge OUT PART …`."
+                f"Expected an unsharded run, got {folder}, which is shard {run.shard} "
+                "and has no tables. Merge all shards by `benchnav-eval merge OUT PART "
+                "…`."
             )
         raise ConfigError(
-            f"Expected a finished run, got {folder} without {name}. Give its "
-            "`benchnav-eval run` command again to "
-            "finish it; `benchnav-eval report --partial` and `replay` read unfinished "
-            "runs."
+            f"Expected a finished run, got {folder} without {name}. Run its "
+            "`benchnav-eval run` command again to finish it; `benchnav-eval report "
+            "--partial` and `replay` can read unfinished runs."
         )
-    with damaged(path, "Remove it and give the run's command again."):
+    with damaged(path, "Remove it, and run the run's command again."):
         digests = run.manifest.get("tables", {})
         if digests.get(name) != digest_of_path(path):
             raise DamageError("it was changed after benchnav wrote it")
@@ -180,17 +179,17 @@ def read_table(folder: Path, name: str) -> pd.DataFrame:
 
 @contextmanager
 def damaged(path: Path, remedy: str) -> Iterator[None]:
-    """Convert any error of reading a file into a ConfigError of one line.
+    """Convert any error of reading a file into a ConfigError with one line.
 
     Args:
         path: path of the file, for the message.
-        remedy: sentence that says how to replace the file.
+        remedy: sentence on how to replace the file.
     """
     try:
         yield
     except PermissionError:
         raise
-    except Exception as error:  # of the table's library, or of a rule for suites
+    except Exception as error:  # raised by pyarrow or by checks of settings
         is_ours = isinstance(error, DamageError | ConfigError)
         reason = error if is_ours else one_line(error)
         message = f"{path} is damaged: {reason}. {remedy}"
@@ -204,10 +203,10 @@ class Finished:
     Args:
         path: file of the unit.
         metadata: metadata of the file: `unit` (its identity); `key`; `code`; `digests` of
-            the maps; `record`; `made`, a random token, which copies retain;
-            `traceback`; `errors`; `touched`, the files, packages and variables that
-            custom parts read; and digests: `content` of its rows, `steps` of its steps,
-            and `recordings` of its recordings by path.
+            the maps; `record`; `made`, a random token, which is the same in copies;
+            `traceback`; `errors`; `touched`, the files, packages and environment
+            variables that custom parts read; and digests: `content` of the rows, `steps`
+            of the steps, and `recordings` of the recordings, by path.
     """
 
     path: Path
@@ -220,13 +219,14 @@ class Finished:
 
     @property
     def metrics(self) -> set[str]:
-        """Columns of its rows in addition to the built-in ones."""
+        """Columns of the metrics in addition to the built-in ones."""
         return set(self.metadata["code"].get(METRICS, ()))
 
     def has(self, unit: Unit) -> bool:
         """Return whether the steps and recordings that `unit` requests were stored.
 
-        Steps of another making of the unit do not count.
+        The folder may instead contain the steps of another file of the unit, which do
+        not count.
         """
         record = self.metadata["record"]
         if RECORDS.index(record) < RECORDS.index(unit.record):
@@ -239,8 +239,8 @@ class Finished:
     def damage(self) -> list[str]:
         """Return a line for each damaged file of the unit, starting with its path.
 
-        Only steps and recordings of this making of the unit are checked. A missing file
-        is no damage.
+        Steps and recordings are checked only if they belong to this file of the unit. A
+        missing file is not damage.
         """
         lines = damage_of(self.path, str(self.path.relative_to(self.folder)))
         condition_id, *_ = self.metadata["unit"]
@@ -253,7 +253,7 @@ class Finished:
         if self.metadata.get("steps") and steps_file.exists():
             damage = damage_of(steps_file, str(steps))
             if not damage and steps_metadata.get(CONTENT) != self.metadata["steps"]:
-                damage = [f"{steps}: it holds the steps of another run"]
+                damage = [f"{steps}: it contains the steps of another run"]
             lines += damage
         for path, digest in self.metadata.get("recordings", {}).items():
             if digest_of_path(self.folder / path) not in ("", digest):
@@ -262,16 +262,16 @@ class Finished:
 
 
 def find_units(folder: Path, unit: Unit) -> list[Finished]:
-    """Find all makings of a unit, of any code and maps, newest first."""
+    """Find all files of a unit, for any code and maps, newest first."""
     files = (folder / "units" / unit.condition.id).glob(f"{unit.name}-*.parquet")
     newest_first = sorted(files, key=lambda path: path.stat().st_mtime, reverse=True)
     identity = _identity(unit)
-    makings = []
+    finished_units = []
     for path in newest_first:
         finished = Finished(path=path, metadata=metadata(path))
         if finished.metadata.get("unit") == identity:
-            makings.append(finished)
-    return makings
+            finished_units.append(finished)
+    return finished_units
 
 
 def unit_path(unit: Unit, key: str) -> Path:
@@ -299,13 +299,13 @@ def write_unit(
         unit: unit that was run.
         origin: origin of its rows.
         rows: one row per episode.
-        errors: messages of faults, a line each.
-        traceback: traceback of the first fault; empty if there was no fault.
+        errors: messages of failures of parts, one line each.
+        traceback: traceback of the first failure; empty if no part failed.
     """
     key = origin.key(unit)
     recordings = {}
-    for member in range(len(unit.maps)):
-        path = unit.recording_path(member)
+    for episode_index in range(len(unit.maps)):
+        path = unit.recording_path(episode_index)
         digest = digest_of_path(folder / path)
         if digest:
             recordings[path.as_posix()] = digest
@@ -330,11 +330,11 @@ def write_unit(
 
 
 def clear_unit(folder: Path, unit: Unit) -> None:
-    """Remove steps and recordings of an earlier making of a unit, but not its rows."""
+    """Remove the steps and recordings of a unit, but not its rows."""
     (folder / unit.steps_path).unlink(missing_ok=True)
-    for member in range(len(unit.maps)):
+    for episode_index in range(len(unit.maps)):
         for suffix in (".npz", ".rrd"):
-            path = folder / unit.recording_path(member, suffix)
+            path = folder / unit.recording_path(episode_index, suffix)
             path.unlink(missing_ok=True)
 
 
@@ -346,20 +346,20 @@ def finish_run(
     Args:
         folder: the run folder.
         finished: all units of the run, in the order of the table.
-        reused: a line on units of other code; empty without such units.
+        reused: line on units that were run with other code; empty without such units.
     """
     manifest = open_run(folder).manifest
     write_errors(folder, finished)
-    tables = [labelled_rows(unit, making) for unit, making in finished]
+    tables = [labelled_rows(unit, finished_unit) for unit, finished_unit in finished]
     rows = pd.concat(tables, ignore_index=True)
     table = pa.Table.from_pandas(rows, preserve_index=False)
     with replacing(folder / EPISODES) as partial:
         pq.write_table(table.replace_schema_metadata(None), partial)
     codes: dict[str, Any] = {}
-    for _, making in finished:
-        code = making.metadata["code"]
+    for _, finished_unit in finished:
+        code = finished_unit.metadata["code"]
         entry = codes.setdefault(code_digest(code), {**code, TOUCHED: {}})
-        entry[TOUCHED] |= making.metadata.get(TOUCHED, {})
+        entry[TOUCHED] |= finished_unit.metadata.get(TOUCHED, {})
     results = {
         "codes": codes,
         "reused": reused,
@@ -371,8 +371,8 @@ def finish_run(
 
 
 def write_errors(folder: Path, finished: Iterable[tuple[Unit, Finished]]) -> None:
-    """Write `errors.txt` of all units, or remove it if nothing failed."""
-    texts = [_trace(unit, making, folder) for unit, making in finished]
+    """Write the failures of all units to `errors.txt`; remove it if nothing failed."""
+    texts = [_trace(unit, finished_unit, folder) for unit, finished_unit in finished]
     traces = [text for text in texts if text]
     if traces:
         write_text(folder / ERRORS, "\n".join(traces))
@@ -384,9 +384,9 @@ def unit_rows(finished: Finished) -> pd.DataFrame:
     """Read the rows of a finished unit.
 
     Raises:
-        ConfigError: If its file is damaged.
+        ConfigError: If the file is damaged.
     """
-    remedy = "Give the run's command again, which runs the unit again."
+    remedy = "Run the run's command again: it runs the unit again."
     with damaged(finished.path, remedy):
         return read_sealed(finished.path).to_pandas()
 
@@ -399,15 +399,16 @@ def labelled_rows(unit: Unit, finished: Finished) -> pd.DataFrame:
 def differences(
     first: pd.DataFrame, second: pd.DataFrame
 ) -> tuple[pd.DataFrame, pd.Index]:
-    """Compare two tables of episodes bit for bit, in result columns that both have.
+    """Compare two tables of episodes bit for bit, in their common result columns.
 
     Args:
         first: rows of episodes, in any order.
         second: rows of episodes, in any order.
 
     Returns:
-        The cells that differ, in the order of the first table: `first`, `second`, by
-        `KEYS` and column; and the keys of episodes that are in only one table.
+        The cells that differ, by `KEYS` and column, with both values (columns `first`
+        and `second`), in the order of the first table; and the keys of the episodes
+        that only one table has.
     """
     common_columns = _results(first) & _results(second)
     columns = [name for name in first if name in common_columns]
@@ -424,12 +425,12 @@ def differences(
 
 
 def differing_columns(first: pd.DataFrame, second: pd.DataFrame) -> list[str]:
-    """Return result columns that are in only one of two tables."""
+    """Return the result columns that only one of two tables has."""
     return sorted(_results(first) ^ _results(second))
 
 
 def _results(rows: pd.DataFrame) -> set[str]:
-    """Return the names of result columns: neither wall times nor digests of code."""
+    """Return the names of result columns, without keys, wall times and code digests."""
     excluded = (*KEYS, "code", "learning_ms")
     names = {name for name in rows if not name.startswith("planning_")}
     return names.difference(excluded)

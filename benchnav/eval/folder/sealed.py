@@ -1,7 +1,7 @@
 """Parquet files of a run with digests of their contents, so that changes are detected.
 
-The metadata of a file is JSON text that contains its own digest, like `run.json`
-(`benchnav.core.store.seal`). It includes `content`, the digest of the table.
+The metadata of a file is JSON text that contains its own digest, as in `run.json`
+(see `benchnav.core.store.seal`). The metadata include `content`, the digest of the table.
 """
 
 import hashlib
@@ -17,20 +17,20 @@ import pyarrow.parquet as pq
 from benchnav.core.errors import ConfigError
 from benchnav.core.store import seal, unseal
 
-METADATA = b"benchnav"  # our key in a Parquet file's metadata
+METADATA = b"benchnav"  # key of benchnav's metadata in a Parquet file
 CONTENT = "content"
 
 
 class DamageError(ValueError):
-    """A file of a run differs from what was written."""
+    """A file of a run is missing, unreadable or changed."""
 
 
 def content_digest(table: pa.Table) -> str:
     """Return the SHA-256 of a table's columns: names, types and values.
 
-    The order of columns does not matter. Columns without any value are ignored, since
-    files of steps receive such columns when a run is extended by a robot with other
-    actions.
+    The order of columns does not matter. Columns without any value are ignored: files
+    of steps receive such columns when a run is extended by a robot with different
+    action dimensions.
 
     Args:
         table: a table of numbers, Booleans and text.
@@ -59,10 +59,10 @@ def with_metadata(table: pa.Table, file_metadata: Mapping[str, Any]) -> pa.Table
 
 
 def metadata(path: Path) -> dict[str, Any]:
-    """Return a file's metadata; empty if it is missing, damaged, or not of a run."""
+    """Return a file's metadata; empty if they are missing, damaged or not benchnav's."""
     try:
         return _unsealed((pq.read_schema(path).metadata or {}).get(METADATA, b"{}"))
-    except Exception:  # a flipped bit may make Arrow raise anything
+    except Exception:  # with a flipped bit, Arrow may raise any error
         return {}
 
 
@@ -74,10 +74,10 @@ def _unsealed(text: bytes) -> dict[str, Any]:
 
 
 def read_sealed(path: Path) -> pa.Table:
-    """Read a file and compare it with its digest.
+    """Read the table of a file, and check its digest.
 
     Args:
-        path: a unit or a file of steps.
+        path: file of a unit or of steps.
 
     Returns:
         The table without metadata.

@@ -27,13 +27,12 @@ STEPS = "steps"
 LAST_COLUMN = "traversability"
 # RMSE of E[λ], and mean log score of the belief, over the terrain ahead of a robot.
 AHEAD_COLUMNS = ("ahead_rmse", "ahead_log_score")
-# Range and half-angle of the terrain ahead of a robot.
-AHEAD_M = 5.0
-AHEAD_DEG = 45.0
+AHEAD_M = 5.0  # range of the terrain ahead of a robot
+AHEAD_DEG = 45.0  # half the angle of this terrain
 _ORDER = ["condition", *DRAW, "step"]
 _REMEDY = (
-    "Remove the steps, which the report can do without, or run it again with "
-    "another `--out`."
+    "Remove the folder of steps, which the report does not need, or run the suite "
+    "again with another `--out`."
 )
 
 
@@ -44,7 +43,7 @@ def write_steps(folder: Path, unit: Unit, key: str, table: pa.Table) -> None:
         folder: the run folder.
         unit: unit that was run.
         key: key of the unit.
-        table: from `step_table`.
+        table: table from `step_table`.
     """
     _write(folder / unit.steps_path, table, {"key": key})
 
@@ -55,9 +54,9 @@ def _write(path: Path, table: pa.Table, file_metadata: Mapping[str, Any]) -> Non
 
 
 def align_steps(folder: Path, finished: Iterable[Unit]) -> None:
-    """Give all files of steps the same columns, also if robots have different actions.
+    """Give all files of steps the same columns, even if robots' actions differ.
 
-    Readers of many files use the columns of the first.
+    Readers of several files use the columns of the first file.
 
     Args:
         folder: the run folder.
@@ -99,8 +98,8 @@ def step_files(
         conditions: ids of conditions; None for all conditions.
 
     Yields:
-        Columns as in `step_table`, and `condition`. If the run is not finished, its
-        files may differ in their columns.
+        Columns of `step_table`, and `condition`. If the run is not finished, its files
+        may have different columns.
 
     Raises:
         ConfigError: If a file is damaged.
@@ -122,8 +121,8 @@ def read_steps(folder: Path, **filters: Any) -> pd.DataFrame:
             …), and `seed`, `realisation`, `map`, `step`. A list selects several values.
 
     Returns:
-        One row per state, in the order of condition, seed, realisation, map and step;
-        columns as in `step_table`, and `condition`.
+        One row per state, ordered by condition, seed, realisation, map and step;
+        columns of `step_table`, and `condition`.
 
     Raises:
         ConfigError: If the run has no steps, or a filter is unknown.
@@ -131,7 +130,7 @@ def read_steps(folder: Path, **filters: Any) -> pd.DataFrame:
     run = open_run(folder)
     if not has_steps(folder):
         raise ConfigError(
-            f"Expected a run with steps, got {folder} without any. Make them with "
+            f"Expected a run with steps, got {folder} without any. Run its suite with "
             "`--record steps`."
         )
     conditions = set(run.conditions)

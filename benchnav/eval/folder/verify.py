@@ -25,7 +25,8 @@ def verify_run(folder: Path) -> tuple[list[str], list[str]]:
         folder: a run folder, finished or not; nothing is written.
 
     Returns:
-        Lines on damage, each starting with the file, and further notes.
+        Lines on damage, each starting with the path of the file, and notes on missing
+        units and files.
 
     Raises:
         ConfigError: If the folder has no `run.json`.
@@ -56,7 +57,9 @@ def verify_run(folder: Path) -> tuple[list[str], list[str]]:
     removed = []
     for name, digest in checksums.items():
         if not digest:
-            damage.append(f"{SUMS}: {name[:60]!r} is not a checksum and a path")
+            damage.append(
+                f"{SUMS}: {name[:60]!r} does not consist of a checksum and a path"
+            )
         elif not (folder / name).is_file():
             removed.append(name)
         elif digest_of_path(folder / name) != digest:
@@ -70,7 +73,7 @@ def verify_run(folder: Path) -> tuple[list[str], list[str]]:
         notes.append(f"{n_missing} of {len(run_units)} units are not finished")
     if removed:
         notes.append(
-            f"{len(removed)} of {len(checksums)} files in {SUMS} are missing, the "
-            f"first {removed[0]}"
+            f"{len(removed)} of {len(checksums)} files in {SUMS} are missing; the "
+            f"first is {removed[0]}"
         )
     return list(dict.fromkeys(damage)), notes

@@ -25,11 +25,12 @@ from benchnav.stats.tables import (
 
 
 def comparison_table(table: pd.DataFrame, difference: float, by: str) -> Table:
-    """Format a comparison: success in percentage points, times in seconds, corrected p.
+    """Format a comparison of success and T_total.
 
     Args:
-        table: from `comparison.compare`.
-        difference: difference of success that `maps_needed` is for.
+        table: table from `comparison.compare`.
+        difference: difference in success rate, as a fraction, for which `maps_needed`
+            was computed.
         by: column in which the conditions of a pair differ.
     """
     scale, suffix, unit, fraction_note = 1, "s", "s", ""
@@ -98,8 +99,8 @@ def metric_table(table: pd.DataFrame, quantity: Quantity, by: str) -> Table:
     """Format a comparison by one metric.
 
     Args:
-        table: from `comparison.compare_by`.
-        quantity: the quantity compared.
+        table: table from `comparison.compare_by`.
+        quantity: the compared quantity.
         by: column in which the conditions of a pair differ.
     """
     unit = f" [{quantity.unit}]" if quantity.unit else ""
@@ -158,7 +159,15 @@ def _pair_table(
     columns: Sequence[Column],
     notes: tuple[str, ...],
 ) -> Table:
-    """Format columns, preceded by labels that differ, the pair, and counts."""
+    """Format a table with the labels that differ, both labels of a pair, and columns.
+
+    Args:
+        table: table of the comparison.
+        by: column in which the conditions of a pair differ.
+        counts: columns of counts, which are shown only if they differ between pairs.
+        columns: further columns.
+        notes: notes of the table.
+    """
     names = [name for name in (*LABELS, "run") if name in table]
     labels = []
     for name in names:
@@ -178,7 +187,7 @@ def _pair_table(
 
 
 def _significance(p: str) -> Column:
-    """Return the column that shows whether the p-value of a column is significant."""
+    """Return the column that shows whether the p-values in column `p` are significant."""
     return Column(
         "significant",
         cell_of(p, lambda value: "yes" if value < ALPHA else "no"),
@@ -187,7 +196,7 @@ def _significance(p: str) -> Column:
 
 
 def _pairs_and_unit(table: pd.DataFrame) -> tuple[str, str]:
-    """Return the number of pairs in words, and the statistical unit."""
+    """Return the number of pairs in words, and the name of the statistical unit."""
     pairs = "1 pair" if len(table) == 1 else f"{len(table)} pairs"
     has_groups = (table["n_groups"] < table["n_maps"]).any()
     return pairs, "group" if has_groups else "map"
@@ -196,16 +205,24 @@ def _pairs_and_unit(table: pd.DataFrame) -> tuple[str, str]:
 def _difference_columns(
     title: str, name: str, unit: str, scale: float, meaning: str
 ) -> list[Column]:
-    """Return the columns of a difference and of its interval."""
+    """Return two columns: a difference, and its interval.
 
-    def ends(row: Row) -> str:
+    Args:
+        title: heading of both columns together, in explanations.
+        name: start of the names of columns in the comparison, such as `time`.
+        unit: end of these names, such as `_s`.
+        scale: factor from the stored values to the shown values.
+        meaning: explanation of the columns.
+    """
+
+    def interval(row: Row) -> str:
         low = scale * row[f"{name}_low{unit}"]
         high = scale * row[f"{name}_high{unit}"]
         return signed_interval(low, high)
 
     heading, _, _ = title.partition(",")
     shown = cell_of(f"{name}_difference{unit}", lambda value: signed(scale * value))
-    return [Column(heading, shown, meaning, title), Column("95 %", ends)]
+    return [Column(heading, shown, meaning, title), Column("95 %", interval)]
 
 
 def _comparison_notes(table: pd.DataFrame, difference: float) -> tuple[str, ...]:
@@ -215,8 +232,8 @@ def _comparison_notes(table: pd.DataFrame, difference: float) -> tuple[str, ...]
     )
     if np.isinf(table["success_detectable"]).any():
         needed = (
-            f"These {unit}s are too few for any difference to be significant, "
-            "and to estimate how many maps a test needs."
+            f"There are too few {unit}s for a significant difference, and for an "
+            "estimate of the number of maps needed."
         )
     return (
         f"Tests by {unit}: signs of the difference (success) and ranks (T_total), p "

@@ -1,4 +1,4 @@
-"""Findings of a run in sentences; tests decide whether one setting is better."""
+"""Findings of a run in sentences, based on statistical tests."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -27,12 +27,13 @@ def findings(
     """Describe the best setting of each block, its margin, significance and failures.
 
     Args:
-        summary: from `summary.summarise`, joined with `best.against_best`.
-        failures: from `failures.failures_table`.
-        predicted: λ̂ where failed episodes ended, by condition.
+        summary: table from `summary.summarise`, joined with `best.against_best`.
+        failures: table from `failures.failures_table`.
+        predicted: λ̂ at the end of failed episodes, by condition, each of shape [number
+            of failures].
 
     Returns:
-        Sentences by the title of a block.
+        Sentences by title of the block.
     """
     by_title = {}
     for title, block in blocks(with_names(summary)):
@@ -42,9 +43,14 @@ def findings(
 
 
 def _pairing_by_label(rows: pd.DataFrame, summary: pd.DataFrame) -> dict[str, bool]:
-    """Return the labels by which blocks on the same maps differ from this one.
+    """Return the columns in which other blocks on the same maps differ from a block.
 
-    The value is whether `compare` pairs settings by that label.
+    Args:
+        rows: summary of the block.
+        summary: summary of the run.
+
+    Returns:
+        For each column, whether `compare` can pair settings by it.
     """
     first = rows.iloc[0]
     setting_columns = [name for name in LABELS if name not in BLOCK]
@@ -60,9 +66,9 @@ def _pairing_by_label(rows: pd.DataFrame, summary: pd.DataFrame) -> dict[str, bo
             & (same_maps[name] != first[name])
         ]
         if not others.empty:
-            rows_of_others = others[setting_columns].itertuples(index=False, name=None)
-            has_common_setting = not settings.isdisjoint(rows_of_others)
-            # Worlds may draw different λ and are never paired.
+            other_settings = others[setting_columns].itertuples(index=False, name=None)
+            has_common_setting = not settings.isdisjoint(other_settings)
+            # Settings of different worlds are not paired, since λ may differ.
             is_paired_by[name] = name != "world" and has_common_setting
     return is_paired_by
 
@@ -92,7 +98,7 @@ def _sentences(
     if not rivals_of_best.empty and (rivals["n_episodes"] > common).any():
         yield f"The comparison uses the {common} episodes that all settings have."
     yield from _rank(best, rivals_of_best, pairing)
-    yield from _why(best, failures, predicted)
+    yield from _failure_sentences(best, failures, predicted)
     count = int(rivals["n_episodes"].sum())
     failed = rivals[list(FAILURE_COUNTS)].to_numpy().sum()
     if failed and len(rivals) > 1:
@@ -185,10 +191,10 @@ def _rank(
     )
 
 
-def _why(
+def _failure_sentences(
     best: Mapping[Any, Any], failures: pd.DataFrame, predicted: Mapping[str, np.ndarray]
 ) -> Iterable[str]:
-    """Yield how the best setting's episodes failed, and λ where they ended."""
+    """Yield sentences on the failures of the best setting, and on λ at their ends."""
     failed = sum(best[column] for column in FAILURE_COUNTS)
     if not failed:
         yield f"{best['name']} never failed."
@@ -200,19 +206,22 @@ def _why(
     observed = failures.loc[
         failures["condition"] == best["condition"], "last_traversability"
     ].median()
-    # An end outside the map has no λ̂.
+    # λ̂ is NaN if an episode ended outside the map.
     predicted_median = pd.Series(predicted.get(best["condition"]), dtype=float).median()
     if not np.isnan(observed) and not np.isnan(predicted_median):
         yield (
-            f"Where they ended, the predicted λ̂ was {predicted_median:.2f}; the robot "
-            f"observed λ = {observed:.2f} in the last 2 s (medians)."
+            f"Where these episodes ended, λ̂ was {predicted_median:.2f}; in the last "
+            f"2 s, the robot observed λ = {observed:.2f} (medians)."
         )
     elif not np.isnan(observed):
-        yield f"The robot observed λ = {observed:.2f} in their last 2 s (median)."
+        yield (
+            "In the last 2 s of these episodes, the robot observed λ = "
+            f"{observed:.2f} (median)."
+        )
 
 
 def _failure_percentages(rows: pd.DataFrame) -> str:
-    """Return counts and percentages of outcomes of failures, frequent ones first."""
+    """Return the count and percentage of each outcome of failures, sorted by count."""
     counts = rows[list(FAILURE_COUNTS)].sum().rename(FAILURE_COUNTS)
     ordered = counts[counts > 0].sort_values(ascending=False, kind="stable")
     words = []

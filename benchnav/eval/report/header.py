@@ -22,13 +22,13 @@ def header_lines(
     manifest: Mapping[str, Any],
     worlds: Mapping[str, Mapping[str, Any]],
 ) -> tuple[str, ...]:
-    """Describe worlds, data, seeds, rejected draws and bounds of a run, one per line.
+    """Return lines on a run: worlds, data, models, seeds, rejected draws and bounds.
 
     Args:
-        summary: from `summary.summarise`.
+        summary: table from `summary.summarise`.
         episodes: rows of the run.
         manifest: contents of `run.json`.
-        worlds: world of each condition, by id.
+        worlds: world of each condition by id, as in `run.json`.
     """
     conditions = manifest["conditions"]
     return (
@@ -88,7 +88,7 @@ def _rejected_draws(episodes: pd.DataFrame, conditions: Mapping[str, Any]) -> li
     episodes = episodes[episodes["condition"].isin(frozen)]
     if not episodes["rejected_draws"].any():
         return []
-    # All conditions have the same draws, but those of a failed model have no draw.
+    # All conditions have the same draws, except that a failed model has no draw.
     rejected = episodes.groupby(MAP)["rejected_draws"].max()
     fraction = rejected.sum() / (rejected + 1).sum()
     return [
@@ -102,7 +102,7 @@ def _bracket(
     conditions: Mapping[str, Any],
     worlds: Mapping[str, Mapping[str, Any]],
 ) -> list[str]:
-    """Return the bounds of the best possible T_total, from planners that are given λ."""
+    """Return lines with bounds of the best possible results, one per reference."""
     lines = []
     for name, rows in episodes.groupby("condition", sort=False):
         budgets = time_budgets(rows, worlds[str(name)])
@@ -116,8 +116,8 @@ def _bracket(
         block = f"{labels['scenario']}, {labels['world']}"
         planner = planner_name(labels["planner"])
         lines.append(
-            f"The best possible result ({block}) lies between that of {planner} and a "
-            f"bound: T_total {best['time_bound']:.1f} to {time_s:.1f} s, "
+            f"The best possible result ({block}) lies between the result of {planner} "
+            f"and a bound: T_total {best['time_bound']:.1f} to {time_s:.1f} s, "
             f"success {success:.1f} to {success_bound:.1f} %."
         )
     return lines
@@ -147,7 +147,7 @@ def _world(value: Mapping[str, Any]) -> str:
 
 
 def provenance_lines(manifest: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return the provenance of a run as (name, value).
+    """Return the provenance of a run as pairs (name, value).
 
     Args:
         manifest: contents of `run.json`.

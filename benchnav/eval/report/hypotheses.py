@@ -24,7 +24,7 @@ _TESTS = {
     "superiority": "one-sided test at the margin (superiority)",
     "equivalence": "two one-sided tests (TOST) at the margin (equivalence)",
 }
-_OF_MARGINS = {
+_MARGIN_VERDICTS = {
     "equivalence": "equivalent",
     "non-inferiority": "not inferior",
     "superiority": "superior",
@@ -37,12 +37,12 @@ def hypothesis_findings(
     """Describe the result of each hypothesis.
 
     Args:
-        tests: from `hypotheses.test_hypotheses`.
+        tests: table from `hypotheses.test_hypotheses`.
         manifest: contents of `run.json`.
         unit: statistical unit, from `words.unit_of_statistics`.
 
     Returns:
-        Sentences by their title.
+        Sentences by title; there is one title.
     """
     all_quantities = quantities(further_quantities(manifest))
     sentences = []
@@ -62,12 +62,12 @@ def hypothesis_table(
     unit: str,
     quantities_by_name: Mapping[str, Quantity] = QUANTITIES,
 ) -> Table:
-    """Format the tests, one row per hypothesis; results of supported ones are bold.
+    """Format the tests, one row per hypothesis, with bold results if supported.
 
     Args:
-        tests: from `hypotheses.test_hypotheses`.
+        tests: table from `hypotheses.test_hypotheses`.
         unit: statistical unit, from `words.unit_of_statistics`.
-        quantities_by_name: quantities that conditions are compared by.
+        quantities_by_name: quantities by which conditions are compared.
     """
     kinds = set(tests["kind"])
     used = "; ".join(words for kind, words in _TESTS.items() if kind in kinds)
@@ -75,8 +75,8 @@ def hypothesis_table(
     notes = (
         f"Tests: {used.format(unit=unit)}; p is corrected over {family} (Holm). "
         f"Supported: p < {ALPHA}.",
-        "Intervals are of one difference and not corrected, so an interval and p can "
-        "disagree.",
+        "Intervals are those of single differences, without correction, so that an "
+        "interval and p can disagree.",
     )
     rows = tests.assign(number=range(1, len(tests) + 1)).to_dict("records")
     columns = [
@@ -88,8 +88,8 @@ def hypothesis_table(
         Column(
             "interval",
             _interval,
-            "95 % for a difference; 90 % for a margin: the end of the interval that "
-            "faces the margin decides the test, before the correction. Below "
+            "95 % for a difference; 90 % for a margin, where the limit next to the "
+            "margin decides the test before correction. With fewer than "
             f"{LEAST_MAPS} {unit}s, only success has an interval.",
         ),
         Column("p", cell_of("p_holm", _p)),
@@ -102,19 +102,19 @@ def hypothesis_table(
     is_difference = tests["kind"] == "difference"
     if (is_of_time & is_difference).any():
         text = (
-            "the interval allows for rare failures that no episode showed, and p "
-            "does not. So p can be small although the interval contains 0."
+            "the interval allows for rare failures that did not occur, but p does "
+            "not. Hence p can be small although the interval contains 0."
         )
         explained.append(("T_total", text))
     for quantity in quantities_by_name.values():
         if quantity.of_arrivals and (tests["metric"] == quantity.name).any():
-            text = "over the episodes in which both reached the goal."
+            text = "over the episodes in which both conditions reach the goal."
             explained.append((quantity.words, text))
     return replace(table, explained=(*table.explained, *explained))
 
 
 def _claim(row: Mapping[Any, Any], quantities_by_name: Mapping[str, Quantity]) -> str:
-    """Return the hypothesis, with conditions named as in tables and figures."""
+    """Return the claim of a hypothesis, with names of conditions as in tables."""
     names = [field.name for field in fields(Hypothesis)]
     test = Hypothesis(**{name: row[name] for name in names})
     first, second = map(reading_names, row["names"])
@@ -131,8 +131,8 @@ def _verdict(row: Mapping[Any, Any]) -> str:
         return f"partial: {NOT_YET}"
     kind = row["kind"]
     direction = row["direction"]
-    if kind in _OF_MARGINS:
-        return _OF_MARGINS[kind] if row["supported"] else f"{kind} not shown"
+    if kind in _MARGIN_VERDICTS:
+        return _MARGIN_VERDICTS[kind] if row["supported"] else f"{kind} not shown"
     if row["supported"]:
         return f"significantly {direction or 'different'}"
     if direction:
@@ -162,15 +162,16 @@ def _extended(manifest: Mapping[str, Any]) -> list[str]:
     if now == planned:
         return []
     return [
-        "The run was extended after the hypotheses were fixed (episodes a condition: "
+        "The run was extended after the hypotheses were fixed (episodes per condition: "
         f"{count_range(planned.values())} then, {count_range(now.values())} now). "
-        "The p-values are valid only if that was planned."
+        "The p-values are valid only if this extension was planned."
     ]
 
 
 def _interval(row: Mapping[Any, Any]) -> str:
-    # The end of this interval decides a test at 5 %, before a correction.
-    suffix, level = ("_90", "90 %") if row["kind"] in _OF_MARGINS else ("", "95 %")
+    # A limit of this interval decides a test at 5 %, before correction.
+    has_margin = row["kind"] in _MARGIN_VERDICTS
+    suffix, level = ("_90", "90 %") if has_margin else ("", "95 %")
     low = row[f"low{suffix}"]
     high = row[f"high{suffix}"]
     if np.isnan(low):
@@ -200,5 +201,5 @@ def _value(value: float) -> str:
 
 
 def _capital(text: str) -> str:
-    # Symbols such as λ̄ stay as they are.
+    # A symbol such as λ̄ is not capitalised.
     return text[0].upper() + text[1:] if text[0].isascii() else text

@@ -1,4 +1,4 @@
-"""Tables of a run: one row per condition; for a paper, one column per scenario.
+"""Tables of a run: one row per condition; for a paper, columns for each block.
 
 Source: Endo, Honda and Ishigami (2024), Table I.
 """
@@ -34,9 +34,9 @@ from benchnav.stats.bootstrap import LEAST_MAPS
 from benchnav.stats.holm import ALPHA
 from benchnav.stats.tables import Column, Row, cell_of, table_of
 
-# Values of `follows` for planners that minimise only the user's objective.
-_USERS_OWN = ("", "J")
-_ALWAYS = ("scenario", "planner", "risk")
+# Values of `follows` for planners that minimise only the objective J.
+_ONLY_J = ("", "J")
+_ALWAYS = ("scenario", "planner", "risk")  # columns of labels that are always shown
 _SUCCESS = shipped.SUCCESS.quantity
 _TOTAL_TIME = shipped.TOTAL_TIME.quantity
 _TRAVERSABILITY = shipped.TRAVERSABILITY.quantity
@@ -56,13 +56,14 @@ _MEANINGS = {
     "belief": "update of the prediction by measurements.",
     "planner": "motion planner.",
     "risk": "risk setting, which turns the predicted distribution of λ into λ̂, the "
-    "one number a planner is given.",
+    "value that a planner is given.",
     "groups": "number of groups of maps; the group is the statistical unit.",
     "maps": "number of maps.",
     "episodes": "number of episodes.",
 }
-_PAPER = (_SUCCESS.heading, _TOTAL_TIME.heading, _TRAVERSABILITY.heading)
-_MAX_ACROSS = 3
+# Headings of the columns of a block in the table for a paper.
+_PAPER_HEADINGS = (_SUCCESS.heading, _TOTAL_TIME.heading, _TRAVERSABILITY.heading)
+_MAX_ACROSS = 3  # blocks side by side
 _SUPERSCRIPTS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
@@ -86,7 +87,7 @@ def _success_time(row: Row) -> str:
 def _traversability(row: Row) -> str:
     mean = 100 * row["traversability_mean"]
     text = mean_and_std(mean, 100 * row["traversability_std"])
-    # An episode that ended at once observed no λ and has no λ̄.
+    # An episode without a step has no observed λ, and thus no λ̄.
     count = row["traversability_n"]
     is_partial = 0 < count < row["n_episodes"]
     return f"{text} (n = {count})" if is_partial else text
@@ -127,7 +128,7 @@ _RESULTS = (
         f"{_TRAVERSABILITY.meaning}, mean ± standard deviation over episodes.",
     ),
 )
-# Optional columns, by the column of the summary that they require.
+# Optional columns, by the required column of the summary.
 _TIMES = {
     "latency_median_ms": Column(
         ALONE,
@@ -142,7 +143,7 @@ _TIMES = {
         "thread: median (95th percentile) over steps; not a latency.",
     ),
 }
-_FAILURES = Column("failures", failures_in_words, "how the other episodes ended.")
+_FAILURES = Column("failures", failures_in_words, "outcomes of the other episodes.")
 
 
 def result_table(
@@ -152,14 +153,14 @@ def result_table(
 ) -> Table:
     """Format a summary; rates not significantly below the best are bold.
 
-    Labels that are the same for all conditions are left out, except scenario, planner
-    and risk; so are equal numbers of maps and episodes.
+    Columns with the same value for all conditions are left out: labels, except
+    scenario, planner and risk; and numbers of maps and episodes.
 
     Args:
-        summary: from `summary.summarise`, joined with `best.against_best`, and with
-            latencies if there are any.
+        summary: table from `summary.summarise`, joined with `best.against_best`, and
+            with latencies if they were measured.
         conditions: entries of `run.json` by id; `follows` and `remarks` become notes.
-        further: quantities in addition to the built-in ones, a column each.
+        further: quantities in addition to the built-in ones; each has a column.
     """
     marks, notes = _notes(summary, conditions)
     labels = _label_columns(summary, _ALWAYS)
@@ -174,11 +175,11 @@ def result_table(
         notes.append("¶ The planner ran as compiled code.")
     has_rivals = (summary["best_rivals"] > 0).any()
     if has_rivals and not summary["best_marked"].any():
-        why = "no setting is significantly"
+        reason = "no setting is significantly"
         if summary["best_maps"].max() < FEWEST_MAPS:
             unit = unit_of_statistics(summary)
-            why = f"with fewer than {FEWEST_MAPS} {unit}s, no setting can be called"
-        notes.append(f"No rate is bold: {why} worse than the best.")
+            reason = f"with fewer than {FEWEST_MAPS} {unit}s, no setting can be called"
+        notes.append(f"No rate is bold: {reason} worse than the best.")
     return table_of(
         rows,
         columns,
@@ -189,7 +190,7 @@ def result_table(
 
 
 def _count_columns(summary: pd.DataFrame) -> list[Column]:
-    """Return the columns of numbers of maps and episodes that differ."""
+    """Return the columns of those numbers of maps and episodes that differ."""
     names = ["maps", "episodes"]
     if unit_of_statistics(summary) == "group":
         names.insert(0, "groups")
@@ -217,15 +218,15 @@ def _label(name: str, row: Row) -> str:
 
 def _further_column(quantity: Quantity) -> Column:
     meaning = (
-        f"{quantity.meaning}: mean over episodes, with its 95 % interval in brackets; "
-        f"no interval below {LEAST_MAPS} maps; n is the number of episodes with a "
+        f"{quantity.meaning}: mean over episodes, with its 95 % interval in brackets "
+        f"if there are {LEAST_MAPS} maps or more; n is the number of episodes with a "
         "value, if some have no value."
     )
     return Column(quantity.heading, partial(_mean_in_words, quantity), meaning)
 
 
 def _mean_in_words(quantity: Quantity, row: Row) -> str:
-    """Return the mean of a further quantity with its interval, in its unit."""
+    """Return the mean of a quantity with its interval, in the quantity's unit."""
     columns = map(quantity.summary_column, ("mean", "low", "high"))
     mean, low, high = (quantity.scale * row[column] for column in columns)
     if np.isnan(mean):
@@ -242,7 +243,7 @@ def learning_table(summary: pd.DataFrame) -> Table | None:
     """Return the table of learning during episodes; None if no robot learnt.
 
     Args:
-        summary: from `summary.summarise`.
+        summary: table from `summary.summarise`.
     """
     if summary.empty or summary["revisions_mean"].isna().all():
         return None
@@ -275,7 +276,7 @@ def _mean_column(metric: Metric, write: Callable[[Any], str]) -> Column:
 
 
 def _columns_to_full(rows: Sequence[Row], summary: pd.DataFrame) -> list[Column]:
-    """Return the columns of differences to a robot that observes the whole map."""
+    """Return columns of differences to the same condition with the sensor `full`."""
     is_full = summary["sensor"] == "full"
     full = {_without_sensor(row): row for row in summary[is_full].to_dict("records")}
 
@@ -317,9 +318,9 @@ def paper_table(summary: pd.DataFrame, label: str, mark: str = "") -> str:
     several tabulars.
 
     Args:
-        summary: from `summary.summarise`, joined with `best.against_best`.
+        summary: table from `summary.summarise`, joined with `best.against_best`.
         label: LaTeX label of the table.
-        mark: words that the caption begins with.
+        mark: start of the caption.
     """
     all_blocks = blocks(summary)
     maps = count_range(summary["n_maps"])
@@ -344,7 +345,7 @@ def paper_table(summary: pd.DataFrame, label: str, mark: str = "") -> str:
 def _across(
     shown_blocks: Sequence[tuple[str, pd.DataFrame]], several: Sequence[str]
 ) -> Table:
-    """Return the table of some blocks, side by side, without repeated labels."""
+    """Return a table of blocks side by side, with repeated labels left empty."""
     labels = ["planner", *several, "risk"]
     side_by_side = []
     for _, rows in shown_blocks:
@@ -363,7 +364,7 @@ def _across(
     shown_names = names.mask(is_as_above, "")
     label_headings = [name.capitalize() for name in labels]
     return Table(
-        headings=(*label_headings, *_PAPER * len(shown_blocks)),
+        headings=(*label_headings, *_PAPER_HEADINGS * len(shown_blocks)),
         n_labels=len(labels),
         rows=tuple(map(tuple, np.hstack([shown_names, cells]))),
         groups=tuple(title for title, _ in shown_blocks),
@@ -390,17 +391,17 @@ def bold_note(summary: pd.DataFrame) -> str:
     if not summary["best_marked"].any():
         return ""
     all_blocks = blocks(summary)
-    of_block = "" if len(all_blocks) == 1 else " of a block"
+    scope = "" if len(all_blocks) == 1 else " of a block"
     words = (
-        f"the highest success rate{of_block}, and all rates without a significant "
+        f"the highest success rate{scope}, and all rates without a significant "
         "difference from it (max-T bootstrap test by "
         f"{unit_of_statistics(summary)}, p ≥ {ALPHA})"
     )
     left_out = pd.concat([rows[~competing(rows)] for _, rows in all_blocks])
     models: dict[str, None] = {}
     for part in PRIVILEGED:
-        of_part = left_out.loc[left_out["privileged"] == part, "model"]
-        models |= dict.fromkeys(of_part)
+        labels = left_out.loc[left_out["privileged"] == part, "model"]
+        models |= dict.fromkeys(labels)
     if not models:
         return f"{words}."
     return f"{words}. Privileged models ({', '.join(models)}) do not compete."
@@ -411,7 +412,7 @@ def _number(value: float) -> str:
 
 
 def _times(*values: float) -> str:
-    """Format milliseconds with two significant digits, all but the first in brackets."""
+    """Format times with two significant digits; put all but the first in brackets."""
     if np.isnan(values[0]):
         return NOT_USED
     digits = partial(
@@ -424,14 +425,14 @@ def _times(*values: float) -> str:
 def _notes(
     summary: pd.DataFrame, conditions: Mapping[str, Mapping[str, Any]]
 ) -> tuple[list[str], list[str]]:
-    """Return each condition's note numbers, and the notes; equal notes have one number."""
+    """Return the numbers of notes of each condition, and all notes, numbered."""
     numbers: dict[str, str] = {}
     marks = []
     for condition in summary["condition"]:
         entry = conditions[condition]
         texts = [*entry["remarks"]]
         cost = entry["follows"]
-        if cost not in _USERS_OWN:
+        if cost not in _ONLY_J:
             texts.insert(0, f"Cost minimised instead of J: {cost}.")
         for text in texts:
             next_number = str(len(numbers) + 1).translate(_SUPERSCRIPTS)

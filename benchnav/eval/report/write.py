@@ -42,21 +42,21 @@ from benchnav.viz.figure import Figure
 from benchnav.viz.style import save_twice
 
 PAGE = "report.html"
-PARTIAL = "partial"  # folder of the report of a run that is not finished
+PARTIAL = "partial"  # folder of the report of an unfinished run
 
 
 @dataclass(frozen=True, kw_only=True)
 class Report(RunData):
-    """The report of a run, and the data that it is based on.
+    """The report of a run, with the data of the run.
 
     Args:
         name: name of the run.
         header: lines on the settings of the run.
-        findings: sentences by their title.
+        findings: sentences by title.
         table: table of results, one row per condition.
-        warnings: lines on faults, and on contents that could not be shown.
-        mark: mark of a run that is not finished; empty for a finished run.
-        faults: warnings on custom figures that could not be drawn.
+        warnings: lines on errors, and on contents that could not be shown.
+        mark: mark of an unfinished run; empty for a finished run.
+        faults: those of the warnings that are about custom figures.
     """
 
     name: str
@@ -75,7 +75,7 @@ class Report(RunData):
 
     @property
     def hypotheses(self) -> Table:
-        """The formatted `tests`."""
+        """The table of the tests of hypotheses."""
         all_quantities = quantities(further_quantities(self.about))
         unit = unit_of_statistics(self.summary)
         return self.marked(hypothesis_table(self.tests, unit, all_quantities))
@@ -87,7 +87,7 @@ class Report(RunData):
         return replace(table, notes=(_capital(self.mark), *table.notes))
 
     def marked_text(self, text: str) -> str:
-        """Return a text, preceded by the mark of a run that is not finished."""
+        """Return a text, preceded by the mark if the run is not finished."""
         return f"{_capital(self.mark)}. {text}" if self.mark else text
 
     def csv(self, table: pd.DataFrame, digits: int = 6) -> str:
@@ -100,14 +100,13 @@ class Report(RunData):
 def read_report(
     folder: Path, record_driven: RecordDriven | None = None, partial: bool = False
 ) -> Report:
-    """Create the report of a run without writing it.
+    """Create the report of a run without writing files.
 
     Args:
-        folder: a finished run.
-        record_driven: records driven episodes again, such as
+        folder: folder of a finished run.
+        record_driven: function that records driven episodes again, such as
             `run.recordings.record_driven`; if None, no failure is shown on a map.
-        partial: whether to accept a run that is not finished, and use its finished
-            units.
+        partial: whether to accept an unfinished run, and use its finished units.
 
     Raises:
         ConfigError: If the folder is not a run folder, or its run is not finished.
@@ -135,10 +134,10 @@ def read_report(
     sheets = collect_sheets(summary, failures, record_driven)
     findings_by_title = findings(summary, failures, sheets.predicted)
     if not tests.empty:
-        # If hypotheses were fixed before the run, all other findings are exploratory.
-        explored = _prefixed("Exploratory: ", findings_by_title)
+        # Findings are exploratory if they do not test the hypotheses of the run.
+        exploratory = _prefixed("Exploratory: ", findings_by_title)
         unit = unit_of_statistics(summary)
-        findings_by_title = hypothesis_findings(tests, manifest, unit) | explored
+        findings_by_title = hypothesis_findings(tests, manifest, unit) | exploratory
     if results.mark:
         mark = f"{_capital(results.mark)}. "
         findings_by_title = _prefixed(mark, findings_by_title)
@@ -177,7 +176,7 @@ def read_report(
 def _latencies(
     summary: pd.DataFrame, conditions: Mapping[str, Mapping[str, Any]]
 ) -> pd.DataFrame:
-    """Return the planning time of a step of one robot; NaN if it was not measured."""
+    """Return planning times of a single robot by condition; NaN if not measured."""
     rows = [conditions[name].get("latency", {}) for name in summary["condition"]]
     table = pd.DataFrame(rows, columns=LATENCIES, dtype=float)
     return table.add_prefix("latency_")
@@ -199,17 +198,18 @@ def write_report(
     """Write `report.html`, `summary.{csv,md,tex}`, `failures.csv` and `figures/`.
 
     Args:
-        folder: a finished run.
-        record_driven: records driven episodes again, such as
+        folder: folder of a finished run.
+        record_driven: function that records driven episodes again, such as
             `run.recordings.record_driven`; if None, no failure is shown on a map.
-        out: folder of the report; by default the run folder, or its folder `PARTIAL`
-            for a run that is not finished.
-        partial: whether to accept a run that is not finished.
-        figures: custom figures, drawn after the shipped ones and those of the suite.
-            One that raises is left out, and a line of `Report.faults` says why.
+        out: folder of the report; by default the run folder, or `PARTIAL` in the run
+            folder for an unfinished run.
+        partial: whether to accept an unfinished run.
+        figures: custom figures, drawn after the shipped ones and those of the suite. A
+            figure that raises is left out, and `Report.faults` has a line with the
+            reason.
 
     Returns:
-        The report as written.
+        The written report.
     """
     report = read_report(folder, record_driven, partial)
     out = out or (folder / PARTIAL if report.mark else folder)
@@ -249,7 +249,7 @@ def write_report(
 
 
 def print_report(report: Report) -> None:
-    """Print findings and table, as wide as the terminal, or without line breaks."""
+    """Print the tables and the findings of a report; see `print_table`."""
     if report.mark:
         print(_capital(report.mark))
     print("\n".join(report.header))
@@ -269,17 +269,17 @@ def _capital(text: str) -> str:
 def _draw_figures(
     report: Report, figures: Sequence[Figure], folder: Path
 ) -> tuple[dict[Path, str], tuple[str, ...]]:
-    """Write the figures of a run, custom ones last.
+    """Write the figures of a run, custom figures last.
 
     Returns:
-        Captions by path of the PNG, and a line for each custom figure that could not be
-        drawn.
+        Captions by path of the PNG file, and a line for each custom figure that could
+        not be drawn.
     """
     captions: dict[Path, str] = {}
     _save_figures(report, figures_of(report), folder, captions)
     faults = []
-    of_suite = report.about.get("suite", {}).get("figures", ())
-    for spec in (*of_suite, *figures):
+    suite_figures = report.about.get("suite", {}).get("figures", ())
+    for spec in (*suite_figures, *figures):
         name = getattr(spec, "name", spec)
         if isinstance(spec, Mapping):
             name = spec["part"]
@@ -299,7 +299,8 @@ def _save_figures(
         path = folder / f"{figure.name}.png"
         if path in captions or path.parent != folder or not figure.name:
             raise ConfigError(
-                f"Expected a figure with a unique name, got {figure.name!r}. Rename it."
+                "Expected a figure with a unique name that can be a file name, got "
+                f"{figure.name!r}. Rename the figure."
             )
         caption = report.marked_text(figure.caption(report))
         mark = _capital(report.mark)
@@ -308,14 +309,14 @@ def _save_figures(
 
 
 def render(file: str, report: Report, figures: Mapping[Path, str]) -> str:
-    """Return the text of a file from its template.
+    """Return the text of a file of the report from its template.
 
-    In HTML, all text is escaped, and the page needs no other file and no network.
+    In HTML, all text is escaped. The page contains its figures and needs no network.
 
     Args:
         file: `report.html` or `summary.md`.
         report: the report.
-        figures: captions by path of the PNG.
+        figures: captions by path of the PNG file.
     """
     environment = Environment(
         loader=PackageLoader("benchnav.eval.report", "templates"),
@@ -345,5 +346,5 @@ def _inline(path: Path) -> str:
 
 
 def _pixels(path: Path) -> int:
-    """Return the width of a PNG from its header."""
+    """Return the width of a PNG file in pixels, from its header."""
     return int.from_bytes(path.read_bytes()[16:20])

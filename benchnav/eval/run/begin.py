@@ -1,4 +1,4 @@
-"""Requests of a command, and the `run.json` that a run starts or is extended with."""
+"""Requested work of a command, and `run.json` of a new or extended run."""
 
 import json
 import os
@@ -43,11 +43,11 @@ class Work(Checked):
     """A checked suite with the further options of a command.
 
     Args:
-        suite: the suite as it was written, for `run.json`.
+        suite: the suite as the user wrote it, for `run.json`.
         record: data of episodes that are stored in addition to rows.
         settings: settings of units.
         shard: shard of the units that is run; None for all units.
-        reuse_code: whether to accept finished units of other code.
+        reuse_code: whether to accept finished units that were run with other code.
     """
 
     suite: Mapping[str, Any]
@@ -62,20 +62,24 @@ def begin(
 ) -> tuple[Conditions, Conditions, tuple[Part, ...]]:
     """Write `run.json`, or extend an existing one.
 
+    Args:
+        work: the requested work.
+        folder: the run folder.
+        say: function that receives messages for the user, one line at a time.
+
     Returns:
         The requested conditions, all conditions of the run, and the run's metrics in
         addition to the built-in ones.
 
     Raises:
-        ConfigError: If the folder contains something else, or a run that cannot be
-            extended by this one.
+        ConfigError: If the folder contains other files, or a run that the requested
+            work cannot extend.
     """
     if not (folder / RUN).exists():
         if is_taken(folder):
             raise ConfigError(
                 f"Expected `out` to be a new folder or a run folder, got {folder}, "
-                "which holds something else. Choose "
-                "another `out`."
+                "which is neither. Choose another `out`."
             )
         write_run(folder, _about({}, work, work.conditions))
         return work.conditions, work.conditions, _parts(work.metrics)
@@ -94,8 +98,8 @@ def begin(
     requested, conditions = _merged(work.conditions, earlier.conditions)
     if conditions != earlier.conditions:
         n_new = len(conditions.keys() - earlier.conditions.keys())
-        few = {0: "more episodes", 1: "1 new condition"}
-        extension = few.get(n_new, f"{n_new} new conditions")
+        texts = {0: "more episodes", 1: "1 new condition"}
+        extension = texts.get(n_new, f"{n_new} new conditions")
         say(f"{folder} is extended by {extension}")
         # The table is written again when all requested units are finished.
         (folder / EPISODES).unlink(missing_ok=True)
@@ -112,11 +116,11 @@ def _parts(metrics: Iterable[NamedMetric]) -> tuple[Part, ...]:
 def _merged(new: Conditions, earlier: Conditions) -> tuple[Conditions, Conditions]:
     """Merge new conditions into those of a run.
 
-    A condition that differs from an earlier one only in unused settings is run as the
-    earlier one.
+    A new condition that differs from an earlier one only in unused settings is merged
+    into the earlier one.
 
     Returns:
-        The new conditions as they are run, and all conditions of the run.
+        The new conditions after merging, and all conditions of the run.
     """
     conditions = dict(earlier)
     requested = {}
@@ -136,43 +140,43 @@ def _merged(new: Conditions, earlier: Conditions) -> tuple[Conditions, Condition
 
 
 def drop(folder: Path) -> None:
-    """Empty a run folder, but keep the folder itself.
+    """Delete the contents of a run folder, but not the folder.
 
-    The folder may be a link, another file system or the working folder.
+    The folder may be a link, a file system's root or the working folder.
     """
     if is_taken(folder):
-        open_run(folder)  # Only a run folder may be emptied.
+        open_run(folder)  # Raises if it is no run folder, which must not be emptied.
         target = folder.resolve()
         prefix = f".{target.name}.dropped-"
         with TemporaryDirectory(dir=target.parent, prefix=prefix) as dropped:
-            # `run.json` last, so that an interrupted call can be repeated.
+            # `run.json` is moved last, so that an interrupted call can be repeated.
             for path in sorted(target.iterdir(), key=lambda path: path.name == RUN):
                 os.replace(path, Path(dropped, path.name))
 
 
 def _check_extends(work: Work, earlier: Run) -> None:
-    """Reject a run that the requested one cannot extend.
+    """Reject an existing run that the requested work cannot extend.
 
     Raises:
         ConfigError: If shards or hypotheses differ, the run cannot be resumed, or two
-            settings share a label.
+            settings have the same label.
     """
     folder = earlier.folder
     if earlier.shard != work.shard:
         raise ConfigError(
-            f"Expected `out` to be new or to hold {_in_words(work.shard)}, got "
-            f"{folder}, which holds "
-            f"{_in_words(earlier.shard)}. Choose another `out`."
+            f"Expected `out` to be new or to contain {_in_words(work.shard)}, got "
+            f"{folder}, which contains {_in_words(earlier.shard)}. Choose another "
+            "`out`."
         )
     check_resumable(earlier)
-    # Other hypotheses would be fixed after the results on which they are tested.
+    # New hypotheses would be fixed after the results on which they are tested.
     fixed = earlier.manifest.get("hypotheses", {}).get("digest", "none")
     if work.hypotheses and work.hypotheses["digest"] != fixed:
         raise ConfigError(
             f"Expected the `hypotheses` that were fixed when {folder} was begun "
-            f"(digest {fixed}), got others (digest "
-            f"{work.hypotheses['digest']}). Leave `hypotheses` out to resume, or "
-            "choose another `out`."
+            f"(digest {fixed}), got different ones (digest "
+            f"{work.hypotheses['digest']}). Leave `hypotheses` out to resume the run, "
+            "or choose another `out`."
         )
     entries = [*earlier.conditions.values(), *work.conditions.values()]
     check_labels([condition for condition, _ in entries])
@@ -180,6 +184,9 @@ def _check_extends(work: Work, earlier: Run) -> None:
 
 def check_resumable(run: Run) -> None:
     """Reject a run with parts that were objects of one process.
+
+    Args:
+        run: opened run folder.
 
     Raises:
         ConfigError: If the run has such parts.
@@ -192,14 +199,13 @@ def check_resumable(run: Run) -> None:
             parts.append(f"metric {entry['quantity']['name']}")
     if parts:
         raise ConfigError(
-            f"Expected a run that can be run again, got {run.folder}, whose "
-            f"{parts[0]} was an object of one process. "
-            "Evaluate it into a new folder."
+            f"Expected a run that can be resumed, got {run.folder}, whose {parts[0]} "
+            "was an object of one process. Evaluate the suite into a new folder."
         )
 
 
 def _in_words(shard: Shard | None) -> str:
-    return "a whole run" if shard is None else f"shard {shard} of a run"
+    return "an unsharded run" if shard is None else f"shard {shard} of a run"
 
 
 def _about(
@@ -256,16 +262,15 @@ def _about(
 def _still_dropped(
     dropped: Iterable[dict[str, str]], conditions: Conditions
 ) -> list[dict[str, str]]:
-    """Return the combinations that were left out and are in no condition, each once.
+    """Return the left-out combinations that no condition has, without repetitions.
 
-    A combination that was left out may have become a condition after a change of its
-    parts.
+    After a change of its parts, a combination that was left out may have been run.
     """
     run_labels = [set(condition.labels.items()) for condition, _ in conditions.values()]
     still_dropped = []
     for entry in dropped:
         labels = set(dropped_labels(entry).items())
-        if not any(labels <= of_condition for of_condition in run_labels):
+        if not any(labels <= condition_labels for condition_labels in run_labels):
             still_dropped.append(entry)
     return provenance.join(still_dropped)
 
@@ -277,8 +282,8 @@ def _notes(condition: Condition) -> dict[str, Any]:
     remarks = list(planner.remarks(task))
     for kind, labels in condition.stands_for.items():
         remarks.append(
-            f"One row for {kind} {', '.join(labels)}, which the planner does not use "
-            "here"
+            f"One row for {kind} {', '.join(labels)}, since the planner does not use "
+            f"the {kind} in this task"
         )
     for part in condition.unreproducible:
         remarks.append(f"Not reproducible: {part} is an object of one process")
@@ -290,7 +295,7 @@ def _notes(condition: Condition) -> dict[str, Any]:
 
 
 def changed_options(planner: Part) -> list[str]:
-    """Return options that differ from their defaults, as `name = value` with dots."""
+    """Return the options that differ from their defaults, as dotted `name = value`."""
     options = registry.options_of("planner", planner.found.target)
     required = {}
     for name, option in options.items():

@@ -1,8 +1,8 @@
-"""Checks before a run: conditions are built, and those that cannot be run are rejected.
+"""Checks before a run, which build the conditions of a suite without planning.
 
-Nothing is predicted and nothing is planned. A suite is a product, and some of its
-combinations are invalid: a planner that cannot steer a robot, or `single-class` with a
-model without classes. They are left out, each with its reason.
+A suite is a product, and some of its combinations may be invalid, such as a planner
+that cannot steer a robot, or `single-class` with a model without classes. Invalid
+combinations are left out, each with a reason.
 """
 
 import json
@@ -42,13 +42,13 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True, kw_only=True)
 class Checked:
-    """The part of a suite that can be run.
+    """The conditions of a suite that can be run, and notes on its other combinations.
 
     Args:
-        conditions: conditions by id, each with its extent.
-        dropped: combinations that cannot be run.
+        conditions: conditions that can be run, by id, each with its extent.
+        dropped: combinations that cannot be run, each with a reason.
         warnings: warnings for readers of the results.
-        hypotheses: hypotheses from `fix_hypotheses`.
+        hypotheses: entry of hypotheses from `fix_hypotheses`.
         metrics: metrics in addition to the built-in ones.
     """
 
@@ -60,16 +60,16 @@ class Checked:
 
     @property
     def caveats(self) -> list[str]:
-        """Warnings for readers of the run's tables, a line each."""
+        """Lines with the warnings and the left-out combinations."""
         return caveats(vars(self))
 
 
-def check_suite(suite: Suite, elsewhere: bool) -> Checked:
+def check_suite(suite: Suite, uses_workers: bool) -> Checked:
     """Build the conditions of a suite, and reject a suite that cannot be run.
 
     Args:
         suite: suite, as a user wrote it.
-        elsewhere: whether other processes create parts, too.
+        uses_workers: whether other processes also create the parts.
 
     Raises:
         ConfigError: If a part, scenario or map is missing, no combination can be run,
@@ -79,8 +79,8 @@ def check_suite(suite: Suite, elsewhere: bool) -> Checked:
     conditions = conditions_of(suite)
     if not conditions:
         raise ConfigError(
-            "Expected a suite with at least one condition, got none; data has "
-            f"{scenarios_of(suite.data)}."
+            "Expected a suite with at least one condition, got none. `data` has the "
+            f"scenarios {scenarios_of(suite.data)}; it needs a split test/SCENARIO."
         )
     maps = {
         condition.id: check_split(condition, suite.maps) for condition in conditions
@@ -98,11 +98,11 @@ def check_suite(suite: Suite, elsewhere: bool) -> Checked:
         raise ConfigError(next(iter(left_out.values()))["reason"])
     for figure in suite.figures:
         for part in read_parts("figure", figure):
-            _ = part.object  # which may reject its options
+            _ = part.object  # creating the figure may reject its options
     robots = {condition.robot.label: condition.task.robot for condition in runnable}
     metrics = read_metrics(suite.metrics, robots.values())
     all_quantities = quantities(metric.quantity for metric in metrics)
-    if elsewhere:
+    if uses_workers:
         check_everywhere(runnable, metrics)
     conditions_by_id = {}
     for condition in conditions:
@@ -135,16 +135,16 @@ def _fix_hypotheses(
     left_out: Mapping[str, LeftOut],
     all_quantities: Mapping[str, Quantity],
 ) -> dict[str, Any]:
-    """Fix the hypotheses of a suite on the conditions that are run.
+    """Return `fix_hypotheses` of the conditions that can be run.
 
     Raises:
-        ConfigError: If a hypothesis is invalid, or compares a condition that is run
-            with a combination that is left out.
+        ConfigError: If a hypothesis is invalid, or compares a condition that can be run
+            with a left-out combination.
     """
     try:
         fixed = fix_hypotheses(suite.hypotheses, conditions, all_quantities)
         tests = fixed.get("tests", ())
-    except ConfigError:  # perhaps of a combination that is left out
+    except ConfigError:  # raised again below if it concerns runnable conditions
         tests = ()
     for test in tests:
         sides = (test["one"], test["other"])
@@ -152,8 +152,8 @@ def _fix_hypotheses(
         if len(lost) == 1:
             raise ConfigError(
                 "Expected hypotheses on conditions that can be run, got "
-                f"{test['claim']!r}, which names one that "
-                f"cannot be run: {lost[0]['reason']}"
+                f"{test['claim']!r}, in which one condition cannot be run: "
+                f"{lost[0]['reason']}"
             )
     runnable = {i: entry for i, entry in conditions.items() if i not in left_out}
     return fix_hypotheses(suite.hypotheses, runnable, all_quantities)
@@ -163,35 +163,38 @@ def check_split(condition: Condition, maps: int) -> int:
     """Return the number of maps that are run; reject a missing scenario or map.
 
     Args:
-        condition: condition, whose data and scenario are checked.
+        condition: condition whose dataset and scenario are checked.
         maps: requested number of maps; 0 for all.
+
+    Raises:
+        ConfigError: If the dataset has no such scenario, or too few maps.
     """
     dataset = condition.dataset
     scenarios = scenarios_of(condition.data)
     if condition.scenario not in scenarios:
         raise ConfigError(
-            f"Expected `scenarios` among {scenarios} of {dataset.path}, got "
+            f"Expected `scenarios` of {dataset.path}, which has {scenarios}, got "
             f"{condition.scenario!r}."
             f"{hint(condition.scenario, scenarios)}{_remedy(dataset, condition.split, 1)}"
         )
     count = dataset.map_count(condition.split)
     if maps > count:
         raise ConfigError(
-            f"Expected `maps` at most {count}, the maps of {condition.split} in "
-            f"{dataset.path}, got {maps}. "
-            f"0 takes all.{_remedy(dataset, condition.split, maps)}"
+            f"Expected `maps` at most {count}, the number of maps of {condition.split} "
+            f"in {dataset.path}, got {maps}. Use 0 for all maps."
+            f"{_remedy(dataset, condition.split, maps)}"
         )
     return maps or count
 
 
 def _remedy(dataset: TerrainDataset, split: str, maps: int) -> str:
-    """Return a command that creates missing maps, if a shipped recipe has them."""
+    """Return a sentence with the command that creates missing maps; empty without one."""
     if dataset.id not in shipped_recipes():
         return ""
     if shipped_sizes(dataset.id).get(split, 0) < maps:
         return ""
     command = f"benchnav-datagen create {dataset.id}"
-    return f" All maps of {dataset.id} are made with `{command}`."
+    return f" Create all maps of {dataset.id} by `{command}`."
 
 
 def check_everywhere(
@@ -207,11 +210,10 @@ def check_everywhere(
     for part in parts:
         if not part.found.everywhere:
             raise ConfigError(
-                f"Expected a {part.kind} that other processes can load (for `jobs` > "
-                "1, `scheduler` or "
-                f"`planner_limit_s`), got {part.part!r}, which only this process has. "
-                "Write its class into a file, "
-                "and import it from there or name it as path/to/file.py:Name."
+                f"Expected a {part.kind} that other processes can load, since `jobs`, "
+                f"`scheduler` or `planner_limit_s` uses them, got {part.part!r}, which "
+                "exists only in this process. Write its class into a file, and import "
+                "it from the file or name it as path/to/file.py:Name."
             )
 
 
@@ -219,7 +221,7 @@ def build_each(conditions: Sequence[Condition], maps: int) -> list[str]:
     """Build conditions on the first map of their splits, without prediction or plan.
 
     Args:
-        conditions: conditions; parts that several of them have are built once.
+        conditions: conditions; parts that several conditions have are built once.
         maps: number of maps of each split; 0 for all.
 
     Returns:
@@ -233,12 +235,12 @@ def build_each(conditions: Sequence[Condition], maps: int) -> list[str]:
     for condition in _distinct(conditions, *world_keys):
         warnings += _check_world(condition, condition.dataset, maps)
     for condition in _distinct(conditions, "data", "scenario", "model", *KNOWLEDGE):
-        _ = condition.statistics  # which may be missing
-    seeing = [condition for condition in conditions if not condition.blind]
-    for condition in _distinct(seeing, "data", "model"):
+        _ = condition.statistics  # raises if needed statistics are missing
+    predicting = [condition for condition in conditions if not condition.blind]
+    for condition in _distinct(predicting, "data", "model"):
         warnings += _check_model(condition)
     for condition in conditions:
-        warnings += _doubts(condition, condition.dataset)
+        warnings += _recipe_warnings(condition, condition.dataset)
     return warnings
 
 
@@ -253,7 +255,7 @@ def _distinct(conditions: Sequence[Condition], *names: str) -> list[Condition]:
 
 
 def _check_model(condition: Condition) -> list[str]:
-    """Load the model, which may reject its options, and warn of another class table."""
+    """Load the model, which may reject its options; warn if its class table differs."""
     model = condition.model.object
     name = f"model {condition.model.label}"
     folder = condition.model.folder
@@ -264,7 +266,7 @@ def _check_model(condition: Condition) -> list[str]:
 
 
 def _check_world(condition: Condition, dataset: TerrainDataset, maps: int) -> list[str]:
-    """Draw λ of the first map, and warn of goals that cannot be reached within T."""
+    """Check T and the maps, draw λ of the first map, and warn of unreachable goals."""
     task = condition.task
     world = condition.world
     split = condition.split
@@ -283,7 +285,7 @@ def _check_world(condition: Condition, dataset: TerrainDataset, maps: int) -> li
         if world.noise == "frozen" and start == 0:
             first = torch.tensor([0])
             terrain = block.terrain.select(first)
-            endpoints = block.places.select(first)
+            endpoints = block.endpoints.select(first)
             draw_frozen(terrain, world, endpoints, key=0, maps=[0])
     centre_distance_m = np.linalg.norm(read["goal_m"] - read["start_m"], axis=1)
     distance_m = centre_distance_m - task.rules.goal_radius_m
@@ -291,14 +293,14 @@ def _check_world(condition: Condition, dataset: TerrainDataset, maps: int) -> li
     if not is_late.any():
         return []
     return [
-        f"in {is_late.sum()} of {len(is_late)} maps of {condition.split} a robot of "
-        f"{top_speed_mps:g} m/s cannot reach the goal "
-        "within the time budget T"
+        f"in {is_late.sum()} of {len(is_late)} maps of {condition.split}, a robot with "
+        f"a top speed of {top_speed_mps:g} m/s cannot reach the goal within the time "
+        "budget T"
     ]
 
 
-def _doubts(condition: Condition, dataset: TerrainDataset) -> Iterator[str]:
-    """Yield differences between the maps' recipe and the rules of the task."""
+def _recipe_warnings(condition: Condition, dataset: TerrainDataset) -> Iterator[str]:
+    """Yield warnings if the maps' recipe does not ensure a feasible path in the task."""
     threshold = dataset.recipe.stuck_threshold
     above = condition.rules.free_space.above
     if above != threshold:
@@ -310,6 +312,5 @@ def _doubts(condition: Condition, dataset: TerrainDataset) -> Iterator[str]:
     if split is not None and not split.solvable:
         yield (
             f"maps of {dataset.id} {condition.split} may have no feasible path to the "
-            "goal (no `solvable: true`), "
-            "so that a planner may fail on them for this reason"
+            "goal, since the recipe does not set `solvable: true`; planners then fail"
         )

@@ -1,8 +1,8 @@
 """Units on the workers of a Dask cluster.
 
-Workers write nothing permanent: they return a unit's files as bytes, and the command
-writes these files. Workers therefore need no disk in common with the command, and a
-unit that is run twice because a worker died is stored once.
+A worker returns a unit's files as bytes, and the command's process writes these files.
+Workers therefore need no common disk, and a unit that is run twice because a worker
+died is stored once.
 """
 
 import multiprocessing
@@ -25,17 +25,18 @@ from benchnav.eval.run.unit import Settings, run_unit
 def run_on_worker(
     working_folder: Path, unit: Unit, origin: Origin, settings: Settings
 ) -> tuple[Unit, dict[str, bytes]]:
-    """Run a unit on a worker of a cluster, and return its files by path in a run folder.
+    """Run a unit on a worker, and return the unit's files by path in a run folder.
 
     Args:
-        working_folder: folder from which relative paths start, if the worker has it.
+        working_folder: folder at which relative paths start, if it exists on the
+            worker.
         unit: unit to run.
         origin: origin of the unit when the run was begun.
         settings: settings of the run.
 
     Raises:
-        ConfigError: If the worker is unfit for the run, or has other code or maps; the
-            message names the worker.
+        ConfigError: If `check_worker` rejects the worker, or its code or maps differ;
+            the message names the worker.
     """
     from distributed import get_worker
 
@@ -66,32 +67,30 @@ def check_worker(worker: Any, settings: Settings) -> None:
         settings: settings of the run.
 
     Raises:
-        ConfigError: If the worker is unfit.
+        ConfigError: If the worker has several threads, or lacks a GPU or the
+            permission to start processes, although the settings need it.
     """
     threads = worker.state.nthreads
     if threads != 1:
         raise ConfigError(
-            f"Expected workers of one thread, got {worker.address} with {threads}. "
-            "Start them with "
-            "`dask worker ADDRESS --nworkers N --nthreads 1`."
+            f"Expected workers with one thread, got {worker.address} with {threads}. "
+            "Start workers by `dask worker ADDRESS --nworkers N --nthreads 1`."
         )
     if settings.planner_limit_s and multiprocessing.current_process().daemon:
         raise ConfigError(
             "Expected workers that may start processes, which `planner_limit_s` "
-            f"needs, got {worker.address}. Start "
-            "them with `dask worker … --no-nanny`, or with "
-            "DASK_DISTRIBUTED__WORKER__DAEMON=False."
+            f"needs, got {worker.address}, which may not. Start workers by `dask "
+            "worker … --no-nanny`, or set DASK_DISTRIBUTED__WORKER__DAEMON=False."
         )
     if settings.device == "cuda" and not torch.cuda.is_available():
         raise ConfigError(
             f"Expected workers with a GPU for `device` cuda, got {worker.address} "
-            "without. Pass --device cpu, or "
-            "start workers on machines that have one."
+            "without a GPU. Pass --device cpu, or start workers on machines with a GPU."
         )
 
 
 def store_files(folder: Path, unit: Unit, files: Mapping[str, bytes]) -> None:
-    """Write a unit's files into a run folder; its rows, written last, mark it finished."""
+    """Write a unit's files into a run folder, the rows last: they mark it finished."""
     clear_unit(folder, unit)
     for name in sorted(files, key=lambda name: name.startswith("units/")):
         with replacing(folder / name) as partial:

@@ -16,7 +16,7 @@ from benchnav.planning.planners.planner import check_steers
 from benchnav.planning.problem import Prediction, pose_problem
 from benchnav.planning.sensing.belief import CovarianceModel, Fields, Static
 
-LeftOut = dict[str, str]  # incompatible labels, by column, and the `reason`
+LeftOut = dict[str, str]  # incompatible labels by column, and `reason`
 
 
 def find_left_out(conditions: Iterable[Condition]) -> dict[str, LeftOut]:
@@ -38,7 +38,7 @@ def find_left_out(conditions: Iterable[Condition]) -> dict[str, LeftOut]:
     for condition in conditions:
         for columns, rule in _RULES.items():
             labels = {column: condition.labels[column] for column in columns}
-            # The part distinguishes risk settings that all have the label `NOT_USED`.
+            # The label of several risk settings may be `NOT_USED`; their parts differ.
             key = (rule, condition.risk.part, *labels.values())
             if key not in reasons:
                 reasons[key] = rule(condition)
@@ -91,9 +91,8 @@ def _resampled(condition: Condition) -> str:
         return ""
     return (
         "Expected a world with constant λ for the model 'clairvoyant', got "
-        f"{condition.world_label!r}, which "
-        "resamples λ at each step. Take the world stakes, or `world.noise` frozen or "
-        "stored."
+        f"{condition.world_label!r}, which resamples λ at each step. Use the world "
+        "stakes, or set `world.noise` to frozen or stored."
     )
 
 
@@ -102,8 +101,8 @@ def _learns_no_class(condition: Condition) -> str:
         return ""
     return (
         "Expected a belief that does not learn for the risk setting 'single-class', "
-        f"got {condition.belief.label!r}, whose updates have no class. Take the belief "
-        "static."
+        f"got {condition.belief.label!r}, whose updated distributions have no classes. "
+        "Use the belief static."
     )
 
 
@@ -115,8 +114,7 @@ def _without_classes(condition: Condition) -> str:
         return ""
     return (
         "Expected a model that predicts classes for the risk setting 'single-class', "
-        f"got {condition.model.label!r}, "
-        "which has no `class_names`."
+        f"got {condition.model.label!r}, which has no `class_names`."
     )
 
 
@@ -125,7 +123,7 @@ def _is_single_class(condition: Condition) -> bool:
 
 
 def _unprepared(condition: Condition) -> str:
-    """Return why a shipped planner's preparation rejects its options, or ""."""
+    """Return the reason for which a shipped planner rejects its options, or ""."""
     planner: Part = condition.planner
     if not planner.found.shipped:
         return ""
@@ -133,7 +131,7 @@ def _unprepared(condition: Condition) -> str:
     flat = 0 * traversability
     grid = Grid(4, 4, condition.dataset.grid.resolution_m)
     rgb = torch.zeros(1, 3, 4, 4, dtype=torch.uint8)
-    seen = Observation(rgb, flat, flat, grid)
+    observation = Observation(rgb, flat, flat, grid)
     ones = torch.ones_like(traversability).unsqueeze(1)
     mixture = TraversabilityMixture(ones, 0.9 * ones, 0 * ones)
     start_m = torch.full((1, 2), 0.5 * grid.resolution_m)
@@ -143,7 +141,7 @@ def _unprepared(condition: Condition) -> str:
         covariance = CovarianceModel(grid=grid, correlation_m=0.0)
         state = Static().init(mixture, covariance)
         fields = Fields(Static(), state, (0,))
-        prediction = Prediction(seen, mixture, traversability, fields=fields)
+        prediction = Prediction(observation, mixture, traversability, fields=fields)
         problem = pose_problem(
             condition.task, prediction, start_m, goal_m, 1.0, condition.world.immobile
         )
@@ -161,8 +159,8 @@ def _unprepared(condition: Condition) -> str:
     return ""
 
 
-# Rules by the columns on which they depend; each returns a reason, or "" for compatible
-# parts. Slow rules come last.
+# Rules by the columns on which they depend. A rule returns a reason, or "" if the parts
+# are compatible. Slow rules come last.
 _RULES: Mapping[tuple[str, ...], Callable[[Condition], str]] = {
     ("planner", "robot"): _unsteered,
     ("planner", "sensor", "belief"): _plans_once,

@@ -1,4 +1,4 @@
-"""Check that rows are identical if repeated in fresh processes and in another order."""
+"""Check that rows are identical if they are repeated in new processes and reordered."""
 
 import random
 from collections.abc import Callable, Sequence
@@ -35,32 +35,34 @@ def check_determinism(
     """Run the first unit of each condition in two processes and compare the rows.
 
     Rows are compared bit for bit, except planning times. The second process runs units
-    and maps in reverse order, twice. Its second rows are compared, so that any state
-    that parts retain has had time to grow. If rows differ, a third process repeats the
-    first, which distinguishes retained state from external input.
+    and maps in reverse order, twice. The rows of its second repetition are compared, so
+    that state that parts retain has had time to grow. If rows differ, a third process
+    repeats the units of the first, which distinguishes retained state from external
+    input.
 
     Args:
         suite: suite whose conditions are checked.
-        say: receives progress, a line at a time.
-        planner_limit_s: time limit of each call of a planner; 0 for none.
+        say: function that receives the progress, one line at a time.
+        planner_limit_s: time limit of each call of a planner in seconds; 0 for no
+            limit.
         device: "cpu", "cuda" or "auto".
 
     Returns:
-        The number of conditions, and a line for each that differs: the columns and the
-        cause.
+        The number of conditions, and a line for each condition that differs, with the
+        differing columns and the cause.
 
     Raises:
         BenchnavError: If the suite cannot be run.
     """
     settings = Settings.on(device, planner_limit_s)
-    checked = check_suite(suite, elsewhere=True)
+    checked = check_suite(suite, uses_workers=True)
     metrics = [metric.part for metric in checked.metrics]
     chosen = []
     for name, condition in checked.conditions.items():
         first_unit, *_ = units({name: condition}, metrics=metrics)
         chosen.append(first_unit)
     say(
-        f"checking that {len(chosen)} conditions repeat, each by its unit of "
+        f"checking that {len(chosen)} conditions repeat, each by a unit of "
         f"{len(chosen[0].maps)} maps"
     )
     first = _run_fresh(chosen, settings)
@@ -81,7 +83,7 @@ def check_determinism(
 
 
 def _cause(first: _Rows, second: _Rows, third: _Rows) -> str:
-    """Return why rows of a unit differ between two runs; `third` repeats `first`."""
+    """Return the cause of different rows in two runs; `third` repeats `first`."""
     first_rows, first_generators = first
     _, second_generators = second
     third_rows, third_generators = third
@@ -90,12 +92,12 @@ def _cause(first: _Rows, second: _Rows, third: _Rows) -> str:
         return f"a part draws from the global generator of {' and '.join(generators)}"
     if _differing(first_rows, third_rows):
         return (
-            "a part depends on something outside, such as a clock, entropy or the "
-            "order of threads"
+            "a part depends on external input, such as a clock, entropy or the order "
+            "of threads"
         )
     return (
-        "a part keeps state between episodes or units, so that rows depend on what "
-        "ran before"
+        "a part keeps state between episodes or units, so that rows depend on earlier "
+        "episodes"
     )
 
 
@@ -109,7 +111,7 @@ def _differing(a: pd.DataFrame, b: pd.DataFrame) -> list[str]:
 
 
 def _run_fresh(chosen: Sequence[Unit], settings: Settings) -> list[_Rows]:
-    """Run units one after the other in one fresh process."""
+    """Run units one after the other in one new process."""
     with ProcessPoolExecutor(1) as executor:
         call = partial(_run_units, Path.cwd(), chosen, settings)
         return executor.submit(call).result()

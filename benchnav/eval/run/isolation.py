@@ -1,8 +1,8 @@
 """A planner in a child process, so that a planner that hangs can be stopped.
 
-The simulation stays in the parent process: only the planner's calls are sent to the
+The simulation stays in the parent process. Only calls of the planner are sent to the
 child, each with a time limit. The child first loads planner, robot and objective by
-name, so that their classes can be unpickled.
+name, so that it can unpickle objects of their classes.
 """
 
 import multiprocessing
@@ -23,15 +23,15 @@ from benchnav.planning.planners.planner import Plan, Planner
 from benchnav.planning.problem import Problem
 from benchnav.planning.sensing.sensor import Step
 
-# Starting a process, importing PyTorch and compiling do not count as planning time.
+# Time limits. The limit to start is added to that of calls that may start or compile.
 _START_S = 120.0
 _CLOSE_S = 5.0
 
 
 class PlannerProcessError(BenchnavError):
-    """A planner timed out, raised, or its process ended.
+    """A planner timed out or raised, or its process ended.
 
-    If the planner raised, the message is the last line of its traceback, and the error
+    If the planner raised, the message is the last line of the traceback, and the error
     has the traceback as a note.
     """
 
@@ -40,9 +40,9 @@ class IsolatedPlanner(Planner[int]):
     """A condition's planner, run in a child process.
 
     Args:
-        condition: condition that has the planner.
-        limit_s: time limit of each call in seconds; `init`, `revise` and the first
-            `plan` have two minutes more, to compile.
+        condition: condition of the planner.
+        limit_s: time limit of each call in seconds; for `init`, `revise` and the first
+            `plan`, which may compile, 120 s are added.
     """
 
     compiled: bool | None = None
@@ -64,7 +64,7 @@ class IsolatedPlanner(Planner[int]):
             raise
 
     def close(self) -> None:
-        """End the child, and merge its record of what the planner read."""
+        """End the child, and merge its record of files that the planner read."""
         if self._child.is_alive():
             with suppress(PlannerProcessError):
                 merge(self._ask(_CLOSE_S, "touched"))
@@ -73,7 +73,7 @@ class IsolatedPlanner(Planner[int]):
         self._connection.close()
 
     def init(self, problem: Problem, generator: torch.Generator) -> int:
-        """See `Planner`. The plan state stays in the child; here it counts calls."""
+        """See `Planner`. Return the number of calls; the plan state stays in the child."""
         seed = generator.initial_seed()
         state = generator.get_state()
         self._ask(self.limit_s + _START_S, "init", problem, seed, state)
@@ -87,7 +87,7 @@ class IsolatedPlanner(Planner[int]):
         return action, plan_state + 1, plan
 
     def revise(self, plan_state: int, problem: Problem) -> int:
-        """See `Planner`. The child may start again, which may take as long as `init`."""
+        """See `Planner`. The call may prepare the planner again, as `init` does."""
         self._ask(self.limit_s + _START_S, "revise", problem)
         return plan_state
 
@@ -97,7 +97,7 @@ class IsolatedPlanner(Planner[int]):
             if not self._connection.poll(limit_s):
                 self._child.kill()
                 raise PlannerProcessError(
-                    f"The planner gave no answer to `{call}` within {limit_s:g} s."
+                    f"The planner did not return from `{call}` within {limit_s:g} s."
                 )
             kind, value = pickle.loads(self._connection.recv_bytes())
         except (EOFError, BrokenPipeError, ConnectionResetError) as error:
@@ -116,7 +116,7 @@ class IsolatedPlanner(Planner[int]):
 
 
 def _serve(connection: Connection, condition: Condition) -> None:
-    """Answer calls of the planner until the connection closes."""
+    """Run calls of the planner in the child until the connection closes."""
     torch.set_num_threads(1)
     planner: Any = None
     plan_state: Any = None

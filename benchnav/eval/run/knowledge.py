@@ -1,4 +1,4 @@
-"""Knowledge of the robots of a unit during episodes, and their planner's problem.
+"""Robots' knowledge during the episodes of a unit, and the problem of their planner.
 
 `benchnav.planning.sensing.knowledge` defines the knowledge. This module passes changes
 of λ̂ to the planner, and scores the belief over the terrain ahead of the robots.
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from benchnav.core.batch import put_if_alike
 from benchnav.eval.folder.steps import AHEAD_DEG, AHEAD_M
-from benchnav.eval.recorded_plans import KnownMap, reach_outline
+from benchnav.eval.recorded_plans import KnownMap, footprint_outline
 from benchnav.planning.free_space import cells_at_goal
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import steps_in
@@ -25,8 +25,8 @@ from benchnav.planning.sensing.knowledge import Knowledge, Truth, call_user_code
 from benchnav.planning.sensing.learner import Learner
 from benchnav.planning.world.outcome import Outcome
 
-_MIN_CHANGE = 0.02  # change of λ̂ in some cell above which a planner replans
-_MIN_LOG_SCORE = -10.0  # lower limit, also for λ with probability 0
+_MIN_CHANGE = 0.02  # a planner replans if λ̂ of any cell changes by more
+_MIN_LOG_SCORE = -10.0  # lower limit of the log score, such as for a density of 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,9 +36,9 @@ class Learning:
     Args:
         learner: sensors, belief and risk measure.
         start: knowledge at the start of the episodes.
-        truth: truth of B episodes, which only sensors and privileged models receive.
-        field_at: function from a step to λ of all cells, shape [B, H, W]; None if λ
-            does not change.
+        truth: true terrain of B episodes, for sensors and privileged models only.
+        field_at: function from the index of a step to λ of all cells, shape [B, H, W];
+            None if λ does not change.
     """
 
     learner: Learner
@@ -47,7 +47,7 @@ class Learning:
     field_at: Callable[[int], Tensor] | None = None
 
 
-class Knowing:
+class KnowledgeTracker:
     """Knowledge of the robots of a batch, updated from step to step.
 
     Args:
@@ -56,15 +56,15 @@ class Knowing:
 
     Attributes:
         revisions: number of changes of each episode's map, int64, shape [B].
-        seen_cells: number of cells that each robot has seen by its last update, int64,
-            shape [B].
-        sensed_cells: number of cells whose λ each robot has measured by its last
+        seen_cells: number of cells whose appearance each robot has observed up to its
+            last update, int64, shape [B].
+        sensed_cells: number of cells whose λ each robot has measured up to its last
             update, int64, shape [B].
-        ahead: RMSE of E[λ] and mean log score of the belief, by step, over the cells
-            ahead of each robot whose λ was not measured, shape [B, 2]; NaN without
-            such cells.
+        ahead: scores by step, shape [B, 2]: RMSE of E[λ] and mean log score of the
+            belief, over the cells ahead of each robot whose λ was not measured. NaN
+            without such cells.
         known: knowledge of the remaining episodes.
-        members: indices of the remaining episodes, int64.
+        episode_indices: indices of the remaining episodes among the B episodes, int64.
     """
 
     def __init__(self, learning: Learning, problem: Problem) -> None:
@@ -77,22 +77,26 @@ class Knowing:
         self._at_goal = cells_at_goal(
             problem.grid, problem.goal_m, problem.goal_radius_m
         )
-        self.members = torch.arange(len(problem), device=problem.start.device)
-        self.revisions = torch.zeros_like(self.members)
+        self.episode_indices = torch.arange(len(problem), device=problem.start.device)
+        self.revisions = torch.zeros_like(self.episode_indices)
         self.seen_cells = self.known.seen.flatten(1).sum(1)
-        self.sensed_cells = torch.zeros_like(self.members)
+        self.sensed_cells = torch.zeros_like(self.episode_indices)
         self.ahead: dict[int, Tensor] = {}
 
     def keep(self, indices: Tensor) -> None:
-        """Drop all episodes except some, by int64 indices into the remaining ones."""
+        """Keep only some of the remaining episodes.
+
+        Args:
+            indices: indices among the remaining episodes, int64.
+        """
         self.known = self._learning.learner.select(self.known, indices)
         self._problem = self._problem.select(indices)
         self._truth = self._truth.select(indices)
         self._at_goal = self._at_goal[indices]
-        self.members = self.members[indices]
+        self.episode_indices = self.episode_indices[indices]
 
     def is_due(self, step: int) -> bool:
-        """Return whether knowledge is updated in a step."""
+        """Return whether the knowledge is updated at a step."""
         return step % self._interval == 0
 
     def learn(self, step: int, robot_state: Tensor, running: Tensor) -> Problem | None:
@@ -100,12 +104,13 @@ class Knowing:
 
         Args:
             step: number of steps taken so far.
-            robot_state: a copy of the states of the remaining robots, shape [B, S].
-            running: mask of the remaining episodes that continue, bool, shape [B].
+            robot_state: copy of the states of the remaining robots, shape [B, S].
+            running: mask of the remaining episodes that have not ended, bool, shape
+                [B].
 
         Returns:
-            The current problem, which starts at the robots' states; None if the planner
-            need not replan.
+            The problem with the current maps and the robots' states as starts; None if
+            the planner need not replan.
 
         Raises:
             KnowledgeError: If a sensor, the belief, the model or the risk measure fails.
@@ -113,10 +118,10 @@ class Knowing:
         field_at = self._learning.field_at
         learner = self._learning.learner
         due = self.is_due(step)
-        # Drawing λ of all cells is slow, and between updates only a belief that learns
-        # receives it.
+        # Drawing λ of all cells is slow. Between updates, only a belief that learns
+        # needs it.
         if field_at is not None and (due or learner.belief.learns):
-            field = field_at(step)[self.members]
+            field = field_at(step)[self.episode_indices]
             self._truth = replace(self._truth, field=field)
         # An ended episode senses nothing, even while it remains in the batch.
         observing = running if due else torch.zeros_like(running)
@@ -133,14 +138,14 @@ class Knowing:
 
     def _count_cells(self, running: Tensor) -> None:
         """Count the cells that the robots of running episodes have seen and measured."""
-        members = self.members[running]
+        episode_indices = self.episode_indices[running]
         seen = self.known.seen[running]
         sensed = self.known.ever_sensed[running]
-        self.seen_cells[members] = seen.flatten(1).sum(1)
-        self.sensed_cells[members] = sensed.flatten(1).sum(1)
+        self.seen_cells[episode_indices] = seen.flatten(1).sum(1)
+        self.sensed_cells[episode_indices] = sensed.flatten(1).sum(1)
 
     def _updated_problem(self, robot_state: Tensor, running: Tensor) -> Problem | None:
-        """Return the problem with the new maps of episodes whose map changed enough."""
+        """Return the problem with new maps where they changed enough; None if nowhere."""
         knowledge = self.known
         problem = self._problem
         free = knowledge.free | self._at_goal
@@ -149,8 +154,8 @@ class Knowing:
         is_updated = has_changed.flatten(1).any(1) & running
         if not bool(is_updated.any()):
             return None
-        self.revisions[self.members[is_updated]] += 1
-        # Other episodes keep their maps, so that no episode depends on its batch.
+        self.revisions[self.episode_indices[is_updated]] += 1
+        # The maps of other episodes stay, so that no episode depends on its batch.
         update_mask = is_updated[:, None, None]
         indices = is_updated.nonzero()[:, 0]
         fields = problem.fields
@@ -174,7 +179,12 @@ class Knowing:
         return self._problem
 
     def _merged_belief(self, state: Any, indices: Tensor) -> Any:
-        """Return a belief state with the current beliefs of some episodes."""
+        """Return a belief state in which those of some episodes are the current ones.
+
+        Args:
+            state: belief state of the remaining episodes in the planner's problem.
+            indices: indices of the episodes to replace, int64.
+        """
         belief = self._learning.learner.belief
         current = self.known.belief_state
 
@@ -185,7 +195,7 @@ class Knowing:
         return call_user_code(Outcome.BELIEF_ERROR, merge)
 
     def look_ahead(self, step: int, robot_state: Tensor, running: Tensor) -> None:
-        """Score the belief over the cells ahead of the robots; arguments as in `learn`."""
+        """Store scores of the belief ahead of the robots; arguments as in `learn`."""
         knowledge = self.known
         is_ahead = self._cells_ahead(robot_state)
         cells = is_ahead & ~knowledge.ever_sensed & running[:, None, None]
@@ -205,7 +215,7 @@ class Knowing:
             sums = values.new_zeros(len(cells), 2).index_add_(0, index, values)
             means = sums / count[:, None]
             rmse = means[:, 0].sqrt()
-            scores[self.members] = torch.stack((rmse, means[:, 1]), 1).float()
+            scores[self.episode_indices] = torch.stack((rmse, means[:, 1]), 1).float()
         self.ahead[step] = scores
 
     def _cells_ahead(self, robot_state: Tensor) -> Tensor:
@@ -222,37 +232,48 @@ class Knowing:
         is_near = torch.hypot(away_x, away_y) <= AHEAD_M
         return is_near & (turn.abs() <= math.radians(AHEAD_DEG))
 
-    def maps_of(self, step: int, members: Iterable[int]) -> dict[int, KnownMap]:
-        """Return the known maps of some of the remaining episodes, by index."""
-        indices = {member: index for index, member in enumerate(self.members.tolist())}
+    def maps_of(self, step: int, episode_indices: Iterable[int]) -> dict[int, KnownMap]:
+        """Return the known maps of those given episodes that remain.
+
+        Args:
+            step: index of the step.
+            episode_indices: indices of episodes among the B episodes.
+
+        Returns:
+            Known maps by the index of the episode among the B episodes.
+        """
+        indices = {
+            episode_index: index
+            for index, episode_index in enumerate(self.episode_indices.tolist())
+        }
         return {
-            member: self._known_map(step, indices[member])
-            for member in members
-            if member in indices
+            episode_index: self._known_map(step, indices[episode_index])
+            for episode_index in episode_indices
+            if episode_index in indices
         }
 
     def _known_map(self, step: int, index: int) -> KnownMap:
-        """Return the known map of a remaining episode."""
+        """Return the known map of an episode, by its index among the remaining ones."""
         grid = self._problem.grid
         knowledge = self.known
         cells = torch.zeros_like(knowledge.free)
         cells[index] = True
         believed = self._learning.learner.at(knowledge, cells)
 
-        def of_episode(values: Tensor) -> np.ndarray:
+        def as_array(values: Tensor) -> np.ndarray:
             return values[index].cpu().numpy()
 
-        def on_grid(values: Tensor) -> np.ndarray:
+        def as_grid(values: Tensor) -> np.ndarray:
             return values.reshape(grid.shape).float().cpu().numpy()
 
-        footprint = of_episode(knowledge.footprint)
+        footprint = as_array(knowledge.footprint)
         return KnownMap(
             step=step,
-            predicted=of_episode(knowledge.risk_map),
-            free=of_episode(knowledge.free | self._at_goal),
-            mean=on_grid(believed.mean()),
-            spread=on_grid(believed.spread()),
-            seen=of_episode(knowledge.seen),
-            sensed=of_episode(knowledge.ever_sensed),
-            outline=reach_outline(footprint, grid.resolution_m),
+            predicted=as_array(knowledge.risk_map),
+            free=as_array(knowledge.free | self._at_goal),
+            mean=as_grid(believed.mean()),
+            spread=as_grid(believed.spread()),
+            seen=as_array(knowledge.seen),
+            sensed=as_array(knowledge.ever_sensed),
+            outline=footprint_outline(footprint, grid.resolution_m),
         )

@@ -1,9 +1,8 @@
-"""Planning time of one step of one robot, which a batch does not show.
+"""Planning time per step of a single robot, which a batch does not show.
 
 For each combination of planner, robot, objective, sensors and belief of a run, the
-first steps of one episode are run on one thread. The first step prepares and may
-compile, so that it is not counted. Each later step is counted, including any replanning
-in it.
+first steps of one episode are run on one thread. The first step is not counted, since
+it may compile. Each later step is counted, including any replanning.
 """
 
 import time
@@ -28,10 +27,10 @@ def measure_latencies(
 ) -> None:
     """Measure planning times of conditions, and write missing ones into `run.json`.
 
-    Each condition gets `median_ms`, `p95_ms` and `max_ms` over `steps` steps.
-    Conditions of one planner, robot, objective, sensors and belief share one
-    measurement, on the first map of the first of them. A planner that fails has no
-    measurement.
+    The entry of each condition gets `median_ms`, `p95_ms` and `max_ms` over `steps`
+    steps. Conditions with the same planner, robot, objective, sensors and belief get
+    the same measurement, on the first map of the first such condition. A planner that
+    fails has no measurement.
 
     Args:
         folder: the run folder.
@@ -84,9 +83,9 @@ def _measure(
     with one_thread():
         try:
             origin = settings.origins().of(unit)
-            built = build(unit, origin, torch.device(settings.device))
-            episodes, _ = simulate(unit, built, settings, stop=stop)
-        except Exception:  # The condition's rows report the fault.
+            inputs = build(unit, origin, torch.device(settings.device))
+            episodes, _ = simulate(unit, inputs, settings, stop=stop)
+        except Exception:  # The rows of the condition report the error.
             return None
     times_ms = 1e3 * episodes.planning_s[1:].numpy()
     if any(episodes.errors) or not len(times_ms):

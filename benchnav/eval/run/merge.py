@@ -1,7 +1,7 @@
 """Merging the shards of a run into one run folder.
 
-The merged run can be reported, resumed and extended like any other. Units are files
-identified by their origin, so that merging copies and checks them.
+The merged run can be reported, resumed and extended like any other. A unit is a file
+that is identified by its origin. Merging therefore checks and copies these files.
 """
 
 import shutil
@@ -41,38 +41,45 @@ from benchnav.eval.folder.run_folder import (
     write_run,
 )
 from benchnav.eval.folder.steps import align_steps
-from benchnav.eval.run.recordings import keep_ground
+from benchnav.eval.run.recordings import write_ground
 
-_NAMED = 3  # conditions that a message names
+_MAX_NAMED = 3  # maximum number of conditions that a message names
 
 
 def merge_shards(parts: Sequence[Path], folder: Path) -> Iterator[tuple[int, int]]:
     """Merge shards into one run folder, and yield (units copied, total units).
 
-    The folder appears under its name only when it is complete.
+    The new folder appears at its path only when it is complete.
 
     Args:
         parts: run folders of shards of one run, in any order.
-        folder: path of the new run, which must not exist or be empty.
+        folder: path of the merged run; nothing may exist there except an empty folder.
 
     Raises:
-        ConfigError: If a part is no shard, the parts are of different runs, or units
-            are missing. Nothing is written then.
+        ConfigError: If a part is no shard, the parts belong to different runs, or units
+            are missing. In these cases, nothing is written.
     """
     with sole_writer(folder, str(folder)):
         if is_taken(folder):
             raise ConfigError(
-                f"Expected `out` to be a new folder, got {folder}, which exists. "
-                "Write `benchnav-eval merge OUT PART …` with the new folder as OUT."
+                f"Expected `out` to be a new folder, got {folder}, which exists. Run "
+                "`benchnav-eval merge OUT PART …` with a new folder as OUT."
             )
         runs = [_open_shard(part) for part in parts]
         _check_alike(runs)
         conditions = runs[0].conditions
         all_units = in_table_order(units(conditions), conditions)
-        makings = [(unit, _find(unit, runs)) for unit in all_units]
-        _check_whole([unit for unit, making in makings if making is None], runs)
-        complete = [(unit, making) for unit, making in makings if making is not None]
-        _check_one_environment([making for _, making in complete])
+        finished_units = [(unit, _find(unit, runs)) for unit in all_units]
+        _check_whole(
+            [unit for unit, finished_unit in finished_units if finished_unit is None],
+            runs,
+        )
+        complete = [
+            (unit, finished_unit)
+            for unit, finished_unit in finished_units
+            if finished_unit is not None
+        ]
+        _check_one_environment([finished_unit for _, finished_unit in complete])
         target = folder.resolve()
         partial = new_folder(target)
         write_run(partial, _about(runs))
@@ -97,31 +104,31 @@ def merge_shards(parts: Sequence[Path], folder: Path) -> Iterator[tuple[int, int
         align_steps(partial, all_units)
         finish_run(partial, copied)
         note_checksums(partial, [partial / ERRORS])
-        keep_ground(partial)
+        write_ground(partial)
         replace_folder(partial, target, last=RUN)
 
 
-def _check_one_environment(makings: Sequence[Finished]) -> None:
-    """Reject units of different code, or whose parts read different files."""
-    for earlier, now in pairwise(makings):
+def _check_one_environment(finished_units: Sequence[Finished]) -> None:
+    """Reject units that were run with different code, files or packages."""
+    for earlier, now in pairwise(finished_units):
         before = earlier.metadata["code"]
         changed = provenance.code_differences(before, now.metadata["code"])
         if changed:
             raise ConfigError(
-                f"Expected shards made by one code, got {earlier.path} and "
-                f"{now.path}, which differ in {'; '.join(changed)}. Give the commands "
-                "of the shards again with one code."
+                f"Expected all shards to be run with the same code, got {earlier.path} "
+                f"and {now.path}, which differ in {'; '.join(changed)}. Run the "
+                "commands of the shards again with the same code."
             )
     touched: dict[str, str] = {}
-    for making in makings:
-        contents = making.metadata.get(TOUCHED, {})
+    for finished_unit in finished_units:
+        contents = finished_unit.metadata.get(TOUCHED, {})
         changed = differing_entries(touched, contents)
         if changed:
             raise ConfigError(
-                f"Expected shards whose parts read the same, got {making.path}, "
-                f"which differs from units before it in {'; '.join(changed)}. Give the "
-                "commands of the shards again with the same files, packages and "
-                "variables."
+                "Expected all shards to be run with the same files, packages and "
+                f"environment variables, got {finished_unit.path}, which differs from other "
+                f"units in {'; '.join(changed)}. Run the commands of the shards again "
+                "without changing these."
             )
         touched |= contents
 
@@ -135,9 +142,8 @@ def _open_shard(part: Path) -> Run:
     run = open_run(part)
     if run.shard is None:
         raise ConfigError(
-            "Expected folders of shards, made with `benchnav-eval run … --shard "
-            f"I/N`, got {part}, which is a whole "
-            "run."
+            "Expected folders of shards, created by `benchnav-eval run … --shard "
+            f"I/N`, got {part}, which is not a shard. Leave it out."
         )
     return run
 
@@ -153,14 +159,14 @@ def _check_alike(runs: Sequence[Run]) -> None:
             reasons.append(f"{run.folder}: {'; '.join(differing)}")
     if reasons:
         raise ConfigError(
-            f"Expected shards of one run, got differences to {runs[0].folder}: "
-            f"{'. '.join(reasons)}. Give the same "
-            "command, with the same code and data, for each shard."
+            f"Expected shards of one run, got shards that differ from "
+            f"{runs[0].folder}: {'. '.join(reasons)}. Run the same command, with the "
+            "same code and data, for each shard."
         )
 
 
 def _unlike(first: Run, second: Run) -> list[str]:
-    """List differences between two runs: shards, conditions, extents and maps."""
+    """List differences in the manifests of two shards, which should be of one run."""
     lines = []
     n_first = _shard(first).of
     n_second = _shard(second).of
@@ -172,10 +178,10 @@ def _unlike(first: Run, second: Run) -> list[str]:
             if condition_id not in run.conditions:
                 names.append(" ".join(label_words(condition.labels)))
         if names:
-            listed = ", ".join(names[:_NAMED])
-            if len(names) > _NAMED:
-                listed += f" and {len(names) - _NAMED} more"
-            lines.append(f"conditions that {run.folder} lacks ({listed})")
+            listed = ", ".join(names[:_MAX_NAMED])
+            if len(names) > _MAX_NAMED:
+                listed += f" and {len(names) - _MAX_NAMED} more"
+            lines.append(f"conditions missing in {run.folder} ({listed})")
     common = [i for i in first.conditions if i in second.conditions]
     pairs = [(first.conditions[i], second.conditions[i]) for i in common]
     if any(a.labels != b.labels for (a, _), (b, _) in pairs):
@@ -192,30 +198,34 @@ def _unlike(first: Run, second: Run) -> list[str]:
 
 
 def _find(unit: Unit, runs: Sequence[Run]) -> Finished | None:
-    """Return a finished unit of some runs; reject one whose rows differ between two."""
+    """Return a finished unit from some shards; reject it if their rows differ."""
     columns = {metric.quantity.column for metric in metrics_of_run(runs[0].manifest)}
     newest = []
     for run in runs:
-        makings = find_units(run.folder, unit)
-        complete = [making for making in makings if columns <= making.metrics]
+        finished_units = find_units(run.folder, unit)
+        complete = [
+            finished_unit
+            for finished_unit in finished_units
+            if columns <= finished_unit.metrics
+        ]
         newest += complete[:1]
-    for making in newest:
-        damage = making.damage()
+    for finished_unit in newest:
+        damage = finished_unit.damage()
         if damage:
             raise ConfigError(
-                f"{making.folder} is damaged: {damage[0]}. Give the shard's command "
-                "again, which runs the unit again."
+                f"{finished_unit.folder} is damaged: {damage[0]}. Run the shard's command "
+                "again: it runs the damaged unit again."
             )
     if not newest:
         return None
     first, *others = newest
-    for making in others:
-        cells, _ = differences(unit_rows(first), unit_rows(making))
+    for finished_unit in others:
+        cells, _ = differences(unit_rows(first), unit_rows(finished_unit))
         if len(cells):
             raise ConfigError(
                 f"Expected the same rows of a unit in all shards, got {unit.name} "
-                f"({unit.condition.description}), which differs between {first.path} "
-                f"and {making.path}. Leave one of them out."
+                f"({unit.condition.description}), whose rows differ between "
+                f"{first.path} and {finished_unit.path}. Leave one of these shards out."
             )
     return first
 
@@ -233,17 +243,17 @@ def _check_whole(missing: Sequence[Unit], runs: Sequence[Run]) -> None:
         begun = f" in {folders[index]}" if index in folders else ""
         named.append(f"{count} {noun} of shard {index}/{of}{begun}")
     raise ConfigError(
-        f"Expected all units of the run, got none for: {', '.join(named)}. Finish the "
-        "run's command with each of these "
-        "as `--shard`, then give this command again with all parts."
+        f"Expected all units of the run, but these are missing: {', '.join(named)}. "
+        "Run the run's command with each of these shards as `--shard`, then run this "
+        "command again with all parts."
     )
 
 
 def _about(runs: Sequence[Run]) -> Mapping[str, Any]:
     """Return `run.json` of the merged run.
 
-    It is `run.json` of the first shard, with latencies, warnings and history of all
-    shards.
+    The result is `run.json` of the first shard, with the latencies, warnings and
+    histories of all shards.
     """
     manifest = dict(runs[0].manifest)
     manifest.pop("shard", None)

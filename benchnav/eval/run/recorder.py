@@ -17,7 +17,7 @@ from benchnav.eval.recorded_plans import (
     thinned,
 )
 from benchnav.eval.recording import MOMENT_S, Recording, drawing_interval
-from benchnav.eval.run.knowledge import Knowing
+from benchnav.eval.run.knowledge import KnowledgeTracker
 from benchnav.eval.run.rollout import Episodes, Observer
 from benchnav.planning.planners.planner import Plan
 from benchnav.planning.problem import Problem
@@ -26,14 +26,14 @@ from benchnav.planning.world.simulation import Simulation
 
 
 class Recorder:
-    """Collects plans and known maps of some episodes of a unit.
+    """Collector of the plans and known maps of some episodes of a unit.
 
     Args:
         unit: unit whose episodes are recorded.
         problem: the unit's problem.
         simulation: the unit's simulation, with a λ field that is not resampled.
         terrain: the unit's true maps, with the true λ, which no planner receives.
-        members: indices of the unit's episodes.
+        episode_indices: indices of the recorded episodes in the unit.
     """
 
     def __init__(
@@ -42,82 +42,87 @@ class Recorder:
         problem: Problem,
         simulation: Simulation,
         terrain: Terrain,
-        members: Iterable[int],
+        episode_indices: Iterable[int],
     ) -> None:
         """Start without plans."""
         self.unit = unit
         self.problem = problem
         self.simulation = simulation
         self.terrain = terrain
-        self._plans: dict[int, list[DrawnPlan]] = {member: [] for member in members}
-        self._known: dict[int, list[KnownMap]] = {member: [] for member in self._plans}
+        self._plans: dict[int, list[DrawnPlan]] = {
+            episode_index: [] for episode_index in episode_indices
+        }
+        self._known: dict[int, list[KnownMap]] = {
+            episode_index: [] for episode_index in self._plans
+        }
 
-    def watch(self, step: int, plan: Plan, planned: list[int]) -> None:
-        """Store a step's plan; plans after the time that figures show are thinned.
+    def store_plan(self, step: int, plan: Plan, planned: list[int]) -> None:
+        """Store the plan of a step; plans after the time that figures show are thinned.
 
         Args:
             step: index of the step.
-            plan: plan of some episodes.
+            plan: plan of the remaining episodes.
             planned: indices of these episodes in the unit.
         """
         is_shown = step * self.problem.dt_s <= MOMENT_S + 1e-6
-        for index, member in enumerate(planned):
-            if member not in self._plans:
+        for index, episode_index in enumerate(planned):
+            if episode_index not in self._plans:
                 continue
             drawn = drawn_plan(step, plan.lines(index))
             if not is_shown:
                 drawn = thinned(drawn)
-            self._plans[member].append(drawn)
+            self._plans[episode_index].append(drawn)
 
     @property
     def observer(self) -> Observer:
-        """Observer that `run_episodes` calls with plans and knowledge."""
+        """Callbacks of this recorder, for `run_episodes`."""
         return Observer(
-            plan=self.watch,
+            plan=self.store_plan,
             plan_interval=drawing_interval(self.problem.dt_s),
-            knowledge=self.learn,
+            knowledge=self.store_knowledge,
         )
 
-    def learn(self, step: int, knowing: Knowing) -> None:
-        """Store the robots' knowledge from a step on.
+    def store_knowledge(self, step: int, tracker: KnowledgeTracker) -> None:
+        """Store the robots' known maps from a step on.
 
         Args:
             step: index of the step.
-            knowing: the knowledge of the batch.
+            tracker: knowledge of the robots of the batch.
         """
-        for member, known_map in knowing.maps_of(step, self._known).items():
-            # float16 takes half the memory, and is finer than a file's resolution.
+        for episode_index, known_map in tracker.maps_of(step, self._known).items():
+            # float16 needs half the memory, and is finer than the levels in files.
             halved = {
                 name: getattr(known_map, name).astype(np.float16) for name in NUMBERS
             }
-            self._known[member].append(replace(known_map, **halved))
+            self._known[episode_index].append(replace(known_map, **halved))
 
-    def recording(self, episodes: Episodes, member: int) -> Recording:
-        """Return the recording of one episode."""
-        steps = int(episodes.steps[member])
-        outcome = Outcome(int(episodes.outcome[member]))
-        return self.driven(
-            member,
+    def recording(self, episodes: Episodes, episode_index: int) -> Recording:
+        """Return the recording of an episode, by its index in the unit."""
+        steps = int(episodes.steps[episode_index])
+        outcome = Outcome(int(episodes.outcome[episode_index]))
+        return self.recording_from_states(
+            episode_index,
             outcome.name.lower(),
-            episodes.states[member, : steps + 1].numpy(),
-            episodes.actions[member, :steps].numpy(),
-            episodes.traversability[member, :steps].numpy(),
+            episodes.states[episode_index, : steps + 1].numpy(),
+            episodes.actions[episode_index, :steps].numpy(),
+            episodes.traversability[episode_index, :steps].numpy(),
         )
 
-    def driven(
+    def recording_from_states(
         self,
-        member: int,
+        episode_index: int,
         outcome: str,
         states: np.ndarray,
         actions: np.ndarray,
         traversability: np.ndarray,
     ) -> Recording:
-        """Record an episode from its driven states, with the collected plans.
+        """Return the recording of an episode from its driven states.
 
-        Letters in shapes are those of `Recording`.
+        The recording contains the collected plans and known maps. Letters in shapes are
+        those of `Recording`.
 
         Args:
-            member: index of the episode in the unit.
+            episode_index: index of the episode in the unit.
             outcome: name of the outcome.
             states: robot states, shape [N + 1, S].
             actions: commanded actions, shape [N, A].
@@ -126,54 +131,54 @@ class Recorder:
         problem = self.problem
         terrain = self.terrain
 
-        def of_member(values: Any) -> np.ndarray:
-            return values[member].cpu().numpy()
+        def as_array(values: Any) -> np.ndarray:
+            return values[episode_index].cpu().numpy()
 
         truth = terrain.truth
-        true_mean = truth.select(torch.tensor([member])).mean()[0]
-        soft = (truth.weights[member, 1:] > 0).any(dim=0)
+        true_mean = truth.select(torch.tensor([episode_index])).mean()[0]
+        soft = (truth.weights[episode_index, 1:] > 0).any(dim=0)
         field = None
         if self.simulation.field is not None:
-            field = of_member(self.simulation.field)
-        layers = {name: of_member(layer) for name, layer in terrain.layers.items()}
+            field = as_array(self.simulation.field)
+        layers = {name: as_array(layer) for name, layer in terrain.layers.items()}
         # A batch may continue after the episode has ended.
         known_maps = [
             known_map
-            for known_map in self._known.get(member, ())
+            for known_map in self._known.get(episode_index, ())
             if known_map.step <= len(actions)
         ]
         free_space = problem.task.rules.free_space
         return Recording(
-            about=self._identity(member, outcome),
+            about=self._identity(episode_index, outcome),
             resolution_m=problem.grid.resolution_m,
-            rgb=of_member(terrain.rgb),
+            rgb=as_array(terrain.rgb),
             field=field,
-            immobilising=of_member(self.simulation.immobilising),
-            goal_m=of_member(problem.goal_m),
-            elevation_m=of_member(terrain.elevation_m),
+            immobilising=as_array(self.simulation.immobilising),
+            goal_m=as_array(problem.goal_m),
+            elevation_m=as_array(terrain.elevation_m),
             true_mean=true_mean.float().cpu().numpy(),
             soft=soft.cpu().numpy(),
-            predicted=of_member(problem.risk_map),
-            free=of_member(problem.free),
+            predicted=as_array(problem.risk_map),
+            free=as_array(problem.free),
             free_by=free_space.by,
             free_above=free_space.above,
             dt_s=problem.dt_s,
-            time_budget_s=float(problem.time_budget_s[member]),
+            time_budget_s=float(problem.time_budget_s[episode_index]),
             action_names=problem.robot.action_names,
             states=states,
             actions=actions,
             traversability=traversability,
-            plans=self._plans.get(member, ()),
+            plans=self._plans.get(episode_index, ()),
             layers=layers,
             known=tuple(known_maps),
         )
 
-    def _identity(self, member: int, outcome: str) -> dict[str, str]:
-        """Return the text by which a recording identifies its episode."""
+    def _identity(self, episode_index: int, outcome: str) -> dict[str, str]:
+        """Return the columns that identify an episode, with values as text."""
         unit = self.unit
         identity = {"condition": unit.condition.id, **unit.condition.labels}
         identity["seed"] = str(unit.seed)
         identity["realisation"] = str(unit.realisation)
-        identity["map"] = str(unit.maps[member])
+        identity["map"] = str(unit.maps[episode_index])
         identity["outcome"] = outcome
         return identity

@@ -1,4 +1,4 @@
-"""Recordings created again from a finished run, and the map that its figures show."""
+"""Recordings created again from a run, and the map that its figures show."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -23,11 +23,11 @@ from benchnav.eval.folder.run_folder import (
     unit_rows,
 )
 from benchnav.eval.folder.steps import LAST_COLUMN, has_steps, read_steps
-from benchnav.eval.recording import GROUND, MAP, Ground, Recording
+from benchnav.eval.recording import GROUND, MAP, RecordedMap, Recording
 from benchnav.eval.run.recorder import Recorder
 from benchnav.eval.run.unit import (
-    Built,
     Settings,
+    UnitInputs,
     build,
     noise_key,
     one_thread,
@@ -40,57 +40,59 @@ from benchnav.planning.world.simulation import Simulation
 
 
 def find_recording(
-    folder: Path, unit: Unit, member: int, out: Path | None = None
+    folder: Path, unit: Unit, episode_index: int, out: Path | None = None
 ) -> Recording:
     """Return the recording of an episode; run its unit again if necessary.
 
     Args:
         folder: a run in which the unit is finished.
         unit: unit of the episode.
-        member: index of the episode in the unit.
+        episode_index: index of the episode in the unit.
         out: folder to which a new recording is written; if None, the run folder.
 
     Raises:
         ConfigError: If the run has no row of the episode, or its device is missing.
-        BenchnavError: If the unit does not repeat its stored row.
+        BenchnavError: If the repeated episode differs from its stored row.
     """
     out = out or folder
     for parent in (folder, out):
-        stored = parent / unit.recording_path(member)
+        stored = parent / unit.recording_path(episode_index)
         if stored.exists():
             return Recording.load(stored)
-    row = _row(folder, unit, unit.maps[member])
+    row = _row(folder, unit, unit.maps[episode_index])
     device = device_of_run(open_run(folder).manifest)
-    # Without a time limit of planners, since it changes no action.
+    # No time limit of planners, since it changes no action.
     settings = Settings(device=device.type)
     with one_thread():
-        recorder, built = _recorder(unit, settings, [member])
-        episodes, _ = simulate(unit, built, settings, observer=recorder.observer)
-    recording = recorder.recording(episodes, member)
+        recorder, inputs = _recorder(unit, settings, [episode_index])
+        episodes, _ = simulate(unit, inputs, settings, observer=recorder.observer)
+    recording = recorder.recording(episodes, episode_index)
     if not _repeats(row, recording):
         raise BenchnavError(
-            f"The repeated episode differs from the stored one: {folder} was made "
-            "with other versions or on "
-            "another machine type. Run the suite again here to replay it."
+            f"The repeated episode differs from the stored one: {folder} was run with "
+            "other versions or on another type of machine. Run the suite again on this "
+            "machine to replay it."
         )
-    recording.save(out / unit.recording_path(member))
+    recording.save(out / unit.recording_path(episode_index))
     return recording
 
 
 def _recorder(
-    unit: Unit, settings: Settings, members: Sequence[int]
-) -> tuple[Recorder, Built]:
-    """Create the problem and the simulation of a unit again."""
+    unit: Unit, settings: Settings, episode_indices: Sequence[int]
+) -> tuple[Recorder, UnitInputs]:
+    """Return a recorder of some episodes of a unit, and the unit's inputs."""
     origin = settings.origins().of(unit)
     device = torch.device(settings.device)
-    built = build(unit, origin, device)
+    inputs = build(unit, origin, device)
     terrain = read_block(unit, origin, device).terrain
-    recorder = Recorder(unit, built.problem, built.simulation, terrain, members)
-    return recorder, built
+    recorder = Recorder(
+        unit, inputs.problem, inputs.simulation, terrain, episode_indices
+    )
+    return recorder, inputs
 
 
 def _row(folder: Path, unit: Unit, map_index: int) -> dict[str, Any]:
-    """Return the row of an episode, also if its run is not finished."""
+    """Return the row of an episode; the run need not be finished."""
     if (folder / EPISODES).exists():
         rows = read_table(folder, EPISODES)
     else:
@@ -106,23 +108,23 @@ def _row(folder: Path, unit: Unit, map_index: int) -> dict[str, Any]:
     matches = _matching(rows, keys)
     if matches.empty:
         raise ConfigError(
-            f"Expected an episode that is finished, got one that {folder} does not "
-            "have yet. Give its `benchnav-eval "
-            "run` command again to finish it, or name another condition."
+            f"Expected a finished episode, got one that {folder} does not have yet. "
+            "Run its `benchnav-eval run` command again to finish it, or select another "
+            "condition."
         )
     return matches.to_dict("records")[0]
 
 
 def _matching(rows: pd.DataFrame, values: Mapping[str, Any]) -> pd.DataFrame:
-    """Return the rows that have these values in the columns of their names."""
+    """Return the rows with the given values, by column."""
     is_equal = rows[list(values)] == pd.Series(values)
     return rows[is_equal.all(axis=1)]
 
 
 def _repeats(row: Mapping[str, Any], recording: Recording) -> bool:
     """Return whether a repeated episode agrees with its row."""
-    ended = np.isclose(row["end_time_s"], recording.end_s, atol=1e-6)
-    if row["outcome"] != recording.about["outcome"] or not ended:
+    is_same_end = np.isclose(row["end_time_s"], recording.end_s, atol=1e-6)
+    if row["outcome"] != recording.about["outcome"] or not is_same_end:
         return False
     if not len(recording.traversability):
         return True
@@ -138,7 +140,7 @@ def record_driven(folder: Path, rows: pd.DataFrame) -> list[Recording]:
 
     Args:
         folder: a finished run that stored steps.
-        rows: episodes of one condition, rows of the run's table.
+        rows: rows of the run's table, all of one condition.
 
     Returns:
         One recording per row.
@@ -155,7 +157,7 @@ def record_driven(folder: Path, rows: pd.DataFrame) -> list[Recording]:
 
 
 def _record_block(run: Run, rows: pd.DataFrame) -> Iterator[Recording]:
-    """Yield recordings of episodes under one seed and realisation."""
+    """Yield recordings of episodes with the same seed and realisation."""
     first = rows.iloc[0]
     condition, _ = run.conditions[first["condition"]]
     maps = tuple(rows["map"].tolist())
@@ -171,19 +173,26 @@ def _record_block(run: Run, rows: pd.DataFrame) -> Iterator[Recording]:
     driven = steps_table.groupby("map")
     commands = list(recorder.problem.robot.action_names)
     outcomes = zip(maps, rows["outcome"], strict=True)
-    for member, (map_index, outcome) in enumerate(outcomes):
+    for episode_index, (map_index, outcome) in enumerate(outcomes):
         steps = driven.get_group(map_index)
         states = steps[["x_m", "y_m", "heading_rad"]].to_numpy()
         actions = steps[commands].to_numpy()[:-1]
         traversability = steps[LAST_COLUMN].to_numpy()[:-1]
-        yield recorder.driven(member, outcome, states, actions, traversability)
+        yield recorder.recording_from_states(
+            episode_index, outcome, states, actions, traversability
+        )
 
 
 def _check_unchanged(run: Run, unit: Unit, code_digest: str) -> None:
     """Reject maps or parts that differ from those of a run.
 
+    Args:
+        run: opened run folder.
+        unit: unit whose maps and parts are checked.
+        code_digest: digest of the code of the run's rows.
+
     Raises:
-        BenchnavError: If they differ.
+        BenchnavError: If maps or parts differ.
     """
     condition = unit.condition
     origin = Settings().origins().of(unit)
@@ -191,22 +200,23 @@ def _check_unchanged(run: Run, unit: Unit, code_digest: str) -> None:
     map_digests = tuple(digests[index] for index in unit.maps)
     if origin.maps[1:] != map_digests:
         raise BenchnavError(
-            f"Expected {condition.data} with the maps of {run.folder}, got other maps."
+            f"Expected {condition.data} with the maps of {run.folder}, got different "
+            "maps. Restore the dataset, or run the suite again."
         )
     parts = code_of(run, code_digest)["parts"]
     for part, digest in origin.code["parts"].items():
         if parts.get(part) != digest:
             raise BenchnavError(
-                f"Expected {part} as it was when {run.folder} was run, got a changed "
-                "one."
+                f"Expected {part} with which {run.folder} was run, got a changed one. "
+                "Restore it, or run the suite again."
             )
 
 
-def telling_map(episodes: pd.DataFrame) -> dict[str, Any]:
-    """Choose the map and draw of λ on which conditions differ most in success.
+def most_differing_map(episodes: pd.DataFrame) -> dict[str, Any]:
+    """Choose the map and the draw of λ on which the success of conditions differs most.
 
-    Successes and failures are about equally frequent there. Of equal maps, the one that
-    most conditions were run on is chosen, then the first.
+    The number of successes or of failures, whichever is smaller, is then largest. Ties
+    are decided by the number of conditions, then by the order of the rows.
 
     Args:
         episodes: rows of a run.
@@ -224,8 +234,10 @@ def telling_map(episodes: pd.DataFrame) -> dict[str, Any]:
     return best[MAP].head(1).to_dict("records")[0]
 
 
-def keep_ground(folder: Path) -> None:
-    """Write the map on which outcomes differ most, with its λ field, if steps exist.
+def write_ground(folder: Path) -> None:
+    """Write the map on which outcomes differ most, with its λ field.
+
+    If the run has no steps, nothing is written.
 
     Args:
         folder: a run with a complete table.
@@ -233,25 +245,25 @@ def keep_ground(folder: Path) -> None:
     if not has_steps(folder):
         return
     rows = read_table(folder, EPISODES)
-    map_keys = telling_map(rows)
+    map_keys = most_differing_map(rows)
     first_id = _matching(rows, map_keys)["condition"].iloc[0]
     condition, _ = open_run(folder).conditions[first_id]
     maps = [map_keys["map"]]
     block = read_maps(condition.dataset, condition.split, maps)
     noise = noise_key(map_keys["seed"], condition.split, map_keys["realisation"])
     simulation = Simulation(
-        block.terrain, condition.task, condition.world, block.places, noise, maps
+        block.terrain, condition.task, condition.world, block.endpoints, noise, maps
     )
     field = None
     if simulation.field is not None:
         field = simulation.field[0].cpu().numpy()
-    ground = Ground(
+    ground = RecordedMap(
         about=map_keys,
         resolution_m=block.terrain.grid.resolution_m,
         rgb=block.terrain.rgb[0].cpu().numpy(),
         field=field,
         immobilising=simulation.immobilising[0].cpu().numpy(),
-        goal_m=block.places.goal_m[0].cpu().numpy(),
+        goal_m=block.endpoints.goal_m[0].cpu().numpy(),
     )
     path = folder / GROUND
     ground.save(path)

@@ -1,7 +1,7 @@
 """Repetition of a run from its provenance, and comparison of every row.
 
-The conditions of `run.json` are repeated with their extents, whichever commands added
-them.
+All conditions of `run.json` are repeated with their extents, including those that later
+commands added.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -41,7 +41,7 @@ from benchnav.eval.run.combinations import find_left_out
 from benchnav.eval.run.runner import run_work
 from benchnav.eval.run.unit import Settings
 
-_SHOWN = 5
+_MAX_SHOWN = 5  # rows that a comparison lists
 
 
 def rerun(
@@ -51,24 +51,25 @@ def rerun(
     overwrite: bool = False,
     say: Say = lambda line: None,
 ) -> Iterator[Progress]:
-    """Run all of a finished run again, and yield the progress in units.
+    """Run all units of a finished run again, and yield the progress in units.
 
     Args:
         run_folder: the run that is repeated.
         folder: folder of the rerun; an interrupted rerun is resumed.
         jobs: number of worker processes, or the address of a Dask cluster's scheduler.
         overwrite: whether to delete a run in `folder` first.
-        say: receives what a user should know, a line at a time.
+        say: function that receives messages for the user, one line at a time.
 
     Raises:
-        ConfigError: If the run is not finished, or a part of it is missing.
+        ConfigError: If the run is not finished, `folder` contains another run, or a
+            part or map is missing.
     """
     run = _open(run_folder)
     check_resumable(run)
     if folder.resolve() == run_folder.resolve():
         raise ConfigError(
-            "Expected `out` to be another folder than the run that is repeated, got "
-            f"{folder}."
+            "Expected `out` to differ from the folder of the repeated run, got "
+            f"{folder}. Choose another `out`."
         )
     if not overwrite and (folder / RUN).exists():
         _check_repeats(run, folder)
@@ -103,7 +104,7 @@ def compare(run_folder: Path, folder: Path) -> tuple[bool, list[str]]:
         folder: the rerun.
 
     Returns:
-        Whether all rows are identical in all columns of both tables, and lines for the
+        Whether all rows and columns of both tables are identical, and lines for the
         user.
 
     Raises:
@@ -119,7 +120,7 @@ def compare(run_folder: Path, folder: Path) -> tuple[bool, list[str]]:
     same = not rows_differ and not columns
     lines = []
     if same:
-        lines.append(f"all {len(first)} rows came out the same")
+        lines.append(f"all {len(first)} rows are identical")
     if rows_differ:
         conditions: dict[str, Condition] = {}
         for entries in (again.conditions, run.conditions):
@@ -138,21 +139,19 @@ def _open(folder: Path) -> Run:
 
 
 def _check_repeats(run: Run, folder: Path) -> None:
-    """Reject a run with other conditions, or with units copied from the original."""
+    """Reject a folder with other conditions, or with copies of the run's units."""
     if set(open_run(folder).conditions) != set(run.conditions):
         raise ConfigError(
             f"Expected `out` to be new or an earlier rerun of {run.folder}, got "
-            f"{folder} with other conditions. Choose "
-            "another `out`."
+            f"{folder}, which has other conditions. Choose another `out`."
         )
     run_units = units(run.conditions)
     copied = _tokens(run.folder, run_units) & _tokens(folder, run_units)
     if copied:
         raise ConfigError(
             f"Expected `out` to be new or an earlier rerun of {run.folder}, got "
-            f"{folder}, where {len(copied)} of "
-            f"{len(run_units)} units are copies of that run's units. Choose another "
-            "`out`, or pass --overwrite."
+            f"{folder}, where {len(copied)} of {len(run_units)} units are copies of "
+            "units of the run. Choose another `out`, or pass --overwrite."
         )
 
 
@@ -166,7 +165,7 @@ def _tokens(folder: Path, run_units: Sequence[Unit]) -> set[str]:
 
 
 def _check_available(run: Run) -> None:
-    """Reject a run that depends on something missing, and list all that is missing."""
+    """Reject a run with missing maps or parts, and list them all."""
     missing: dict[str, None] = {}
     parts = [metric.part for metric in metrics_of_run(run.manifest)]
     checks: list[Callable[[], Any]] = [partial(provenance.describe_metrics, parts)]
@@ -180,7 +179,8 @@ def _check_available(run: Run) -> None:
             missing[str(error)] = None
     if missing:
         raise ConfigError(
-            f"Expected all inputs of {run.folder}, got missing ones: {' '.join(missing)}"
+            f"Expected all inputs of {run.folder}, but some are missing: "
+            f"{' '.join(missing)}"
         )
     conditions = [condition for condition, _ in run.conditions.values()]
     for entry in find_left_out(conditions).values():
@@ -194,7 +194,14 @@ def _verdict(
     cells: pd.DataFrame,
     missing: pd.Index,
 ) -> list[str]:
-    """Describe the rows that differ: counts, the first rows, the largest differences."""
+    """Describe the differing rows: counts, the first rows and the largest differences.
+
+    Args:
+        conditions: conditions of both runs, by id.
+        rows: number of rows of the original run.
+        cells: differing cells, from `differences`.
+        missing: keys of rows that only one table has.
+    """
     changes = [
         f"{name} {_text(a)} → {_text(b)}" for (*_, name), a, b in cells.itertuples()
     ]
@@ -205,13 +212,13 @@ def _verdict(
     differing = pd.concat([by_row.agg(", ".join), unmatched])
     counts = differing.groupby(level="condition", sort=False).size()
     lines = [
-        f"{len(differing)} of {rows} rows came out differently, in {len(counts)} of "
+        f"{len(differing)} of {rows} rows differ, in {len(counts)} of "
         f"{len(conditions)} conditions:"
     ]
     for condition, count in counts.items():
         lines.append(f"  {conditions[condition].description}: {count} rows")
-    lines.append("the first of them:")
-    for (condition, *draw), line in differing.head(_SHOWN).items():
+    lines.append("the first of these rows:")
+    for (condition, *draw), line in differing.head(_MAX_SHOWN).items():
         keys = zip(KEYS[1:], draw, strict=True)
         words = ", ".join(f"{name} {value}" for name, value in keys)
         lines.append(f"  {conditions[condition].description}, {words}: {line}")
@@ -221,7 +228,7 @@ def _verdict(
     max_gaps = gaps.groupby(level=-1, sort=False).max().dropna()
     if len(max_gaps):
         words = ", ".join(f"{name} {gap:.3g}" for name, gap in max_gaps.items())
-        lines.append(f"greatest differences: {words}")
+        lines.append(f"largest differences: {words}")
     return lines
 
 

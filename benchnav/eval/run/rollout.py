@@ -1,8 +1,8 @@
 """Episodes: a planner and the simulation in a closed loop, as one batch.
 
-A GPU executes queued work while the CPU queues more, as long as no value is read. On
-devices other than the CPU, the loop therefore reads the mask of running episodes only
-every few steps, and faults remain tensors until the end.
+A GPU executes queued work while the CPU queues more, as long as the CPU reads no value.
+On a GPU, the loop therefore reads the mask of running episodes only every few steps,
+and records errors as tensors until the end.
 Letters in shapes: B episodes, N steps, S state and A action dimensions.
 """
 
@@ -20,7 +20,7 @@ from torch import Tensor
 from benchnav.core.device import GPU_FAULTS, DeviceError, gpu_failed
 from benchnav.core.errors import BenchnavError, out_of_memory_error
 from benchnav.core.settings import fault
-from benchnav.eval.run.knowledge import Knowing, Learning
+from benchnav.eval.run.knowledge import KnowledgeTracker, Learning
 from benchnav.planning.objective import distance
 from benchnav.planning.planners.boundary import (
     Answer,
@@ -36,8 +36,8 @@ from benchnav.planning.sensing.sensor import Step
 from benchnav.planning.world.outcome import Outcome, classify_standstill
 from benchnav.planning.world.simulation import Simulation, SimulationState, end
 
-_MAX_REMAINING = 0.75  # fraction of running episodes above which no batch is reduced
-_CHECK_INTERVAL = 8  # steps between two reads of the running episodes, on a GPU
+_MAX_REMAINING = 0.75  # a batch is reduced if at most this fraction still runs
+_CHECK_INTERVAL = 8  # steps between two reads of the running episodes on a GPU
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,49 +45,50 @@ class Observer:
     """Callbacks during episodes, for recordings.
 
     Args:
-        plan: function that is called with the index of a step, its plan and the indices
-            of its episodes, before the step is taken.
-        plan_interval: number of steps between two calls of `plan`; the first step has a
-            call.
-        knowledge: function that is called with the index of a step and the knowledge
-            after an update, before the step is planned.
+        plan: function that is called before a step is taken, with the index of the
+            step, the plan and the indices of the planned episodes.
+        plan_interval: number of steps between two calls of `plan`; the first call is at
+            the first step.
+        knowledge: function that is called after an update and before the step is
+            planned, with the index of the step and the knowledge.
     """
 
     plan: Callable[[int, Plan, list[int]], None] | None = None
     plan_interval: int = 1
-    knowledge: Callable[[int, Knowing], None] | None = None
+    knowledge: Callable[[int, KnowledgeTracker], None] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class Episodes:
     """Trajectories and outcomes of a batch of episodes, on the CPU.
 
-    Beyond an episode's `steps` its state is constant.
+    After the last of an episode's `steps`, its state is constant.
 
     Args:
         states: robot states, shape [B, N + 1, S].
         actions: commanded actions, shape [B, N, A].
         traversability: observed λ of each step, shape [B, N].
-        speed_mps: speed that each action gives on terrain of λ = 1, in m/s, shape
-            [B, N].
-        turn_rate_radps: turn rate that each action gives on terrain of λ = 1, in rad/s,
-            shape [B, N].
-        outcome: codes of `Outcome`, shape [B].
-        steps: number of steps to the end, shape [B].
+        speed_mps: speed of the robot with the same action on terrain with λ = 1, in
+            m/s, shape [B, N].
+        turn_rate_radps: turn rate of the robot with the same action on terrain with
+            λ = 1, in rad/s, shape [B, N].
+        outcome: codes of `Outcome`, int64, shape [B].
+        steps: number of steps to the end, int64, shape [B].
         begin_s: wall time of the planner's preparation for the batch, in seconds.
-        planning_s: wall time of each step's plan, in seconds, shape [N].
-        planned: number of episodes that each step's plan is for, int64, shape [N].
+        planning_s: wall time of planning at each step, for all planned episodes, in
+            seconds, shape [N].
+        planned: number of planned episodes at each step, int64, shape [N].
         revisions: number of changes of each episode's map, int64, shape [B].
         learning_s: wall time of sensing and updates in all steps, in seconds.
-        errors: one line for each episode, length B: the fault of its planner that ended
-            it; empty for other episodes.
-        traceback: traceback of the planner's exception; empty if it raised none.
-        seen_cells: number of cells that each robot saw, int64, shape [B]; None if
-            robots do not learn.
+        errors: error that ended each episode in one line, length B; empty without an
+            error.
+        traceback: traceback of the exception that ended episodes; empty without one.
+        seen_cells: number of cells whose appearance each robot observed, int64, shape
+            [B]; None if robots do not learn.
         sensed_cells: number of cells whose λ each robot measured, int64, shape [B];
             None if robots do not learn.
-        ahead: RMSE of E[λ] and log score over the cells ahead of the robot, as in
-            `Knowing.ahead`, shape [B, N, 2]; NaN at steps without an update. None if
+        ahead: RMSE of E[λ] and mean log score over the cells ahead of the robot, as in
+            `KnowledgeTracker.ahead`, shape [B, N, 2]; NaN at steps without an update. None if
             robots do not learn.
     """
 
@@ -111,12 +112,12 @@ class Episodes:
 
 
 class Clock:
-    """Timer of successive calls that does not wait for a GPU.
+    """Timer of successive code blocks that does not wait for a GPU.
 
-    On a GPU, events are recorded in its stream and read at the end.
+    On a GPU, events are recorded in the GPU's stream and read at the end.
 
     Args:
-        device: device of the calls.
+        device: device on which the blocks compute.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -126,7 +127,7 @@ class Clock:
 
     @contextmanager
     def timed(self) -> Iterator[None]:
-        """Measure the enclosed block; one that raises is not counted."""
+        """Measure the enclosed block, unless it raises."""
         began = self._mark()
         yield
         self._marks.append((began, self._mark()))
@@ -139,7 +140,7 @@ class Clock:
         return event
 
     def seconds(self) -> list[float]:
-        """Return the time of each call so far, in seconds."""
+        """Return the time of each measured block, in seconds."""
         if not self._on_gpu:
             return [end - begin for begin, end in self._marks]
         torch.cuda.synchronize()
@@ -147,91 +148,98 @@ class Clock:
 
 
 class _Log:
-    """Record of the steps while they are taken."""
+    """Record of the steps of all episodes."""
 
     def __init__(self, start: SimulationState, problem: Problem) -> None:
         device = start.state.device
         self.dt_s = problem.dt_s
         self.states = [start.state]
-        # Each step has actions, observed λ, and distance and turn rate for λ = 1. The
-        # empty first entry gives shapes to episodes without a step.
+        # Values of each step: action, observed λ, and distance and turn rate for λ = 1.
+        # The empty first entry defines the shapes if there is no step.
         n_actions = len(problem.robot.action_low)
         empty = start.state.new_zeros(len(start.state), 0)
         no_actions = empty[..., None].expand(-1, 0, n_actions)
         self._steps = [[no_actions, empty, empty, empty]]
-        self.clock = Clock(device)  # of the preparation, then of each plan
-        self.learning = Clock(device)
+        self.clock = Clock(device)  # times the preparation, then each plan
+        self.learning = Clock(device)  # times sensing and updates
         self.planned: list[int] = []
         self._reasons: list[str] = []
-        # Index of each episode's reason; -1 without a fault.
-        self._fault = torch.full_like(start.outcome, -1)
+        # Index of each episode's reason; -1 without an error.
+        self._reason_index = torch.full_like(start.outcome, -1)
 
-    def blame(self, mask: Tensor, reason: str) -> None:
-        """Record the reason for which the episodes of a mask, bool [B], end."""
+    def record_error(self, mask: Tensor, reason: str) -> None:
+        """Record the error that ends the episodes of a mask, bool, shape [B]."""
         if reason not in self._reasons:
             self._reasons.append(reason)
         index = self._reasons.index(reason)
-        self._fault = torch.where(mask, index, self._fault)
+        self._reason_index = torch.where(mask, index, self._reason_index)
 
     def add(
         self,
         after: SimulationState,
         action: Tensor,
         traversability: Tensor,
-        free: Tensor,
+        unhindered: Tensor,
     ) -> None:
-        """Add a step; `free` are the states that terrain of λ = 1 would give."""
+        """Add a step.
+
+        Args:
+            after: state of the simulation after the step.
+            action: commanded actions, shape [B, A].
+            traversability: observed λ, shape [B].
+            unhindered: robot states after the step if λ were 1, shape [B, S].
+        """
         before = self.states[-1]
-        driven = distance(free, before[:, :2])
-        turned = (free[:, 2] - before[:, 2]) / self.dt_s
-        values = (action, traversability, driven, turned)
+        distance_m = distance(unhindered, before[:, :2])
+        turn_rate = (unhindered[:, 2] - before[:, 2]) / self.dt_s
+        values = (action, traversability, distance_m, turn_rate)
         self._steps.append([value.unsqueeze(1) for value in values])
         self.states.append(after.state)
 
     def episodes(
-        self, now: SimulationState, traceback_: str, knowing: Knowing | None
+        self, now: SimulationState, traceback_: str, tracker: KnowledgeTracker | None
     ) -> Episodes:
         """Return the episodes; `now` is the last state of the simulation."""
         track = torch.stack(self.states, dim=1)
-        taken = len(self._steps) - 1
-        actions, traversability, driven, turned = (
+        n_steps = len(self._steps) - 1
+        actions, traversability, distance_m, turn_rate = (
             torch.cat(values, dim=1) for values in zip(*self._steps, strict=True)
         )
         seconds = self.clock.seconds()
         outcome = classify_standstill(
-            now.outcome, now.step, track[..., :2], driven, self.dt_s
+            now.outcome, now.step, track[..., :2], distance_m, self.dt_s
         )
-        reasons = [*self._reasons, ""]  # index -1 selects the empty one
-        errors = [reasons[index] for index in self._fault.tolist()]
-        learnt: dict[str, Any] = {}
-        if knowing is None:
-            learnt["revisions"] = torch.zeros_like(now.step).cpu()
+        reasons = [*self._reasons, ""]  # index -1 selects the empty reason
+        errors = [reasons[index] for index in self._reason_index.tolist()]
+        learning: dict[str, Any] = {}
+        if tracker is None:
+            learning["revisions"] = torch.zeros_like(now.step).cpu()
         else:
-            learnt["revisions"] = knowing.revisions.cpu()
-            learnt["seen_cells"] = knowing.seen_cells.cpu()
-            learnt["sensed_cells"] = knowing.sensed_cells.cpu()
-            learnt["ahead"] = _by_step(knowing.ahead, len(track), taken)
+            learning["revisions"] = tracker.revisions.cpu()
+            learning["seen_cells"] = tracker.seen_cells.cpu()
+            learning["sensed_cells"] = tracker.sensed_cells.cpu()
+            learning["ahead"] = _by_step(tracker.ahead, len(track), n_steps)
         return Episodes(
             states=track.cpu(),
             actions=actions.cpu(),
             traversability=traversability.cpu(),
-            speed_mps=(driven / self.dt_s).cpu(),
-            turn_rate_radps=turned.cpu(),
+            speed_mps=(distance_m / self.dt_s).cpu(),
+            turn_rate_radps=turn_rate.cpu(),
             outcome=outcome.cpu(),
             steps=now.step.cpu(),
             begin_s=seconds[0] if seconds else 0.0,
-            # A planner that raised has no step for its last plan.
-            planning_s=torch.tensor(seconds[1 : taken + 1], dtype=torch.float64),
-            planned=torch.tensor(self.planned[:taken]),
+            # If the planner raised, its last plan belongs to no step.
+            planning_s=torch.tensor(seconds[1 : n_steps + 1], dtype=torch.float64),
+            planned=torch.tensor(self.planned[:n_steps]),
             learning_s=sum(self.learning.seconds()),
             errors=tuple(errors),
             traceback=traceback_,
-            **learnt,
+            **learning,
         )
 
 
 def _by_step(measured: Mapping[int, Tensor], batch: int, steps: int) -> Tensor:
-    """Return scores of all steps, NaN without an update, shape [B, N, 2]."""
+    """Return the scores of all steps, shape [B, N, 2]; NaN without an update."""
     scores = torch.full((batch, steps, 2), torch.nan)
     for step, values in measured.items():
         if step < steps:
@@ -250,34 +258,33 @@ def run_episodes(
 ) -> Episodes:
     """Run a batch of episodes until all have ended.
 
-    An exception of the planner ends the episodes that still run. An action that its
-    robot cannot perform ends only its own episode.
+    An exception of the planner ends all episodes that still run. An action that the
+    robot cannot perform ends only the episode of this robot.
 
     Args:
         planner: planner that chooses actions; it receives copies of predictions, never
-            the truth.
+            the true terrain.
         problem: problem with predicted traversability.
         simulation: simulation with the true terrain.
         generator: random generator of the planner.
         observer: callbacks for recordings.
-        stop: function that is called with the index of each step; True ends the run.
-            Episodes that still run keep the outcome running.
-        learning: sensing and belief of the robots, after whose updates the planner
-            replans; None if the robots do not learn.
+        stop: function that is called with the index of each step. If it returns True,
+            the batch stops, and episodes that still run keep the outcome `RUNNING`.
+        learning: sensing and belief of the robots; None if the robots do not learn.
 
     Returns:
         The episodes.
 
     Raises:
-        RobotError: If the robot's F failed in the simulation.
+        RobotError: If the robot dynamics F failed in the simulation.
         DeviceError: If the GPU failed.
     """
     now = simulation.init(problem.start)
     log = _Log(now, problem)
     observed = torch.full_like(now.state[:, 0], torch.nan)
     check_interval = 1 if observed.device.type == "cpu" else _CHECK_INTERVAL
-    trace = ""
-    knowing = None if learning is None else Knowing(learning, problem)
+    traceback_ = ""
+    tracker = None if learning is None else KnowledgeTracker(learning, problem)
     try:
         with log.clock.timed():
             plan_state = begin(planner, problem, generator)
@@ -290,18 +297,18 @@ def run_episodes(
                 if not bool(running.any()):
                     break
                 remaining = batch.drop_ended(running)
-                if knowing is not None and remaining is not None:
-                    knowing.keep(remaining)
-            revised = None
-            if knowing is not None:
+                if tracker is not None and remaining is not None:
+                    tracker.keep(remaining)
+            revised_problem = None
+            if tracker is not None:
                 state = batch.part_of(now.state)
                 running_part = batch.part_of(now.running)
                 with log.learning.timed():
-                    revised = knowing.learn(count, state, running_part)
-                if knowing.is_due(count):
-                    knowing.look_ahead(count, state, running_part)
+                    revised_problem = tracker.learn(count, state, running_part)
+                if tracker.is_due(count):
+                    tracker.look_ahead(count, state, running_part)
                     if observer.knowledge is not None:
-                        observer.knowledge(count, knowing)
+                        observer.knowledge(count, tracker)
             watched = observer.plan is not None and count % observer.plan_interval == 0
             step = Step(
                 state=now.state,
@@ -310,18 +317,18 @@ def run_episodes(
                 draw=watched,
             )
             with log.clock.timed():
-                if revised is not None:
-                    batch.revise(revised, generator)
+                if revised_problem is not None:
+                    batch.revise(revised_problem, generator)
                 answer = batch.act(step)
-            log.planned.append(len(batch.members))
+            log.planned.append(len(batch.episode_indices))
             if watched and observer.plan is not None:
-                observer.plan(count, answer.plan, batch.members.tolist())
+                observer.plan(count, answer.plan, batch.episode_indices.tolist())
             action, faulty, status = batch.spread(answer)
-            log.blame(now.running & faulty, answer.reason)
+            log.record_error(now.running & faulty, answer.reason)
             now = end(now, faulty, Outcome.PLANNER_ERROR)
             now = end(now, status == PlanStatus.FAILED, Outcome.PLANNER_FAILURE)
-            now, observed, free = _move(simulation, now, action)
-            log.add(now, action, observed, free)
+            now, observed, unhindered = _move(simulation, now, action)
+            log.add(now, action, observed, unhindered)
     except (RobotError, DeviceError):
         raise
     except GPU_FAULTS as error:
@@ -329,70 +336,75 @@ def run_episodes(
     except (Exception, SystemExit) as error:
         if no_memory := out_of_memory_error(error):
             raise no_memory from error
-        trace = traceback.format_exc() if bool(now.running.any()) else ""
-        log.blame(now.running, fault(error))
+        traceback_ = traceback.format_exc() if bool(now.running.any()) else ""
+        log.record_error(now.running, fault(error))
         outcome = (
             error.outcome
             if isinstance(error, KnowledgeError)
             else Outcome.PLANNER_ERROR
         )
         now = end(now, now.running, outcome)
-    return log.episodes(now, trace, knowing)
+    return log.episodes(now, traceback_, tracker)
 
 
 class _Batch:
-    """The episodes that are planned: all at first, fewer after enough have ended.
+    """The planned episodes: at first all, later only those that still run.
 
     Args:
         planner: planner of all episodes.
         problem: problem of all episodes.
-        plan_state: plan state returned by `begin`.
+        plan_state: plan state that `begin` returned.
+
+    Attributes:
+        episode_indices: indices of the planned episodes among all, int64 on the CPU.
     """
 
     def __init__(
         self, planner: Planner[Any], problem: Problem, plan_state: Any
     ) -> None:
-        self.members = torch.arange(len(problem))
+        self.episode_indices = torch.arange(len(problem))
         self._planner = planner
         self._all = problem
         self._part = problem
         self._state = plan_state
-        self._index = self.members.to(problem.start.device)
+        self._index = self.episode_indices.to(problem.start.device)
 
     def drop_ended(self, running: Tensor) -> Tensor | None:
-        """Remove ended episodes if a quarter has ended and the planner supports it.
+        """Remove ended episodes if at least a quarter has ended.
+
+        A planner that does not implement `select` keeps all episodes.
 
         Args:
             running: mask of running episodes, bool on the CPU, shape [B].
 
         Returns:
-            Indices of the remaining episodes among the previous ones, int64; None if no
-            episode was removed.
+            Indices of the remaining episodes among those planned so far, int64; None if
+            no episode was removed.
         """
-        remaining = running[self.members].nonzero()[:, 0]
-        if len(remaining) > _MAX_REMAINING * len(self.members):
+        remaining = running[self.episode_indices].nonzero()[:, 0]
+        if len(remaining) > _MAX_REMAINING * len(self.episode_indices):
             return None
         indices = remaining.to(self._index.device)
         state = self._planner.select(self._state, indices)
         if state is NotImplemented:
             return None
         self._state = state
-        self.members = self.members[remaining]
-        self._index = self.members.to(self._index.device)
+        self.episode_indices = self.episode_indices[remaining]
+        self._index = self.episode_indices.to(self._index.device)
         self._part = self._part.select(indices)
         return indices
 
     def part_of(self, values: Tensor) -> Tensor:
-        """Select the values of the remaining episodes from those of all, [B, ...]."""
+        """Return the values of the planned episodes from values of all, [B, ...]."""
         return values[self._index]
 
     def revise(self, problem: Problem, generator: torch.Generator) -> None:
-        """Replan for a changed problem of the remaining episodes."""
+        """Replan for a changed problem of the planned episodes."""
         self._state = revise(self._planner, self._state, problem, generator)
         self._part = problem
 
     def act(self, step: Step) -> Answer:
-        """Return the planner's answer for the remaining episodes."""
+        """Return the planner's answer for the planned episodes."""
         part_step = replace(
             step,
             state=step.state[self._index],
@@ -403,7 +415,10 @@ class _Batch:
         return answer
 
     def spread(self, answer: Answer) -> tuple[Tensor, Tensor, Tensor]:
-        """Return actions, faults and statuses of all episodes, neutral for ended ones."""
+        """Return actions, fault masks and statuses of all episodes, shape [B, ...].
+
+        Episodes that are no longer planned stand still, without a fault.
+        """
         index = self._index
         zeros = torch.zeros(len(self._all), dtype=torch.int64, device=index.device)
         standing = standing_actions(self._all)
@@ -414,16 +429,16 @@ class _Batch:
 
 
 class RobotError(BenchnavError):
-    """A robot's F raised in the simulation, so that no row would be meaningful."""
+    """The robot dynamics F raised in the simulation, so that no row is meaningful."""
 
 
 def _move(
     simulation: Simulation, now: SimulationState, action: Tensor
 ) -> tuple[SimulationState, Tensor, Tensor]:
-    """Return the next states, the observed λ, and the states that λ = 1 would give."""
+    """Return the next state, the observed λ, and the robot states if λ were 1."""
     try:
-        free = simulation.unhindered(now, action)
-        return *simulation.step(now, action), free
+        unhindered = simulation.unhindered(now, action)
+        return *simulation.step(now, action), unhindered
     except GPU_FAULTS as error:
         raise gpu_failed(error) from error
     except Exception as error:

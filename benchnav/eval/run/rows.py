@@ -21,16 +21,17 @@ from benchnav.planning.world.world import Endpoints
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Draws:
-    """Reference values of the maps of a batch and of the λ drawn on them.
+class References:
+    """Reference values of B episodes, from their maps and draws of λ.
 
     Args:
-        reference_time_s: grid reference times at 1 m/s, in seconds, shape [B]; NaN if
-            missing.
-        rejected_draws: number of draws of λ that were rejected before each episode's
-            draw, since they had no feasible path to the goal, length B.
-        lower_bound_s: lower bounds of the time to the goal, in seconds, infinite if no
-            trajectory reaches it, length B; empty if no bound was computed.
+        reference_time_s: grid reference time of each map at 1 m/s, in seconds, shape
+            [B]; NaN if missing.
+        rejected_draws: number of draws of λ that were rejected, since they had no
+            feasible path to the goal, for each episode, length B.
+        lower_bound_s: lower bound of the time to the goal for each episode, in seconds,
+            length B; infinite if no trajectory reaches the goal. Empty if no bound was
+            computed.
     """
 
     reference_time_s: np.ndarray
@@ -39,16 +40,16 @@ class Draws:
 
 
 def finished_episodes(
-    problem: Problem, episodes: Episodes, draws: Draws
+    problem: Problem, episodes: Episodes, references: References
 ) -> list[Episode]:
     """Return each episode of a batch as metrics receive it.
 
     Args:
         problem: the problem of the batch.
         episodes: the episodes of the batch.
-        draws: reference values of their maps and λ.
+        references: reference values of the episodes.
     """
-    # In the precision of the observed λ, in which planners compare.
+    # The threshold has the precision of observed λ, in which planners compare.
     dtype = episodes.traversability.dtype
     above = torch.tensor(problem.task.rules.free_space.above, dtype=dtype)
     n_episodes = len(episodes.steps)
@@ -58,7 +59,9 @@ def finished_episodes(
     for b in range(n_episodes):
         steps = int(episodes.steps[b])
         outcome = Outcome(int(episodes.outcome[b]))
-        lower_bound_s = draws.lower_bound_s[b] if len(draws.lower_bound_s) else np.nan
+        lower_bound_s = (
+            references.lower_bound_s[b] if len(references.lower_bound_s) else np.nan
+        )
         episode = Episode(
             states=_float64(episodes.states[b, : steps + 1]),
             actions=_float64(episodes.actions[b, :steps]),
@@ -69,7 +72,7 @@ def finished_episodes(
             outcome=outcome.name.lower(),
             dt_s=problem.dt_s,
             time_budget_s=float(problem.time_budget_s[b]),
-            reference_time_s=float(draws.reference_time_s[b]),
+            reference_time_s=float(references.reference_time_s[b]),
             goal_m=_float64(problem.goal_m[b]),
             goal_radius_m=problem.goal_radius_m,
             stuck_traversability=float(above),
@@ -77,17 +80,17 @@ def finished_episodes(
             planning_s=_float64(planning_s[:steps]),
             preparing_s=preparing_s,
             learning=_learning(episodes, b),
-            rejected_draws=draws.rejected_draws[b],
+            rejected_draws=references.rejected_draws[b],
             lower_bound_s=lower_bound_s,
         )
         finished.append(episode)
     return finished
 
 
-def unbegun_episodes(
+def episodes_without_steps(
     task: Task, endpoints: Endpoints, time_budget_s: Tensor, outcome: Outcome
 ) -> list[Episode]:
-    """Return episodes without a step, for example because their model failed.
+    """Return episodes without steps, for a unit whose model failed.
 
     Args:
         task: task of all episodes.
@@ -100,7 +103,7 @@ def unbegun_episodes(
     starts = robot.initial_state(poses)
     no_steps = np.empty(0)
     no_actions = np.empty((0, len(robot.action_names)))
-    unbegun = []
+    episodes = []
     for start, goal_m, budget_s in zip(
         starts, endpoints.goal_m, time_budget_s, strict=True
     ):
@@ -122,8 +125,8 @@ def unbegun_episodes(
             planning_s=no_steps,
             preparing_s=np.nan,
         )
-        unbegun.append(episode)
-    return unbegun
+        episodes.append(episode)
+    return episodes
 
 
 def _float64(values: Tensor) -> np.ndarray:
@@ -131,20 +134,20 @@ def _float64(values: Tensor) -> np.ndarray:
     return np.array(values.cpu().double().numpy())
 
 
-def _learning(episodes: Episodes, member: int) -> LearningRecord | None:
-    """Return the record of learning of one episode; None if robots do not learn."""
+def _learning(episodes: Episodes, episode_index: int) -> LearningRecord | None:
+    """Return the learning record of an episode; None if robots do not learn."""
     seen_cells = episodes.seen_cells
     sensed_cells = episodes.sensed_cells
     if episodes.ahead is None or seen_cells is None or sensed_cells is None:
         return None
-    steps = int(episodes.steps[member])
+    steps = int(episodes.steps[episode_index])
     n_planned = int(episodes.planned.sum())
     step_s = episodes.learning_s / n_planned if n_planned else np.nan
     return LearningRecord(
-        revisions=int(episodes.revisions[member]),
-        seen_cells=int(seen_cells[member]),
-        sensed_cells=int(sensed_cells[member]),
-        ahead=_float64(episodes.ahead[member, :steps]),
+        revisions=int(episodes.revisions[episode_index]),
+        seen_cells=int(seen_cells[episode_index]),
+        sensed_cells=int(sensed_cells[episode_index]),
+        ahead=_float64(episodes.ahead[episode_index, :steps]),
         step_s=step_s,
     )
 
@@ -162,7 +165,7 @@ def episode_rows(
         unit: the unit, with its metrics in addition to the built-in ones.
         groups: group index of each map, shape [B].
         finished: episodes of the unit, length B.
-        errors: message of each episode's fault in one line; empty if it had no fault.
+        errors: error of each episode in one line, length B; empty without an error.
         compiled: whether the planner ran compiled.
 
     Returns:
@@ -171,7 +174,7 @@ def episode_rows(
         of the unit's further metrics.
 
     Raises:
-        MetricError: If a metric raises, or returns an infinite number or no number.
+        MetricError: If a metric raises, or returns an infinite value or no number.
     """
     further = [part.create() for part in unit.metrics]
     rows = []
@@ -189,14 +192,14 @@ def episode_rows(
                 f"{unit.condition.description}, seed {unit.seed}, realisation "
                 f"{unit.realisation}, map {map_index}"
             )
-            message = f"{fault} It was given an episode of {origin}."
+            message = f"{fault} The episode is one of {origin}."
             raise MetricError(message) from fault
         rows.append(row)
     return _identities(unit, groups).join(pd.DataFrame(rows))
 
 
 def _identities(unit: Unit, groups: np.ndarray) -> pd.DataFrame:
-    """Return the columns that identify the unit's episodes, one row each."""
+    """Return the columns that identify the episodes of a unit, one row per episode."""
     columns: dict[str, Any] = {"condition": unit.condition.id}
     columns |= unit.condition.labels
     columns["seed"] = unit.seed
@@ -207,7 +210,7 @@ def _identities(unit: Unit, groups: np.ndarray) -> pd.DataFrame:
 
 
 def step_table(unit: Unit, problem: Problem, episodes: Episodes) -> pa.Table:
-    """Tabulate driven paths, one row for each step and one for the last state.
+    """Tabulate the steps of episodes: one row for each step and for the last state.
 
     Args:
         unit: unit that was run.
@@ -216,9 +219,9 @@ def step_table(unit: Unit, problem: Problem, episodes: Episodes) -> pa.Table:
 
     Returns:
         `seed`, `realisation`, `map`, `step`, `time_s`, `x_m`, `y_m`, `heading_rad`; a
-        column for each action; if robots learn, `AHEAD_COLUMNS` (NaN except at
-        updates); and observed `traversability`. Actions and `traversability` are NaN at
-        the last state.
+        column for each action dimension; if robots learn, `AHEAD_COLUMNS` (NaN except
+        at updates); and observed `traversability`. Actions and `traversability` are NaN
+        at the last state.
     """
     step_axis = np.arange(episodes.states.shape[1])
     n_steps = episodes.steps.numpy()[:, None]
@@ -227,8 +230,8 @@ def step_table(unit: Unit, problem: Problem, episodes: Episodes) -> pa.Table:
     step = np.broadcast_to(step_axis, is_row.shape)[is_row]
     n_rows = len(step)
 
-    def of_steps(values: Tensor) -> np.ndarray:
-        """Return one value a row, NaN at the last state of each episode."""
+    def step_values(values: Tensor) -> np.ndarray:
+        """Return one value per row; NaN at the last state of each episode."""
         numbers = values.numpy().astype(np.float32)
         padded = np.pad(numbers, ((0, 0), (0, 1)))
         return np.where(is_step, padded, np.float32(np.nan))[is_row]
@@ -243,9 +246,9 @@ def step_table(unit: Unit, problem: Problem, episodes: Episodes) -> pa.Table:
         numbers = episodes.states[..., index].numpy()
         columns[name] = numbers.astype(np.float32)[is_row]
     for index, name in enumerate(problem.robot.action_names):
-        columns[name] = of_steps(episodes.actions[..., index])
+        columns[name] = step_values(episodes.actions[..., index])
     if episodes.ahead is not None:
         for index, name in enumerate(AHEAD_COLUMNS):
-            columns[name] = of_steps(episodes.ahead[..., index])
-    columns[LAST_COLUMN] = of_steps(episodes.traversability)
+            columns[name] = step_values(episodes.ahead[..., index])
+    columns[LAST_COLUMN] = step_values(episodes.traversability)
     return pa.table(columns)

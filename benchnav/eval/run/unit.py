@@ -1,7 +1,7 @@
 """Running a unit of work: its maps, problem, simulation, episodes and files.
 
-Only the unit's block of maps is read and predicted. A process reuses the prediction for
-all planners and risk settings of the block.
+Only the unit's block of maps is read and predicted. A process reuses the prediction of
+a block for all planners and risk settings.
 """
 
 import traceback
@@ -34,11 +34,11 @@ from benchnav.eval.run.knowledge import Learning
 from benchnav.eval.run.recorder import Recorder
 from benchnav.eval.run.rollout import Episodes, Observer, run_episodes
 from benchnav.eval.run.rows import (
-    Draws,
+    References,
     episode_rows,
+    episodes_without_steps,
     finished_episodes,
     step_table,
-    unbegun_episodes,
 )
 from benchnav.models.base import predict
 from benchnav.models.predictor import Clairvoyant, loaded, nugget_of
@@ -64,7 +64,8 @@ class Settings:
     """Settings of units.
 
     Args:
-        planner_limit_s: time limit of each call of a planner; 0 for none.
+        planner_limit_s: time limit of each call of a planner in seconds; 0 for no
+            limit.
         device: device of all computation, "cpu" or "cuda".
     """
 
@@ -73,11 +74,11 @@ class Settings:
 
     @classmethod
     def on(cls, device: str, planner_limit_s: float = 0.0) -> "Settings":
-        """Return the settings for "cpu", "cuda", or "auto": CUDA if there is a GPU."""
+        """Return the settings for a device: "cpu", "cuda", or "auto" (CUDA if any)."""
         return cls(planner_limit_s=planner_limit_s, device=find_device(device).type)
 
     def origins(self) -> Origins:
-        """Return the origins of units under these settings."""
+        """Return the current origins of units with these settings."""
         return Origins(self.planner_limit_s, self.device)
 
 
@@ -91,7 +92,7 @@ def run_unit(unit: Unit, folder: Path, origin: Origin, settings: Settings) -> No
         settings: settings of the run.
 
     Raises:
-        ConfigError: If its code or its maps have changed since.
+        ConfigError: If the unit's code or maps have changed since the run was begun.
     """
     _check_origin(unit, origin, settings)
     clear_unit(folder, unit)
@@ -99,34 +100,34 @@ def run_unit(unit: Unit, folder: Path, origin: Origin, settings: Settings) -> No
     with one_thread():
         block = read_block(unit, origin, device)
         try:
-            built = build(unit, origin, device)
+            inputs = build(unit, origin, device)
         except KnowledgeError as error:
             rows = _failed_rows(unit, block, error)
             write_unit(folder, unit, origin, rows, [str(error)], traceback.format_exc())
             return
-        problem = built.problem
-        simulation = built.simulation
-        watched = unit.watched()
-        recorder = Recorder(unit, problem, simulation, block.terrain, watched)
-        observer = recorder.observer if watched else Observer()
-        episodes, compiled = simulate(unit, built, settings, observer=observer)
+        problem = inputs.problem
+        simulation = inputs.simulation
+        recordable = unit.possibly_recorded()
+        recorder = Recorder(unit, problem, simulation, block.terrain, recordable)
+        observer = recorder.observer if recordable else Observer()
+        episodes, compiled = simulate(unit, inputs, settings, observer=observer)
         bounds_s = None
-        if not all(episodes.errors):  # such as those of a planner that was not created
-            bounds_s = _lower_bounds_s(unit, built)
+        if not all(episodes.errors):  # e.g. all fail if the planner cannot be created
+            bounds_s = _lower_bounds_s(unit, inputs)
     succeeded = (episodes.outcome == Outcome.SUCCESS).tolist()
-    for member in unit.recorded(succeeded):
-        recording = recorder.recording(episodes, member)
-        recording.save(folder / unit.recording_path(member))
+    for episode_index in unit.recorded(succeeded):
+        recording = recorder.recording(episodes, episode_index)
+        recording.save(folder / unit.recording_path(episode_index))
     if unit.record != "none":
         steps = step_table(unit, problem, episodes)
         write_steps(folder, unit, origin.key(unit), steps)
     rejected = simulation.attempts - 1
-    draws = Draws(
-        reference_time_s=block.places.reference_time_s.cpu().numpy(),
+    references = References(
+        reference_time_s=block.endpoints.reference_time_s.cpu().numpy(),
         rejected_draws=rejected.tolist(),
         lower_bound_s=bounds_s or (),
     )
-    finished = finished_episodes(problem, episodes, draws)
+    finished = finished_episodes(problem, episodes, references)
     rows = episode_rows(unit, block.groups, finished, episodes.errors, compiled)
     errors = sorted({error for error in episodes.errors if error})
     write_unit(folder, unit, origin, rows, errors, episodes.traceback)
@@ -136,11 +137,11 @@ def _failed_rows(unit: Unit, block: "Block", error: KnowledgeError) -> pd.DataFr
     """Return the rows of a unit whose model, sensor or belief failed at the start."""
     task = unit.condition.task
     budgets_s = unit.condition.world.budget_s(
-        block.places.reference_time_s, task.robot.top_speed_mps
+        block.endpoints.reference_time_s, task.robot.top_speed_mps
     )
-    unbegun = unbegun_episodes(task, block.places, budgets_s, error.outcome)
-    errors = [str(error)] * len(unbegun)
-    return episode_rows(unit, block.groups, unbegun, errors, compiled=False)
+    episodes = episodes_without_steps(task, block.endpoints, budgets_s, error.outcome)
+    errors = [str(error)] * len(episodes)
+    return episode_rows(unit, block.groups, episodes, errors, compiled=False)
 
 
 def _check_origin(unit: Unit, origin: Origin, settings: Settings) -> None:
@@ -151,55 +152,56 @@ def _check_origin(unit: Unit, origin: Origin, settings: Settings) -> None:
         changed.append(f"maps of {unit.condition.data} {unit.condition.split}")
     if changed or now != origin:
         raise ConfigError(
-            "Expected the code and the maps that the run was begun with, got "
-            f"changes: {'; '.join(changed)}. "
-            "Give the run's command again; finished units are kept."
+            "Expected the code and the maps with which the run was begun, got "
+            f"changes: {'; '.join(changed)}. Run the run's command again; finished "
+            "units are kept."
         )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Block:
-    """A block of maps; compared by identity, so that its prediction can be cached.
+    """A block of B maps; equality is identity, so that a prediction can be cached.
 
     Args:
         terrain: the true maps.
-        places: starts, goals and grid reference times.
-        groups: group index of each map, equal for overlapping maps, int64, shape [B].
+        endpoints: starts, goals and grid reference times.
+        groups: group index of each map, int64, shape [B]; overlapping maps have the
+            same index.
     """
 
     terrain: Terrain
-    places: Endpoints
+    endpoints: Endpoints
     groups: np.ndarray
 
     def to(self, device: torch.device) -> "Block":
         """Return the block on a device."""
         return replace(
-            self, terrain=self.terrain.to(device), places=self.places.to(device)
+            self, terrain=self.terrain.to(device), endpoints=self.endpoints.to(device)
         )
 
 
 def read_maps(dataset: TerrainDataset, split: str, maps: Sequence[int]) -> Block:
-    """Read some maps of a split; without stored groups, each map is a group."""
-    places = dataset.read(split, maps, ["start_m", "goal_m", "reference_time_s"])
+    """Read maps of a split; if no groups are stored, each map is a group."""
+    endpoints = dataset.read(split, maps, ["start_m", "goal_m", "reference_time_s"])
     groups: Any = maps
     if "group" in dataset.field_names:
         groups = dataset.read(split, maps, ["group"])["group"]
-    tensors = {name: torch.from_numpy(values) for name, values in places.items()}
+    tensors = {name: torch.from_numpy(values) for name, values in endpoints.items()}
     return Block(
         terrain=dataset.terrain(split, maps),
-        places=Endpoints(**tensors),
+        endpoints=Endpoints(**tensors),
         groups=np.asarray(groups, dtype=np.int64).reshape(-1),
     )
 
 
 def read_block(unit: Unit, origin: Origin, device: torch.device = CPU) -> Block:
-    """Return a unit's maps and endpoints on a device, cached for other settings."""
+    """Return a unit's maps and endpoints on a device, cached for later units."""
     condition = unit.condition
     return _block(condition.data, condition.split, unit.maps, origin.maps, device)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Built:
+class UnitInputs:
     """Inputs of a unit's episodes.
 
     Args:
@@ -213,28 +215,28 @@ class Built:
     learning: Learning | None
 
 
-def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> Built:
+def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> UnitInputs:
     """Create the problem, the simulation and the initial knowledge of a unit.
 
     Args:
         unit: unit whose episodes are run.
-        origin: origin of the unit, which cached predictions depend on.
+        origin: origin of the unit; its digests of maps are keys of the cache.
         device: device of all computation.
 
     Raises:
         KnowledgeError: If a sensor, the model, the belief or the risk measure failed.
         DeviceError: If the GPU failed.
-        BenchnavError: If data cannot be read, or are insufficient for the world.
+        BenchnavError: If the maps cannot be read, or lack data that the world needs.
     """
     condition = unit.condition
     block = read_block(unit, origin, device)
     task = condition.task
     noise = noise_key(unit.seed, condition.split, unit.realisation)
     simulation = Simulation(
-        block.terrain, task, condition.world, block.places, noise, unit.maps
+        block.terrain, task, condition.world, block.endpoints, noise, unit.maps
     )
-    start_m = block.places.start_m
-    goal_m = block.places.goal_m
+    start_m = block.endpoints.start_m
+    goal_m = block.endpoints.goal_m
     try:
         learner = _learner(condition, block)
         field = block.terrain.traversability
@@ -268,7 +270,7 @@ def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> Built:
     except GPU_FAULTS as error:
         raise gpu_failed(error) from error
     if not condition.learns:
-        return Built(problem=problem, simulation=simulation, learning=None)
+        return UnitInputs(problem=problem, simulation=simulation, learning=None)
     is_resampled = simulation.field is None
     learning = Learning(
         learner=learner,
@@ -276,11 +278,11 @@ def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> Built:
         truth=truth,
         field_at=simulation.field_at if is_resampled else None,
     )
-    return Built(problem=problem, simulation=simulation, learning=learning)
+    return UnitInputs(problem=problem, simulation=simulation, learning=learning)
 
 
 def _learner(condition: Condition, block: Block) -> Learner:
-    """Return the sensing and belief of a unit's robots."""
+    """Return the sensors and the belief of a unit's robots."""
     dataset = condition.dataset
     world = condition.world
     sensor = call_user_code(Outcome.SENSOR_ERROR, condition.sensor.create)
@@ -311,35 +313,35 @@ def _learner(condition: Condition, block: Block) -> Learner:
 def _predict(
     model_key: str, block: Block, field: Tensor | None
 ) -> TraversabilityDistribution:
-    """Return the prediction of a block, cached unless the model is given λ."""
+    """Return the prediction of a block, cached unless the model receives λ."""
     model = loaded(model_key)
     if not isinstance(model, Clairvoyant):
         return _prediction(model_key, block)
-    assert field is not None  # suites with resampled λ are rejected
+    assert field is not None  # `check_suite` leaves out resampled λ
     return predict(model, replace(block.terrain, traversability=field))
 
 
 def noise_key(seed: int, split: str, realisation: int) -> int:
-    """Return the simulation's noise key, equal for all conditions.
+    """Return the simulation's noise key, which is the same for all conditions.
 
-    Conditions are thus compared under common random numbers.
+    Conditions are thus compared with common random numbers.
     """
     return rng.stream_key(seed, "simulation", *_draw(split, realisation))
 
 
 def _draw(split: str, realisation: int) -> tuple[str | int, ...]:
-    """Return the stream keys of a draw of λ; realisation 0 adds no key."""
+    """Return the stream keys of a draw of λ: split, and realisation unless it is 0."""
     return (split, realisation) if realisation else (split,)
 
 
 def simulate(
-    unit: Unit, built: Built, settings: Settings, **options: Any
+    unit: Unit, inputs: UnitInputs, settings: Settings, **options: Any
 ) -> tuple[Episodes, bool]:
-    """Run a unit's episodes, and return them and whether the planner ran compiled.
+    """Run a unit's episodes; return them, and whether the planner ran compiled.
 
     Args:
         unit: unit whose episodes are run.
-        built: inputs of its episodes.
+        inputs: inputs of its episodes.
         settings: settings with the time limit of planners.
         **options: further arguments of `run_episodes`.
     """
@@ -354,27 +356,28 @@ def simulate(
                 planner = condition.planner.create()
         except (Exception, SystemExit) as error:
             planner = _FailedPlanner(error)
-        # Keyed by seed and split, never by the batch.
+        # The key depends on seed and split, not on the batch.
         draw = _draw(condition.split, unit.realisation)
         key = rng.stream_key(unit.seed, "planner", *draw)
         episodes = run_episodes(
             planner,
-            built.problem,
-            built.simulation,
+            inputs.problem,
+            inputs.simulation,
             rng.generator(key),
-            learning=built.learning,
+            learning=inputs.learning,
             **options,
         )
     return episodes, bool(planner.compiled)
 
 
-def _lower_bounds_s(unit: Unit, built: Built) -> list[float] | None:
-    """Return lower bounds of the time to the goal if the planner is given λ.
+def _lower_bounds_s(unit: Unit, inputs: UnitInputs) -> list[float] | None:
+    """Return lower bounds of the time to the goal, in seconds.
 
-    None if the planner is not given λ, or the robot or the world has no such bound.
+    The result is None if the planner is not given λ, or if no bound exists for the
+    robot or the world.
     """
-    problem = built.problem
-    field = built.simulation.field
+    problem = inputs.problem
+    field = inputs.simulation.field
     condition = unit.condition
     has_bound = field is not None and type(problem.robot) in BOUNDED_ROBOTS
     if not has_bound or condition.model.part != "clairvoyant":
@@ -398,7 +401,7 @@ def _lower_bounds_s(unit: Unit, built: Built) -> list[float] | None:
 
 
 class _FailedPlanner(Planner[None]):
-    """Substitute for a planner that could not be created, which raises its error."""
+    """Substitute for a planner that could not be created; it raises the error."""
 
     def __init__(self, error: BaseException) -> None:
         self.error = error
@@ -421,7 +424,7 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-# Caches are keyed by digests, so that changed maps and models are read again.
+# Keys of the caches contain digests, so that changed maps and models are read again.
 
 
 @lru_cache(maxsize=2)

@@ -1,6 +1,6 @@
 """The best condition of each block, and the conditions that are significantly worse.
 
-The test is that of `benchnav.stats.best`.
+`benchnav.stats.best` defines the test.
 """
 
 from collections.abc import Mapping
@@ -16,9 +16,9 @@ from benchnav.stats.by_map import alike
 from benchnav.stats.holm import ALPHA
 from benchnav.stats.intervals import success_interval
 
-# Conditions of a block have the same task, maps and noise.
+# Columns that define a block: its conditions have the same task, maps and noise.
 BLOCK = ("data", "scenario", "world", "robot", "objective")
-# Privileged models; the model that is given most comes first.
+# Models that receive part of the truth; the model that receives most comes first.
 PRIVILEGED = ("clairvoyant", "oracle", "ideal")
 
 _COLUMNS = (
@@ -38,13 +38,13 @@ _COLUMNS = (
 
 
 def privileged_models(conditions: Mapping[str, Any]) -> dict[str, str]:
-    """Return the privileged models of conditions: models given part of the truth.
+    """Return the models of conditions that receive part of the truth.
 
     Args:
         conditions: entries of `run.json` by id.
 
     Returns:
-        Names in `PRIVILEGED`, by the id of each condition with such a model.
+        Names in `PRIVILEGED`, by the id of each condition with a privileged model.
     """
     privileged = {}
     for condition, entry in conditions.items():
@@ -56,10 +56,10 @@ def privileged_models(conditions: Mapping[str, Any]) -> dict[str, str]:
 
 
 def competing(rows: pd.DataFrame) -> pd.Series:
-    """Return a mask of the conditions of a block that compete for the best.
+    """Return a mask of the conditions of a block that compete to be the best.
 
-    A privileged model is only a reference, unless no other condition of the block uses
-    a prediction.
+    A condition with a privileged model is only a reference, unless no other condition
+    of the block uses a prediction.
 
     Args:
         rows: summary of one block, with `privileged` as in `against_best`.
@@ -80,33 +80,34 @@ def against_best(
     summary: pd.DataFrame,
     privileged: Mapping[str, str] | None = None,
 ) -> pd.DataFrame:
-    """Compare the competing conditions of each block per map with the best.
+    """Compare the competing conditions of each block with the best condition, per map.
 
-    All are compared on the episodes that they have in common, so that a condition with
-    more maps is compared on the same maps as the others. The best condition has the
-    highest success rate on these episodes; ties are decided by the lower mean T_total.
+    The conditions of a block are compared on their common episodes, so that all have
+    the same maps. The best condition has the highest success rate on these episodes;
+    ties are decided by the lower mean T_total.
 
     Args:
         episodes: rows of episodes.
-        summary: their summary, from `summary.summarise`.
+        summary: summary of the episodes, from `summary.summarise`.
         privileged: names from `privileged_models`; by default no model is privileged.
 
     Returns:
-        One row per condition, in the order of the summary, with the columns below. They
-        are NaN if the condition does not compete, or if it is the best itself.
+        One row per condition, in the order of the summary, with the columns below.
+        Values that compare the condition with the best are NaN if the condition does
+        not compete or is the best.
 
-        - `condition`; `privileged`, its name in `PRIVILEGED` or empty; `best`, the best
-          condition of its block.
-        - `best_rivals`, the number of other competitors; `best_episodes`, the number of
-          common episodes; `best_maps`, the number of their maps, where a group counts
-          as one.
-        - `best_difference`, by which the success rate of the best is higher, with the
-          uncorrected 95 % interval of this pair, `best_low`, `best_high`; `best_p`,
-          from `best_set_p`; `best_shown`, the minimum detectable difference with 80 %
-          power.
+        - `condition`; `privileged`, its model in `PRIVILEGED` or empty; `best`, the id
+          of the best condition of the block.
+        - `best_rivals`, the number of other competing conditions; `best_episodes`, the
+          number of common episodes; `best_maps`, the number of maps of these episodes,
+          or of groups of maps.
+        - `best_difference`, the success rate of the best minus that of the condition,
+          with its uncorrected 95 % interval `best_low`, `best_high`; `best_p`, the
+          p-value from `best_set_p`; `best_shown`, the minimum detectable difference
+          with 80 % power.
         - `best_alike`, true if the condition competes and is not significantly worse
-          than the best; `best_marked`, true if it is alike and another condition of its
-          block is significantly worse.
+          than the best; `best_marked`, true if also some condition of the block is
+          significantly worse.
     """
     groups = dict(list(episodes.groupby("condition", sort=False)))
     model_names = summary["condition"].map(privileged or {})
@@ -114,12 +115,12 @@ def against_best(
     table_rows: list[dict[str, Any]] = []
     for _, rows in summary.groupby(list(BLOCK), sort=False, dropna=False):
         rivals = rows.loc[competing(rows), "condition"]
-        of_block, compared = _compare({name: groups[name] for name in rivals})
+        block_columns, compared = _compare({name: groups[name] for name in rivals})
         alike_flags = [columns["best_alike"] for columns in compared.values()]
         some_worse = not all(alike_flags)
         for condition in rows["condition"]:
             columns = compared.get(condition, {"best_alike": False})
-            row = {"condition": condition, **of_block, **columns}
+            row = {"condition": condition, **block_columns, **columns}
             row["best_marked"] = columns["best_alike"] and some_worse
             table_rows.append(row)
     table = pd.DataFrame(table_rows).reindex(columns=_COLUMNS)
@@ -131,28 +132,32 @@ def against_best(
 def _compare(
     rivals: Mapping[str, pd.DataFrame],
 ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-    """Return the columns of `against_best` for the block, and for each condition."""
+    """Return the columns of `against_best` for a block, and by condition.
+
+    Args:
+        rivals: rows of episodes by id of each competing condition.
+    """
     common = on_common_draws(rivals)
     has_no_draws = any(rows.empty for rows in common.values())
     rows_of = rivals if has_no_draws else common
-    names = sorted(rows_of)  # ties are in the order of digests
+    names = sorted(rows_of)  # remaining ties are decided by id
     times = np.array([rows_of[name]["total_time_s"].mean() for name in names])
     mean_s = dict(zip(names, alike(times, times.max()), strict=True))
     rates = {name: rows_of[name]["success"].mean() for name in names}
     best, *others = sorted(names, key=lambda name: (-rates[name], mean_s[name]))
     n_episodes = len(rows_of[best])
     n_maps = rows_of[best]["group"].nunique()
-    of_block = {
+    block_columns = {
         "best": best,
         "best_rivals": len(others),
         "best_episodes": n_episodes,
         "best_maps": n_maps,
     }
-    of_conditions: dict[str, dict[str, Any]] = {best: {"best_alike": True}}
-    if has_no_draws:  # nothing to compare
+    by_condition: dict[str, dict[str, Any]] = {best: {"best_alike": True}}
+    if has_no_draws:  # no common episode to compare
         for condition in others:
-            of_conditions[condition] = {"best_alike": True, "best_p": 1.0}
-        return of_block, of_conditions
+            by_condition[condition] = {"best_alike": True, "best_p": 1.0}
+        return block_columns, by_condition
     wins = []
     for condition in (best, *others):
         by_group = rows_of[condition].groupby("group")["success"]
@@ -170,5 +175,5 @@ def _compare(
             columns["best_low"] = float(low)
             columns["best_high"] = float(high)
             columns["best_shown"] = detectable[index]
-        of_conditions[condition] = columns
-    return of_block, of_conditions
+        by_condition[condition] = columns
+    return block_columns, by_condition

@@ -35,20 +35,20 @@ def compare(pairs: Sequence[Pair], difference: float = 0.05) -> pd.DataFrame:
     Returns:
         One row per pair, with these columns:
 
-        - Common labels; `one`, `other`; `n_maps`; `n_groups`, the number of statistical
-          units, equal to `n_maps` unless maps are grouped; `n_episodes` of each
-          condition.
-        - `success_one`, `success_other`; `success_difference` with its 95 % interval
-          `success_low`, `success_high`; `success_p`, and `success_p_holm` after Holm's
-          correction; `success_detectable`, the minimum detectable difference with 80 %
-          power, and `maps_needed` for `difference`, both at the level of the first step
-          of Holm's correction.
-        - `time_difference_s`, `time_low_s`, `time_high_s`, `time_p` and `time_p_holm`
-          of T_total, where a failure counts as T. If T differs between the conditions
-          of any pair, all times are fractions of T and end in `_share`, since failures
-          would otherwise be penalised differently.
-        - `arrival_time_…` over episodes in which both conditions reach the goal. There
-          is no test, since both conditions select these episodes.
+        - common labels; `one` and `other`, the labels of the pair; `n_maps`;
+          `n_groups`, the number of statistical units, which is `n_maps` unless maps are
+          grouped; `n_episodes`, the number of episodes of each condition.
+        - `success_one`, `success_other`, the success rates; `success_difference` with
+          its 95 % interval `success_low`, `success_high`; `success_p`, and
+          `success_p_holm` after Holm's correction; `success_detectable`, the minimum
+          detectable difference with 80 % power, and `maps_needed`, the number of maps
+          for `difference`, both at the level of the first step of Holm's correction.
+        - `time_difference_s`, `time_low_s`, `time_high_s`, `time_p` and `time_p_holm`,
+          the same for T_total, where a failure counts as T. If T differs between the
+          conditions of any pair, all times are fractions of T and these columns end in
+          `_share`, since failures would otherwise be penalised differently.
+        - `arrival_time_…`, the same over episodes in which both conditions reach the
+          goal. There is no test, since the outcomes select these episodes.
     """
     alpha = ALPHA / len(pairs)
     as_fractions = any(budgets_differ(pair.episodes) for pair in pairs)
@@ -68,9 +68,9 @@ def compare_by(pairs: Sequence[Pair], quantity: Quantity) -> pd.DataFrame:
         quantity: the compared quantity.
 
     Returns:
-        One row per pair: common labels, `one`, `other`; `n_maps`, `n_groups`,
-        `n_episodes` of each condition; `metric`; `unit` of the following columns;
-        `mean_one`, `mean_other`, `difference` with its 95 % interval `low`, `high`; `p`
+        One row per pair: common labels, `one`, `other`, `n_maps`, `n_groups` and
+        `n_episodes`, as in `compare`; `metric`; `unit` of the following columns;
+        `mean_one`, `mean_other`; `difference` with its 95 % interval `low`, `high`; `p`
         of a sign-flip test, and `p_holm` after Holm's correction. The difference and
         its interval are NaN without episodes.
     """
@@ -87,7 +87,7 @@ def compare_by(pairs: Sequence[Pair], quantity: Quantity) -> pd.DataFrame:
 
 
 def _labels(pair: Pair, episodes: pd.DataFrame) -> dict[str, Any]:
-    """Return the columns that identify a row, and its numbers of maps and episodes."""
+    """Return the labels of a pair, and its numbers of maps, groups and episodes."""
     return {
         **pair.shared,
         "one": pair.one,
@@ -99,7 +99,7 @@ def _labels(pair: Pair, episodes: pd.DataFrame) -> dict[str, Any]:
 
 
 def _corrected(rows: Sequence[Mapping[str, Any]], *names: str) -> pd.DataFrame:
-    """Return the table of rows, with Holm-corrected copies of columns of p-values."""
+    """Return the table of rows, with a Holm-corrected copy of each column in `names`."""
     table = pd.DataFrame(rows)
     corrected = {f"{name}_holm": holm(table[name].to_numpy()) for name in names}
     return table.assign(**corrected)
@@ -113,8 +113,8 @@ def _compare(
     time_interval = interval_of(timed, "total_time_s")
     gain, draws = gain_by_map(rows)
     std = float(standard_deviation(gain, draws))
-    both_arrived = rows["success"] & rows["success_other"]
-    arrival_differences = mean_differences(rows[both_arrived])
+    both_succeeded = rows["success"] & rows["success_other"]
+    arrival_differences = mean_differences(rows[both_succeeded])
     mean, low, high = map(float, mean_interval(arrival_differences))
     row: dict[str, Any] = {}
     row["success_one"] = rows["success"].mean()
@@ -131,11 +131,11 @@ def _compare(
 
 
 def named(name: str, interval: Interval, unit: str = "") -> dict[str, float]:
-    """Return a difference and the ends of its interval, by column.
+    """Return a difference and the limits of its interval, by column.
 
     Args:
         name: start of the columns, such as `time`.
-        interval: difference, lower and upper end.
+        interval: difference, lower limit and upper limit.
         unit: end of the columns, such as `_s`.
     """
     difference, low, high = interval

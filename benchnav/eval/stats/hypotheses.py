@@ -1,7 +1,8 @@
-"""Tests of the hypotheses that a suite fixed, per map.
+"""Tests per map of the hypotheses that a suite fixes.
 
-A difference is tested by sign flips, other kinds of hypotheses by a margin
-(`benchnav.stats.margins`). Holm's correction covers all hypotheses of a run.
+A difference is tested by sign flips. Other kinds of hypotheses are tested by intervals
+and a margin (`benchnav.stats.margins`). Holm's correction covers all hypotheses of a
+run.
 """
 
 from collections.abc import Mapping
@@ -31,22 +32,21 @@ def test_hypotheses(
     """Test the hypotheses of a run.
 
     Args:
-        fixed: hypotheses from `fix_hypotheses`.
+        fixed: entry of hypotheses from `fix_hypotheses`.
         episodes: all rows of the run.
-        worlds: world of each condition, by id.
-        is_whole: whether the run is finished. If not, differences and intervals are
-            computed on common episodes, and `p`, `p_holm` are NaN, since a hypothesis
-            must be tested only once.
+        worlds: world of each condition by id, as in `run.json`.
+        is_whole: whether the run is finished. If it is not, `p` and `p_holm` are NaN,
+            since a hypothesis must be tested only once.
         quantities: quantities by which conditions are compared, by name.
 
     Returns:
-        One row per hypothesis: all fields of `Hypothesis` and `claim`; `unit` of the
-        following columns; `n_maps`, where a group counts as one; `n_episodes` of each
-        condition; `mean_one`, `mean_other` and their `difference`, `one` minus `other`,
-        with the ends of its 95 % and 90 % intervals, `low`, `high`, `low_90`,
-        `high_90`; `p`, and `p_holm` after Holm's correction; and `supported`, true if
-        `p_holm` is below 0.05. With fewer than `stats.bootstrap.LEAST_MAPS` maps, only
-        a difference in success has an interval.
+        One row per hypothesis: all fields of `Hypothesis`, `names` and `claim`; `unit`
+        of the following columns; `n_maps`, the number of maps, or of groups of maps;
+        `n_episodes` of each condition; `mean_one`, `mean_other`; `difference`, `one`
+        minus `other`; the limits `low`, `high` of its 95 % interval and `low_90`,
+        `high_90` of its 90 % interval; `p`, and `p_holm` after Holm's correction; and
+        `supported`, true if `p_holm` is below 0.05. With fewer than
+        `stats.bootstrap.LEAST_MAPS` maps, only a difference in success has an interval.
     """
     rows = dict(list(episodes.groupby("condition", sort=False)))
     table_rows = []
@@ -57,9 +57,9 @@ def test_hypotheses(
         test = Hypothesis(**fields)
         sides = []
         for condition in (test.one, test.other):
-            of_condition = rows.get(condition, episodes.iloc[:0])
-            budgets = time_budgets(of_condition, worlds[condition])
-            sides.append(of_condition.assign(time_budget_s=budgets))
+            side_rows = rows.get(condition, episodes.iloc[:0])
+            budgets = time_budgets(side_rows, worlds[condition])
+            sides.append(side_rows.assign(time_budget_s=budgets))
         first, second = sides
         quantity = quantities[test.metric]
         paired = comparable(first, second, quantity)
@@ -87,28 +87,28 @@ def comparable(
     """Return the episodes in which two conditions can be compared, side by side.
 
     Args:
-        first: rows of a condition, each with its T as `time_budget_s`.
-        second: rows of the other condition, likewise.
+        first: rows of the first condition, with T as `time_budget_s`.
+        second: rows of the second condition, with T as `time_budget_s`.
         quantity: the compared quantity.
 
     Returns:
-        The episodes in which both have a value and, for a quantity `of_arrivals`, both
-        reached the goal; columns as in `side_by_side`.
+        The episodes in which both conditions have a value and, for a quantity
+        `of_arrivals`, both reach the goal; columns as in `side_by_side`.
     """
     column = quantity.column
     measures = dict.fromkeys(["success", "total_time_s", "time_budget_s", column])
     paired = side_by_side(first, second, [*measures])
     if quantity.of_arrivals:
-        both_arrived = paired["success"] & paired["success_other"]
-        paired = paired[both_arrived]
+        both_succeeded = paired["success"] & paired["success_other"]
+        paired = paired[both_succeeded]
     return paired.dropna(subset=[column, f"{column}_other"])
 
 
 def means_and_difference(quantity: Quantity, rows: pd.DataFrame) -> dict[str, float]:
-    """Return the means, their difference and its 95 % interval, in the quantity's unit.
+    """Return both means, and their difference with its 95 % interval, by column.
 
     Args:
-        quantity: the compared quantity.
+        quantity: the compared quantity, whose unit the values have.
         rows: rows from `comparable`.
     """
     difference, low, high = _interval(rows, quantity, 0.95)
@@ -124,7 +124,7 @@ def means_and_difference(quantity: Quantity, rows: pd.DataFrame) -> dict[str, fl
 
 
 def _interval(rows: pd.DataFrame, quantity: Quantity, confidence: float) -> Interval:
-    """Return the difference and its interval, whose ends are NaN with too few maps."""
+    """Return the difference and its interval; NaN limits if there are too few maps."""
     difference, low, high = interval_of(rows, quantity.column, confidence)
     scale = quantity.scale
     return scale * difference, scale * low, scale * high
@@ -135,12 +135,11 @@ def p_of(
     rows: pd.DataFrame,
     quantities: Mapping[str, Quantity] = QUANTITIES,
 ) -> float:
-    """Return the uncorrected p of a hypothesis; 1 if there are too few maps.
+    """Return the uncorrected p-value of a hypothesis; 1 if there are too few maps.
 
     Args:
         test: the hypothesis.
-        rows: episodes of the two conditions side by side; the columns of the second end
-            in `_other`.
+        rows: rows from `comparable`.
         quantities: quantities by which conditions are compared, by name.
     """
     quantity = quantities[test.metric]

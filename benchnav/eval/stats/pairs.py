@@ -1,4 +1,4 @@
-"""Pairs of conditions whose values differ in one part, on the same maps and draws."""
+"""Pairs of conditions that differ in one part, on the same maps and draws of λ."""
 
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -19,15 +19,15 @@ from benchnav.eval.experiment.condition import (
 )
 from benchnav.eval.experiment.unit import DRAW
 
-# Columns in which conditions may differ, with their keys in a condition's value. Data
-# and scenario are not among them, since they determine the maps.
+# Columns in which the conditions of a pair may differ, with their keys in a condition's
+# value. `data` and `scenario` are excluded, since they determine the maps.
 _PARTS = ("risk", "planner", "model", "objective", "robot", *KNOWLEDGE)
 _KEYS: Mapping[str, tuple[str, ...]] = {
     **{name: (name,) for name in _PARTS},
     "world": ("world", "rules"),
     "run": (),
 }
-# Columns of an episode that a pair has for both conditions.
+# Columns of episodes that a pair has for both conditions.
 _MEASURES = (
     "success",
     "total_time_s",
@@ -40,18 +40,17 @@ _MEASURES = (
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Compared:
-    """A condition of one run, or of several runs that contain identical rows of it.
+    """A condition with its episodes, from one or several runs.
 
     Args:
         labels: labels in tables by column, including `run`, which is `NOT_USED` unless
-            two runs contain the condition.
-        value: all settings that affect its rows, as in `run.json`.
-        maps: digests of its maps, in the order of maps.
-        episodes: its rows, each with its T as `time_budget_s`.
-        code: code that computed the rows, by run: names of sources, versions and parts
-            with their digests.
-        map_properties: digest of the maps' properties `MEANING`; empty if the run lacks
-            it.
+            several runs contain the condition.
+        value: all settings that affect the rows, as in `run.json`.
+        maps: digests of the maps, in the order of maps.
+        episodes: rows of the condition, with T as `time_budget_s`.
+        code: code of the rows by name of the run, as in `Origin.code`.
+        map_properties: digest of the properties `MEANING` of the maps; empty if the run
+            does not contain it.
     """
 
     labels: Mapping[str, str]
@@ -69,13 +68,11 @@ class Pair:
     Args:
         one: label of the first condition.
         other: label of the second condition, with which the first is compared.
-        shared: labels that both conditions have; if only one condition uses a part,
-            its label.
-        episodes: common episodes by seed, realisation and map: `success`,
-            `total_time_s`, `time_budget_s` and other measures of the first condition;
-            the same columns of the second, which end in `_other`; and `group`, the
-            statistical unit. Maps may have different numbers of episodes.
-        members: both conditions.
+        shared: labels of both conditions by column; if only one condition uses a part,
+            the label of this condition.
+        episodes: common episodes, as `side_by_side` returns them. Maps may have
+            different numbers of episodes.
+        members: the first and the second condition.
     """
 
     one: str
@@ -90,15 +87,15 @@ def find_pairs(
 ) -> list[Pair]:
     """Pair conditions whose values differ only in one part.
 
-    A part that a condition does not use, such as the risk setting of a blind planner,
-    equals any other.
+    A part that one of the conditions does not use, such as the risk setting of a blind
+    planner, is ignored.
 
     Args:
         conditions: conditions of one or several runs; each condition occurs once unless
             runs are compared with each other.
-        by: column that differs; see `by_what`.
-        against: label with which all others are compared; if empty, all pairs are
-            formed.
+        by: column that differs; if empty, see `by_what`.
+        against: label with which all other conditions are paired; if empty, all pairs
+            are formed.
 
     Returns:
         Pairs, grouped by their common labels.
@@ -115,8 +112,8 @@ def find_pairs(
     if not pairs:
         listed = ", ".join(values) or NOT_USED
         raise ConfigError(
-            f"Expected two conditions or more that differ in their {by} and in "
-            f"nothing else, got {by} {listed}.{_others(conditions, by)}"
+            f"Expected two or more conditions that differ only in their {by}, got "
+            f"conditions with {by} {listed}.{_other_differences(conditions, by)}"
         )
     families: dict[tuple[str, ...], list[Pair]] = defaultdict(list)
     for pair in pairs:
@@ -127,7 +124,7 @@ def find_pairs(
 def matches(
     conditions: Sequence[Compared], by: str, against: str = ""
 ) -> Iterator[tuple[Compared, Compared]]:
-    """Yield both conditions of each pair of `find_pairs`.
+    """Yield the two conditions of each pair of `find_pairs`.
 
     Args:
         conditions: as in `find_pairs`.
@@ -139,7 +136,7 @@ def matches(
         is_selected = not against or against in labels
         if not is_selected or not _differ_in(a, b, by):
             continue
-        # The later condition comes first, unless it is the one with label `against`.
+        # A condition with the label `against` is the second of a pair.
         if against and b.labels[by] == against:
             yield a, b
         else:
@@ -151,15 +148,16 @@ def by_what(conditions: Sequence[Compared], by: str = "", against: str = "") -> 
 
     Args:
         conditions: conditions that are compared.
-        by: requested column. If empty: the column that contains `against`; `run` if
-            runs have common conditions; else `risk`.
-        against: a label, or empty.
+        by: requested column. If empty, the column with the label `against`; without
+            `against`, `run` if runs have common conditions, otherwise `risk`.
+        against: label of a condition; may be empty.
 
     Raises:
-        ConfigError: If `by` is no key, or `against` is in no column or in several.
+        ConfigError: If `by` is no key of `_KEYS`, or `against` is a label of no column
+            or of several columns.
     """
     if by:
-        check_known("`by` (other data or scenarios are other maps)", by, _KEYS)
+        check_known("`by` (data and scenario determine the maps)", by, _KEYS)
         return by
     if not against:
         has_runs = any(c.labels["run"] != NOT_USED for c in conditions)
@@ -173,18 +171,17 @@ def by_what(conditions: Sequence[Compared], by: str = "", against: str = "") -> 
     columns = list(columns_of[against])
     if len(columns) > 1:
         raise ConfigError(
-            f"Expected `against` to be a label of one kind, got {against!r}, a label "
-            f"of {' and of '.join(columns)}. Pass "
-            f"--by {' or --by '.join(columns)}."
+            f"Expected `against` to be a label of one column, got {against!r}, a label "
+            f"of {' and of '.join(columns)}. Pass --by {' or --by '.join(columns)}."
         )
     return columns[0]
 
 
 def check_one_value_each(conditions: Iterable[Compared]) -> None:
-    """Reject two values under one label, which readers could not distinguish.
+    """Reject two values with the same label, which readers could not distinguish.
 
     Raises:
-        ConfigError: If two values have one label.
+        ConfigError: If two values have the same label.
     """
     values: dict[tuple[str, str], tuple[dict[str, Any], Compared]] = {}
     for condition in conditions:
@@ -195,9 +192,9 @@ def check_one_value_each(conditions: Iterable[Compared]) -> None:
             if earlier != value and label != NOT_USED:
                 runs = " and ".join(dict.fromkeys([*first.code, *condition.code]))
                 raise ConfigError(
-                    f"Expected one {name} under each label, got two that {runs} call "
-                    f"{label!r}: {_in_words(earlier, value)}. Leave one of the runs "
-                    "out, or run one again under another label."
+                    f"Expected one {name} for each label, got two with the label "
+                    f"{label!r} in {runs}: {_in_words(earlier, value)}. Leave one of "
+                    "the runs out, or run one again with another label."
                 )
 
 
@@ -207,15 +204,15 @@ def _in_words(a: Any, b: Any) -> str:
     return ", ".join(words)
 
 
-def _others(conditions: Sequence[Compared], by: str) -> str:
-    """Describe the other columns or worlds in which the conditions differ."""
+def _other_differences(conditions: Sequence[Compared], by: str) -> str:
+    """Describe differences of conditions that prevent pairs by a column."""
     fields: dict[str, dict[str, Any]] = {}
     for condition in conditions:
         field_ = _field(condition)
         fields[repr(field_)] = field_
     if by == "world" and len(fields) > 1:
         first, second, *_ = fields.values()
-        return f" λ itself differs between their worlds: {_in_words(first, second)}."
+        return f" Their worlds draw different λ: {_in_words(first, second)}."
     differing: dict[str, set[str]] = {}
     for name in _KEYS:
         labels = {condition.labels[name] for condition in conditions} - {NOT_USED}
@@ -227,11 +224,14 @@ def _others(conditions: Sequence[Compared], by: str) -> str:
     for name, labels in differing.items():
         words.append(f"{name} ({', '.join(sorted(labels))})")
     first_name = next(iter(differing))
-    return f" They differ in {' and '.join(words)}: try `--by {first_name}`."
+    return f" They differ in {' and '.join(words)}. Try `--by {first_name}`."
 
 
 def _differ_in(a: Compared, b: Compared, by: str) -> bool:
-    """Return whether two values differ only in one part that both use, on the same λ."""
+    """Return whether two conditions with the same λ differ only in one part.
+
+    Both conditions must use the part.
+    """
     if by == "run":
         return a.value == b.value and a.labels["run"] != b.labels["run"]
     unused = [name for name in _KEYS if NOT_USED in (a.labels[name], b.labels[name])]
@@ -247,8 +247,7 @@ def _differ_in(a: Compared, b: Compared, by: str) -> bool:
 def _field(condition: Compared) -> dict[str, Any]:
     """Return the settings of a world that determine the drawn λ.
 
-    If λ is frozen, the threshold of immobilising terrain is one of them. Time budgets
-    never are.
+    If λ is frozen, they include the threshold of immobilising terrain.
     """
     world = condition.value["world"]
     if world["noise"] != "frozen":
@@ -268,8 +267,8 @@ def _pair(first: Compared, second: Compared, by: str) -> Pair:
     paired = side_by_side(first.episodes, second.episodes, _MEASURES)
     if paired.empty:
         raise ConfigError(
-            f"Expected conditions with episodes in common, got {names} with "
-            f"{_draws(first)} and {_draws(second)}."
+            f"Expected conditions with common episodes, got {names} with "
+            f"{_draws(first)} and {_draws(second)}. Run them with the same seeds."
         )
     shared = {}
     for name in (*LABELS, "run"):
@@ -289,16 +288,16 @@ def _pair(first: Compared, second: Compared, by: str) -> Pair:
 def side_by_side(
     first: pd.DataFrame, second: pd.DataFrame, measures: Sequence[str]
 ) -> pd.DataFrame:
-    """Return the common episodes of two conditions, a row each.
+    """Return the common episodes of two conditions, one row per episode.
 
     Args:
-        first: rows of a condition.
-        second: rows of the other condition.
-        measures: columns that both have; the columns of `second` get the suffix
-            `_other`.
+        first: rows of the first condition.
+        second: rows of the second condition.
+        measures: columns of both conditions.
 
     Returns:
-        The columns `DRAW`, the measures, and `group`.
+        `group`, the statistical unit; the columns `DRAW`; the measures of the first
+        condition; and the measures of the second, with the suffix `_other`.
     """
     columns = [*DRAW, *measures]
     first_columns = first[["group", *columns]]
@@ -306,7 +305,7 @@ def side_by_side(
 
 
 def on_common_draws(conditions: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
-    """Return the episodes that all conditions have in common, in one order.
+    """Return the common episodes of all conditions, in the same order.
 
     Args:
         conditions: rows of each condition, by id.
@@ -325,19 +324,19 @@ def check_maps(first: Compared, second: Compared, names: str) -> None:
     """Check that two conditions have the same maps, properties and groups of maps.
 
     Args:
-        first: a condition.
-        second: the other condition.
+        first: first condition.
+        second: second condition.
         names: names of both conditions, for the message.
 
     Raises:
-        ConfigError: If maps of one index have different digests, or the properties or
-            the groups of the maps differ.
+        ConfigError: If maps with the same index have different digests, or the
+            properties or the groups of the maps differ.
     """
     common = min(len(first.maps), len(second.maps))
     if list(first.maps[:common]) != list(second.maps[:common]):
         raise ConfigError(
-            f"Expected conditions on the same maps, got {names}, whose maps have "
-            "other digests."
+            f"Expected conditions on the same maps, got {names}, whose maps differ. "
+            "Run them on the same dataset."
         )
     first_groups = first.episodes.groupby("map")["group"].first()
     second_groups = second.episodes.groupby("map")["group"].first()
@@ -352,8 +351,8 @@ def check_maps(first: Compared, second: Compared, names: str) -> None:
         split = f"of {first.value['data']} {first.value['split']}"
         words = ", ".join(f"{name} {split}" for name in differing)
         raise ConfigError(
-            f"Expected conditions on maps of one meaning, got {names}, which differ "
-            f"in {words}. Run them on one dataset."
+            f"Expected conditions on maps with the same properties, got {names}, which "
+            f"differ in {words}. Run them on the same dataset."
         )
 
 

@@ -1,14 +1,15 @@
 """Regret, split along a chain of conditions that ends at the near-optimal reference.
 
-The chain starts at a planner with a model's prediction. It leads to the optimal planner
-with the same prediction, then with the models `ideal` and `oracle`, and ends at the
-near-optimal reference, which is given λ itself. The reference's trajectories are
-feasible, so that regret against it is at most the regret against the minimum time. The
-table also has a lower bound of the time, which no trajectory undercuts.
+The chain starts at a planner with a model's prediction. The next conditions are the
+optimal planner with the same prediction, with the model `ideal` and with the model
+`oracle`. The last is the near-optimal reference, which is given λ itself. The
+reference's trajectories are feasible, so that the regret against the reference is at
+most the regret against the minimum time. The table also has a lower bound of the time
+of all trajectories.
 
-Each step of the chain is a paired difference. The steps add up to the total by
-construction, but they are not causes: a step may be negative, and another order of
-steps would give other values.
+Each step of the chain is a paired difference. By construction, the steps add up to the
+total. They are not causes: a step may be negative, and another order of steps would
+give other values.
 """
 
 import math
@@ -34,15 +35,15 @@ _MODELS = ("ideal", "oracle")
 def find_chains(conditions: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
     """Find complete chains of five conditions.
 
-    Robots that learn during the episode are in no chain, since optimal planners plan
+    A chain has no robots that learn during the episode, since optimal planners plan
     only once.
 
     Args:
         conditions: entries of `run.json` by id.
 
     Returns:
-        Five ids for each chain: a planner with a model; the optimal planner with that
-        model, with `ideal` and with `oracle`; and the reference.
+        Five ids for each chain: a planner with a model; the optimal planner with this
+        model, with `ideal` and with `oracle`; and the near-optimal reference.
     """
     values = {condition: entry["value"] for condition, entry in conditions.items()}
     chains = []
@@ -69,12 +70,12 @@ def find_chains(conditions: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
 def _references(
     values: Mapping[str, Mapping[str, Any]], value: Mapping[str, Any]
 ) -> list[str]:
-    """Return the reference conditions for a condition's value."""
+    """Return the conditions that are references for a condition, given its value."""
     parts = {"planner": REFERENCE, "model": "clairvoyant"}
     references = []
     for condition in _alike(values, value, ("planner", "model", "risk"), **parts):
         options = values[condition]["planner"]["options"]
-        # With zero levels, entering a soft spot counts as a loss: no reference.
+        # With zero levels, the planner rejects paths over soft spots: no reference.
         if options.get("levels") != 0:
             references.append(condition)
     return references
@@ -86,12 +87,12 @@ def _alike(
     ignored: Sequence[str],
     **parts: str,
 ) -> list[str]:
-    """Return conditions that have some parts, and equal `value` except in some keys.
+    """Return the conditions with given parts whose other settings equal a value.
 
     Args:
         values: values of all conditions by id.
-        value: the value to compare with.
-        ignored: keys that may differ.
+        value: value that is compared.
+        ignored: keys in which a condition may differ from `value`.
         **parts: required parts by kind.
     """
     expected = _without(value, ignored)
@@ -122,15 +123,15 @@ def split_regret(
     Returns:
         One row per step of a chain, with these columns:
 
-        - `chain`, the chain's index from 1; labels of the chain's first condition;
-          `against`, the reference.
-        - Id, planner and model of the step's two conditions: `one`, `one_planner`,
-          `one_model`, and the same for `other`.
-        - `n_maps`, where a group counts as one; `n_episodes`.
-        - For `success` and `time` (T_total in seconds; a failure counts as T): the
-          means `…_one` and `…_other`; their `…_difference`, one minus other, with its
-          95 % interval `…_low`, `…_high`; and `…_bound`, the best mean that the lower
-          bounds of the time allow, NaN if the reference's rows lack these bounds.
+        - `chain`, the index of the chain from 1; labels of the chain's first condition;
+          `against`, the name of the reference.
+        - id, planner and model of the two conditions of the step: `one`, `one_planner`,
+          `one_model`, `other`, `other_planner`, `other_model`.
+        - `n_maps`, the number of maps, or of groups of maps; `n_episodes`.
+        - for `success` and `time` (T_total in seconds; a failure counts as T): the
+          means `…_one` and `…_other`; `…_difference`, one minus other, with its 95 %
+          interval `…_low`, `…_high`; and `…_bound`, the best mean that the lower bounds
+          of the time allow, NaN if the rows of the reference have no bounds.
     """
     rows = dict(list(episodes.groupby("condition", sort=False)))
     steps: list[dict[str, Any]] = []
@@ -143,7 +144,9 @@ def split_regret(
         if with_budgets[chain[0]].empty:
             continue
         labels = conditions[chain[0]]["labels"]
-        of_chain = {name: labels[name] for name in (*BLOCK, "planner", "model", "risk")}
+        chain_labels = {
+            name: labels[name] for name in (*BLOCK, "planner", "model", "risk")
+        }
         bounds = best_possible(with_budgets[chain[-1]])
         for first, second in pairwise(chain):
             paired = side_by_side(
@@ -151,7 +154,7 @@ def split_regret(
                 with_budgets[second],
                 ["success", "total_time_s", "time_budget_s"],
             )
-            step = {"chain": index, **of_chain, "against": AGAINST}
+            step = {"chain": index, **chain_labels, "against": AGAINST}
             sides = {"one": first, "other": second}
             step |= sides
             for side, condition in sides.items():
@@ -166,7 +169,7 @@ def best_possible(rows: pd.DataFrame) -> dict[str, float]:
     """Return the best means of success and T_total that the lower bounds allow.
 
     Args:
-        rows: episodes, with `time_budget_s`.
+        rows: rows of episodes, with T as `time_budget_s`.
 
     Returns:
         `success_bound`, and `time_bound` in seconds; NaN if any episode has no

@@ -1,9 +1,9 @@
 """Summaries of conditions: success rates with intervals, and means with counts.
 
 The statistical unit is the map, or the group of maps if a dataset has groups. Episodes
-on one map under several seeds or realisations are correlated: a hundred episodes on
-twenty maps contain less information than episodes on a hundred maps. The design effect
-quantifies the loss.
+on the same map with different seeds or realisations are correlated: 100 episodes on 20
+maps contain less information than 100 episodes on 100 maps. The design effect
+quantifies this loss.
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,7 +26,7 @@ from benchnav.stats.intervals import (
     wilson_interval,
 )
 
-# Metrics summarised by mean and standard deviation, by the median, and by the mean.
+# Metrics that are summarised by mean and standard deviation.
 _SPREAD: tuple[Metric, ...] = (
     shipped.TRAVERSABILITY,
     shipped.TIME_RATIO,
@@ -35,7 +35,9 @@ _SPREAD: tuple[Metric, ...] = (
     shipped.STUCK_FRACTION,
     shipped.ROUGHNESS,
 )
+# Metrics that are summarised by the median.
 _MEDIANS: tuple[Metric, ...] = shipped.PLANNING
+# Metrics that are summarised by the mean.
 _LEARNING: tuple[Metric, ...] = (
     shipped.SEEN_CELLS,
     shipped.SENSED_CELLS,
@@ -46,7 +48,9 @@ _LEARNING: tuple[Metric, ...] = (
 
 
 def time_budgets(episodes: pd.DataFrame, world: Mapping[str, Any]) -> pd.Series:
-    """Return each episode's T in seconds: T_total of a failure, else from the world.
+    """Return each episode's T in seconds.
+
+    T is the T_total of a failure. For a success, T follows from the world.
 
     Args:
         episodes: rows of one condition.
@@ -54,7 +58,7 @@ def time_budgets(episodes: pd.DataFrame, world: Mapping[str, Any]) -> pd.Series:
     """
     total_s = episodes["total_time_s"]
     if "time_budget_ratio" in world:
-        # The time over its ratio is the reference time at the robot's top speed.
+        # T_total divided by its ratio is the reference time at the robot's top speed.
         budget_s = world["time_budget_ratio"] * total_s / episodes["time_ratio"]
     else:
         budget_s = world["time_budget_s"]
@@ -64,7 +68,7 @@ def time_budgets(episodes: pd.DataFrame, world: Mapping[str, Any]) -> pd.Series:
 def success_mean(episodes: pd.DataFrame) -> tuple[float, float, float]:
     """Return the success rate of a condition with Wilson's 95 % interval.
 
-    The interval is that of the number of episodes divided by `design_effect`.
+    For the interval, the number of episodes is divided by `design_effect`.
     """
     success = episodes["success"].to_numpy(dtype=bool)
     maps = episodes["group"].to_numpy()
@@ -84,14 +88,14 @@ def total_time_mean(
         world: world of the condition, as in `run.json`.
 
     Returns:
-        Mean and ends in seconds; the ends are NaN with fewer than
+        Mean and limits in seconds; the limits are NaN with fewer than
         `stats.bootstrap.LEAST_MAPS` maps.
     """
     success = episodes["success"].to_numpy(dtype=bool)
     maps = episodes["group"].to_numpy()
     total_s = episodes["total_time_s"].to_numpy()
     budgets_s = time_budgets(episodes, world)
-    arrival_s = 0.0  # without a success; no arrival takes less
+    arrival_s = 0.0  # minimum time of a success, if no episode succeeded
     if success.any():
         arrival_s = total_s[success].mean()
     _, low, high = success_mean(episodes)
@@ -123,23 +127,24 @@ def summarise(
     Returns:
         One row per condition, with these columns:
 
-        - `condition` and its labels; `n_episodes`; `n_maps`; `n_groups`, equal to
+        - `condition` and its labels; `n_episodes`; `n_maps`; `n_groups`, which is
           `n_maps` if the dataset has no groups.
-        - `success_rate` with Wilson's interval `success_low`, `success_high`, computed
-          from the number of episodes divided by `design_effect`.
-        - `NAME_mean`, `NAME_std`, and `NAME_n`, the number of episodes that have a
-          value: of the total time (a failure counts as T), the time of successes only,
-          observed λ, the time over the reference time, the score, the path length, the
-          fraction of stuck steps, and the roughness.
-        - `total_time_low_s`, `total_time_high_s`: 95 % interval of the mean total time,
-          from `total_time_interval`.
-        - The medians `planning_ms_median`, `planning_ms_p95_median` and
+        - `success_rate` with its interval `success_low`, `success_high`, and
+          `design_effect`; see `success_mean`.
+        - `NAME_mean`, `NAME_std`, and `NAME_n`, the number of episodes with a value,
+          for the total time (a failure counts as T), the time of successes only,
+          observed λ, the time divided by the reference time, the score, the path
+          length, the fraction of stuck steps, and the roughness.
+        - `total_time_low_s`, `total_time_high_s`, the 95 % interval of the mean total
+          time from `total_time_mean`.
+        - the medians `planning_ms_median`, `planning_ms_p95_median` and
           `planning_start_ms_median`.
-        - `NAME_mean` of metrics of learning, NaN if robots do not learn;
-          `compiled_share`; `OUTCOME_count`, the number of failures of each kind.
-        - Mean, standard deviation and number of episodes of each further quantity, as
-          above, and `NAME_low`, `NAME_high`, Student's 95 % interval of its mean per
-          map.
+        - `NAME_mean` for metrics of learning, NaN if robots do not learn;
+          `compiled_share`, the fraction of episodes with a compiled planner;
+          `OUTCOME_count`, the number of failures with each outcome.
+        - for each further quantity: mean, standard deviation and number of episodes, as
+          above; and `NAME_low`, `NAME_high`, Student's 95 % interval of the mean over
+          maps.
     """
     groups = episodes.groupby("condition", sort=False)
     rows = [
@@ -179,7 +184,7 @@ def _summarise_condition(
         row[name] = group[metric.column].median()
     for metric in _LEARNING:
         name = metric.quantity.summary_column("mean")
-        # Runs of robots that do not learn lack the columns.
+        # If robots do not learn, the table lacks these columns.
         values = group.get(metric.column)
         row[name] = np.nan if values is None else values.mean()
     row["compiled_share"] = group["compiled"].astype(float).mean()
@@ -193,7 +198,7 @@ def _summarise_condition(
 
 
 def _spread(quantity: Quantity, values: pd.Series) -> dict[str, object]:
-    """Return a quantity's mean, standard deviation and number of episodes with a value."""
+    """Return mean, standard deviation and number of values of a quantity, by column."""
     stem = quantity.column.removesuffix(quantity.suffix)
     return {
         quantity.summary_column("mean"): values.mean(),
@@ -203,9 +208,9 @@ def _spread(quantity: Quantity, values: pd.Series) -> dict[str, object]:
 
 
 def _mean_with_interval(quantity: Quantity, group: pd.DataFrame) -> dict[str, object]:
-    """Return `_spread` with Student's 95 % interval of the mean per map.
+    """Return the columns of `_spread`, and Student's 95 % interval over maps.
 
-    The column may be missing if the run is not finished.
+    If the run is not finished, the quantity's column may be missing.
     """
     values = pd.Series(np.nan, index=group.index)
     if quantity.column in group:

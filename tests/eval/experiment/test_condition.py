@@ -340,7 +340,7 @@ def test_two_settings_of_one_part_stand_side_by_side_with_labels() -> None:
         ({"conditions": ({"planer": "mppi"},)}, "Did you mean 'planner"),
         (
             {"conditions": ({"risk": "mean", "risks": ["var"]},)},
-            "`risk` or `risks` in one of",
+            "`risk` or `risks` in each mapping of",
         ),
     ],
 )
@@ -586,11 +586,11 @@ def test_what_robots_know_by_is_read_back() -> None:
         ({"grounds": ("probe", "probe:1")}, "twice"),
         (
             {"grounds": ("probe", {"part": "probe", "options": {"radius_m": 2.0}})},
-            "both called 'probe'",
+            "with the label 'probe'",
         ),
         (
             {"sensors": ("near", {"part": "near", "options": {"range_m": 2.0}})},
-            "both called 'near'",
+            "with the label 'near'",
         ),
         (
             {"beliefs": ({"part": "copula", "options": {"windw": 3}},)},
@@ -617,9 +617,9 @@ def test_labels_of_what_robots_know_by_are_one_each() -> None:
         one(beliefs=("copula",), grounds=("probe:2",)),
     )
     check_labels([probe, far, one()])
-    with pytest.raises(ConfigError, match="two settings that are both called 'probe'"):
+    with pytest.raises(ConfigError, match="two settings with the label 'probe'"):
         check_labels([probe, replace(far, ground=replace(far.ground, label="probe"))])
-    with pytest.raises(ConfigError, match="for one ground, got 'mine' and 'probe'"):
+    with pytest.raises(ConfigError, match="for each ground, got 'mine' and 'probe'"):
         check_labels(
             [probe, replace(probe, ground=replace(probe.ground, label="mine"))]
         )

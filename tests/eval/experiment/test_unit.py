@@ -132,8 +132,10 @@ ENDED = [True, False, True, False]  # whether each episode succeeded
 def test_what_is_recorded(
     record: str, leads: bool, watched: list[int], recorded: list[int]
 ) -> None:
-    unit = replace(some_units()[0], maps=(0, 1, 2, 3), record=record, leads=leads)  # type: ignore[arg-type]
-    assert list(unit.watched()) == watched
+    unit = replace(
+        some_units()[0], maps=(0, 1, 2, 3), record=record, is_first_unit=leads
+    )  # type: ignore[arg-type]
+    assert list(unit.possibly_recorded()) == watched
     assert unit.recorded(ENDED) == recorded
 
 
@@ -143,14 +145,14 @@ def test_each_word_records_all_that_the_one_before_it_does() -> None:
     for less, more in pairwise(RECORDS):
         for leads, *ended in product((True, False), repeat=3):
             of = [
-                replace(unit, record=record, leads=leads).recorded(ended)
+                replace(unit, record=record, is_first_unit=leads).recorded(ended)
                 for record in (less, more)
             ]
             assert set(of[0]) <= set(of[1])
 
 
 def test_one_unit_leads_each_condition() -> None:
-    leading = [unit for unit in some_units() if unit.leads]
+    leading = [unit for unit in some_units() if unit.is_first_unit]
     assert len({unit.condition.id for unit in leading}) == len(leading) == 4
     assert {(unit.seed, unit.realisation, unit.block) for unit in leading} == {
         (0, 0, 0)

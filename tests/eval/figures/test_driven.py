@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from benchnav.core.errors import ConfigError
 from benchnav.eval.figures.data import Driven, RunData, read_driven
 from benchnav.eval.figures.driven import DrivenPaths
-from benchnav.eval.recording import GROUND, Ground, Recording
+from benchnav.eval.recording import GROUND, RecordedMap, Recording
 from benchnav.viz.drives import MARKS
 from benchnav.viz.maps import IMMOBILISING
 from benchnav.viz.style import planner_colours
@@ -24,7 +24,7 @@ from tests.eval.report.test_write import run_folder
 RISKS = ("mean", "cvar:0.5", "cvar:0.9")
 
 
-def ground(**changes: Any) -> Ground:
+def ground(**changes: Any) -> RecordedMap:
     field = np.linspace(0, 1, 40 * 60, dtype=np.float32).reshape(40, 60)
     about = {
         "data": "paper-v1",
@@ -38,7 +38,7 @@ def ground(**changes: Any) -> Ground:
         "about": about, "resolution_m": 0.5, "rgb": np.full((3, 40, 60), 100, np.uint8), "field": field,
         "immobilising": field < 0.1, "goal_m": np.array([24.0, 15.0], np.float32),
     }  # fmt: skip
-    return Ground(**(given | changes))
+    return RecordedMap(**(given | changes))
 
 
 def episodes(ended: dict[int, list[bool]]) -> pd.DataFrame:
@@ -217,7 +217,7 @@ def test_the_figure_is_of_the_stored_steps_of_its_map(tmp_path: Path) -> None:
     data = run_data(folder, rows)
     assert DrivenPaths().needs(data)
     assert (
-        "std, map 1, seed 0, realisation 0. On this map outcomes differ most."
+        "std, map 1, seed 0, realisation 0. Outcomes differ most on this map."
         in DrivenPaths().caption(data)
     )
     assert driven.rows["map"].tolist() == [1, 1, 1]
@@ -282,7 +282,7 @@ def test_more_conditions_than_can_be_distinguished_are_left_out_and_counted(
     with_steps(folder, rows)
     ground().save(folder / GROUND)
     data = run_data(folder, rows)
-    words = f" Shown are {most} of {most + 2} conditions, as many successes as failures"
+    words = f" The figure shows {most} of {most + 2} conditions, with equally many successes"
     assert words in DrivenPaths().caption(data)
     figure = DrivenPaths()(data)
     legend = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
@@ -348,11 +348,11 @@ def test_trajectories_are_of_that_map_as_many_that_arrived_as_not() -> None:
 def test_the_map_comes_back_as_it_was(tmp_path: Path) -> None:
     for one in (ground(), ground(field=None)):
         one.save(tmp_path / "a.npz")
-        again = Ground.load(tmp_path / "a.npz")
+        again = RecordedMap.load(tmp_path / "a.npz")
         assert (again.about, again.resolution_m) == (one.about, 0.5)
         assert (again.field is None) == (one.field is None)
         np.testing.assert_array_equal(again.immobilising, one.immobilising)
     path = tmp_path / "a.npz"
     path.write_bytes(path.read_bytes()[:200])
     with pytest.raises(ConfigError, match=r"a\.npz is damaged"):
-        Ground.load(path)
+        RecordedMap.load(path)

@@ -36,7 +36,7 @@ def shown(rows: pd.DataFrame, **changes: Any) -> FailedLine:
         )
         for x, y, outcome in rows[["x_m", "y_m", "outcome"]].to_numpy()
     ]
-    return FailedLine(name="MPPI, mean", failures=rows, recordings=recordings, among=9)
+    return FailedLine(name="MPPI, mean", failures=rows, recordings=recordings, total=9)
 
 
 def draw_failures(lines: list[FailedLine]) -> Figure:

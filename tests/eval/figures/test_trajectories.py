@@ -167,7 +167,7 @@ def test_λ_as_it_was_has_a_third_panel_with_the_whole_path_and_where_it_ended()
         )
     end = marks[MARKS["immobilised"]["marker"]]
     np.testing.assert_array_equal(np.ravel(end.get_data()), taken.track[-1])
-    assert last.get_title() == "whole path, over the λ field"
+    assert last.get_title() == "complete path over the λ field"
     # Where it was by the moment of the plan is told by the panels above, and where it
     # headed.
     heading = robot_marker(taken.states[taken.now, 2]).get_transform()
@@ -282,7 +282,7 @@ def test_the_legend_names_what_the_ground_has(
 
 def test_the_legend_names_layers_that_are_there() -> None:
     names = names_in_legend(draw_trajectories([recording()]))
-    below = ["not free", "driven; above in the colour of the observed λ"]
+    below = ["not free", "driven path; in the top row, its colour is the observed λ"]
     assert set(names) == {
         "samples",
         "reference path",

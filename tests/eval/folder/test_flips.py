@@ -25,7 +25,7 @@ from benchnav.eval.folder.run_folder import (
 from benchnav.eval.folder.sealed import metadata, read_sealed, with_metadata
 from benchnav.eval.folder.steps import read_steps
 from benchnav.eval.folder.verify import verify_run
-from benchnav.eval.recording import GROUND, Ground, Recording
+from benchnav.eval.recording import GROUND, RecordedMap, Recording
 from benchnav.eval.report.playback.viewer_file import write_viewer_files
 from benchnav.eval.run.runner import run_suite
 from tests.commands import call
@@ -65,7 +65,7 @@ def everything(folder: Path) -> Iterator[Any]:
     for path in sorted((folder / "playback").glob("*.npz")):
         recording = Recording.load(path)
         yield recording.states, recording.predicted, recording.about
-    ground = Ground.load(folder / GROUND)
+    ground = RecordedMap.load(folder / GROUND)
     yield ground.rgb, ground.field
 
 
@@ -156,7 +156,7 @@ def test_missing_files_and_units_of_another_run_are_told(
     assert damage == []
     count = len((run / "SHA256SUMS").read_text().splitlines())
     assert notes == [
-        f"1 of {count} files in SHA256SUMS are missing, the first summary.csv"
+        f"1 of {count} files in SHA256SUMS are missing; the first is summary.csv"
     ]
     shutil.copyfile(second, first)  # a whole file, of another unit
     unit = next(
@@ -178,7 +178,7 @@ def test_steps_that_are_sealed_again_are_not_those_of_the_unit(
     changed = with_metadata(read_sealed(path).slice(1), {"key": metadata(path)["key"]})
     pq.write_table(changed, path)
     damage, _ = verify_run(copy)
-    assert damage == [f"{path.relative_to(copy)}: it holds the steps of another run"]
+    assert damage == [f"{path.relative_to(copy)}: it contains the steps of another run"]
 
 
 def test_a_damaged_viewer_file_is_written_again(run: Path, tmp_path: Path) -> None:

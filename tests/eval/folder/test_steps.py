@@ -192,4 +192,4 @@ def test_edited_steps_are_read_or_refused_in_one_line(
             said.append(str(error))
         shutil.rmtree(place)
     assert len(said) > count / 5
-    assert all("Remove the steps" in line for line in said)
+    assert all("Remove the folder of steps" in line for line in said)

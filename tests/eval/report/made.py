@@ -11,7 +11,7 @@ import torch
 from benchnav.core.tables import Bold, Table
 from benchnav.eval.experiment.condition import LABELS
 from benchnav.eval.figures.data import RunData
-from benchnav.eval.recorded_plans import KnownMap, drawn_plan, reach_outline
+from benchnav.eval.recorded_plans import KnownMap, drawn_plan, footprint_outline
 from benchnav.eval.recording import Recording
 from benchnav.eval.stats.best import against_best, privileged_models
 from benchnav.eval.stats.summary import summarise
@@ -236,7 +236,7 @@ def known_maps(recording: Recording, steps: Iterable[int]) -> tuple[KnownMap, ..
             KnownMap(
                 step=step, predicted=(0.8 * mean).astype(np.float16), free=mean > 0.3, mean=mean,
                 spread=np.where(sensed, 0, 0.3).astype(np.float16), seen=seen, sensed=sensed,
-                outline=reach_outline(away_m < 2, 0.5),
+                outline=footprint_outline(away_m < 2, 0.5),
             )
         )  # fmt: skip
     return tuple(known)

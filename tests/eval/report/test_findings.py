@@ -190,13 +190,16 @@ def test_the_ground_of_failures_is_that_of_the_best_alone() -> None:
         }
     )
     without = said(best, other, failures=failures)
-    assert "The robot observed λ = 0.04 in their last 2 s (median)." in without
+    assert (
+        "In the last 2 s of these episodes, the robot observed λ = 0.04 (median)."
+        in without
+    )
     told = {
         best[0]["condition"]: np.array([0.5, np.nan, 0.6, 0.9]),
         other[0]["condition"]: np.array([0.1]),
     }
     assert (
-        "Where they ended, the predicted λ̂ was 0.60; the robot observed λ = 0.04 in the last 2 s (medians)."
+        "Where these episodes ended, λ̂ was 0.60; in the last 2 s, the robot observed λ = 0.04 (medians)."
     ) in said(best, other, failures=failures, told=told)
 
 

@@ -53,7 +53,7 @@ def test_an_extension_after_the_hypotheses_is_told() -> None:
         pd.DataFrame([a_test()]), ABOUT | {"conditions": conditions}, "group"
     ).values()
     assert said[-1].startswith(
-        "The run was extended after the hypotheses were fixed (episodes a condition: 80 then, 80 to 200 now)"
+        "The run was extended after the hypotheses were fixed (episodes per condition: 80 then, 80 to 200 now)"
     )
     assert "40 groups" in said[0]
 

@@ -415,7 +415,7 @@ def test_maps_too_few_to_show_any_difference_say_so() -> None:
     assert many["detectable"] == f"{100 * table['success_detectable'][1]:.0f}"
     (_, note) = comparison_table(table, 0.2, "risk").notes
     assert note.endswith(
-        "These maps are too few for any difference to be significant, and to estimate how many maps a test needs."
+        "There are too few maps for a significant difference, and for an estimate of the number of maps needed."
     )
 
 

@@ -153,7 +153,7 @@ def test_a_figure_with_λ_as_it_was_says_so(tmp_path: Path) -> None:
     made.held_recording(about=about).save(folder / "playback" / "a.npz")
     write_report(folder)
     text = (folder / "summary.md").read_text()
-    assert "Below: the whole driven path over the λ field." in text
+    assert "Below: complete driven path over the λ field." in text
 
 
 @pytest.mark.parametrize("outcome", ["planner_error", "model_error"])

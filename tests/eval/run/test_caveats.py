@@ -199,7 +199,7 @@ def test_of_a_product_exactly_the_combinations_that_can_be_run_are_left(
         "risks": ("mean", "single-class"), "beliefs": ("static", "copula"), "world": ("paper", "stakes"),
     }  # fmt: skip
     suite = suite_on(dataset_path, robots=("unicycle",), maps=1, **listed)
-    checked = check_suite(suite, elsewhere=False)
+    checked = check_suite(suite, uses_workers=False)
     columns = ("planner", "model", "risk", "belief", "world")
     labels = [condition.labels for condition in conditions_of(suite, scenarios_of)]
     # What a condition does not use is like a label with which all goes together.
@@ -238,7 +238,7 @@ def test_what_is_left_out_is_told_before_anything_is_run_and_until_it_can_be_run
     assert line in caveats(open_run(tmp_path / "run").manifest)
     # The class has learnt its classes.
     monkeypatch.setattr(TwoModes, "class_names", ("firm", "soft"))
-    checked = check_suite(suite, elsewhere=False)
+    checked = check_suite(suite, uses_workers=False)
     work = Work(**vars(checked), suite={}, record="none", settings=Settings())
     begin(work, tmp_path / "run", said.append)
     assert open_run(tmp_path / "run").manifest["dropped"] == []
@@ -254,8 +254,8 @@ def test_a_planner_whose_settings_are_never_prepared_is_refused(
         dataset_path, planners=(FREE, HAZARD), robots=("unicycle",), world="paper"
     )
     with pytest.raises(ConfigError, match="immobilises robots for `hazard`"):
-        check_suite(suite, elsewhere=False)
-    left = check_suite(replace(suite, world=("paper", "stakes")), elsewhere=False)
+        check_suite(suite, uses_workers=False)
+    left = check_suite(replace(suite, world=("paper", "stakes")), uses_workers=False)
     assert [entry["world"] for entry in left.dropped] == ["paper"]
 
 
@@ -281,11 +281,11 @@ def test_a_hypothesis_on_what_is_left_out_is_refused(
     )  # fmt: skip
     if words:
         with pytest.raises(
-            ConfigError, match=f"names one that cannot be run: .*{words}"
+            ConfigError, match=f"in which one condition cannot be run: .*{words}"
         ):
-            check_suite(suite, elsewhere=False)
+            check_suite(suite, uses_workers=False)
     else:
-        assert len(check_suite(suite, elsewhere=False).hypotheses["tests"]) == 1
+        assert len(check_suite(suite, uses_workers=False).hypotheses["tests"]) == 1
 
 
 @pytest.mark.parametrize("once", [False, True])

@@ -77,10 +77,10 @@ def test_conditions_that_do_not_repeat_are_named_with_the_cause(
         for line in lines
     }
     assert causes == {
-        "Clock": "a part depends on something outside, such as a clock, entropy or the order of threads",
+        "Clock": "a part depends on external input, such as a clock, entropy or the order of threads",
         "Python": "a part draws from the global generator of random",
         "NumPy": "a part draws from the global generator of numpy.random",
         "Torch": "a part draws from the global generator of torch",
-        "Counting": "a part keeps state between episodes or units, so that rows depend on what ran before",
+        "Counting": "a part keeps state between episodes or units, so that rows depend on earlier episodes",
     }
     assert not any("planning" in line for line in lines)

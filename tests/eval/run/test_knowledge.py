@@ -18,7 +18,7 @@ from benchnav.core.terrain import Terrain
 from benchnav.eval.experiment.condition import conditions_of
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.run.isolation import IsolatedPlanner
-from benchnav.eval.run.knowledge import Knowing, Learning
+from benchnav.eval.run.knowledge import KnowledgeTracker, Learning
 from benchnav.eval.run.rollout import Episodes, run_episodes
 from benchnav.models.predictor import Oracle
 from benchnav.planning import risk
@@ -321,7 +321,7 @@ def test_what_was_not_sensed_changes_no_action(
 
 def told(how: Learning, problem: Problem, steps: int) -> list[tuple[int, Problem]]:
     """When robots that drive along x are told of another map, and of which."""
-    knowledge, state, found = Knowing(how, problem), problem.start.clone(), []
+    knowledge, state, found = KnowledgeTracker(how, problem), problem.start.clone(), []
     for step in range(steps):
         revised = knowledge.learn(step, state, torch.ones(BATCH, dtype=torch.bool))
         if revised is not None:
@@ -399,7 +399,7 @@ def test_the_goal_that_stays_free_is_that_of_the_episode_that_is_left() -> None:
     truth = replace(
         given.learning.truth, field=torch.zeros_like(given.learning.truth.field)
     )
-    knowing = Knowing(
+    knowing = KnowledgeTracker(
         replace(given.learning, truth=truth), replace(given.problem, goal_m=goal)
     )
     knowing.keep(torch.tensor([1]))
@@ -416,7 +416,10 @@ def test_a_robot_that_has_ended_sees_and_senses_nothing_more() -> None:
         sensor=Near(range_m=2.0), ground=Probe(1.0), covariance=ALIKE,
         predict=lambda terrain, seen: Oracle().predict_terrain(terrain),
     )  # fmt: skip
-    knowing, running = Knowing(given.learning, given.problem), torch.arange(BATCH) < 3
+    knowing, running = (
+        KnowledgeTracker(given.learning, given.problem),
+        torch.arange(BATCH) < 3,
+    )
     before = knowing.known
     knowing.learn(0, given.problem.start + torch.tensor([3.0, 3.0, 0.0]), running)
     for name in ("seen", "ever_sensed"):
@@ -660,7 +663,7 @@ def test_the_error_keeps_how_episodes_end(call: str) -> None:
 def test_what_is_measured_ahead_is_what_each_cell_ahead_tells() -> None:
     given = drives(ground=Probe(1.0))
     problem, truth, how = given.problem, given.learning.truth, given.learning.learner
-    knowing = Knowing(given.learning, problem)
+    knowing = KnowledgeTracker(given.learning, problem)
     states = problem.start.clone()
     states[:, 2] = torch.linspace(-3, 3, BATCH)
     states[3, :2] = torch.tensor([6.1, 5.7])
@@ -747,7 +750,7 @@ def test_who_has_ended_senses_nothing_more_whenever_it_leaves_the_batch(
 
 def test_planners_are_told_nothing_of_episodes_whose_map_stays() -> None:
     given = drives(ground=Probe(1.0))
-    knowing = Knowing(given.learning, given.problem)
+    knowing = KnowledgeTracker(given.learning, given.problem)
     running = torch.arange(BATCH) < 3
     (told,) = [knowing.learn(0, given.problem.start, running)]
     assert told is not None
@@ -770,7 +773,9 @@ def test_λ_that_is_drawn_anew_is_what_it_is_in_each_step(belief: Belief[Any]) -
         drawn.append(step)
         return torch.full((BATCH, SIZE, SIZE), 0.1 * (step + 1))
 
-    knowing = Knowing(replace(given.learning, field_at=field_at), given.problem)
+    knowing = KnowledgeTracker(
+        replace(given.learning, field_at=field_at), given.problem
+    )
     knowing.keep(torch.tensor([3, 1, 0]))
     running = torch.ones(3, dtype=torch.bool)
     for step in range(8):

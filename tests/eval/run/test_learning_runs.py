@@ -259,7 +259,7 @@ def test_a_run_that_is_not_whole_goes_on_to_the_same_rows(
             path.unlink()
     said: list[str] = []
     finish(suite, folder, say=said.append)
-    assert "6 of 8 units were there already" in said
+    assert "6 of 8 units were already finished" in said
     assert same(*(read_table(place, EPISODES) for place in (whole, folder)))
 
 

@@ -149,7 +149,7 @@ def test_a_merged_run_is_gone_on_with_and_extended(
     }
     said: list[str] = []
     list(run_suite(suite, tmp_path / "all", say=said.append))
-    assert said == ["12 of 12 units were there already"]
+    assert said == ["12 of 12 units were already finished"]
     longer = replace(suite, seeds=(0, 1, 2, 3))
     finish(longer, tmp_path / "all")
     assert {path: path.stat().st_mtime_ns for path in before} == before
@@ -195,7 +195,7 @@ def test_a_folder_holds_one_shard(
 def test_a_whole_run_is_no_shard(
     suite: Suite, whole: Path, parts: list[Path], tmp_path: Path
 ) -> None:
-    with pytest.raises(ConfigError, match="holds a whole run"):
+    with pytest.raises(ConfigError, match="contains an unsharded run"):
         finish(suite, whole, Shard(index=1, of=OF))
     with pytest.raises(ConfigError, match="whole run"):
         list(merge_shards([*parts, whole], tmp_path / "all"))
@@ -216,7 +216,7 @@ def test_a_shard_without_units_is_not_needed(suite: Suite, tmp_path: Path) -> No
     full = [folder for folder in folders if (folder / "units").exists()]
     assert len(full) == 1
     (line,) = [one for one in said if "measuring" not in one]
-    assert line.endswith(" holds none of the 1 units")
+    assert line.endswith(" contains none of the 1 units")
     assert len(said) == 2
     list(merge_shards(full, tmp_path / "all"))
     assert len(pd.read_parquet(tmp_path / "all" / "episodes.parquet")) == 2
@@ -231,9 +231,9 @@ def test_missing_units_are_told_with_their_shards(
     for given, expected in (
         (
             [parts[0], parts[2]],
-            rf"got none for: {count} units of shard 2/3, 1 unit of shard 3/3 in .*part3",
+            rf"these are missing: {count} units of shard 2/3, 1 unit of shard 3/3 in .*part3",
         ),
-        (parts, r"got none for: 1 unit of shard 3/3 in .*part3"),
+        (parts, r"these are missing: 1 unit of shard 3/3 in .*part3"),
     ):
         with pytest.raises(ConfigError, match=expected):
             list(merge_shards(given, tmp_path / "all"))
@@ -251,7 +251,7 @@ def change_run(part: Path, change: Callable[[dict], None]) -> None:  # type: ign
     [
         (lambda about: next(iter(about["datasets"].values()))["maps"]["test/hs"].reverse(), "maps of .* test/hs"),
         (lambda about: about["shard"].update(of=4), "number of shards"),
-        (lambda about: about["conditions"].popitem(), "lacks .*hs .*bad"),
+        (lambda about: about["conditions"].popitem(), "missing in .*hs .*bad"),
         (
             lambda about: [(t["draws"].pop(), t["seeds"].pop()) for t in about["conditions"].values()],
             "seeds, realisations or maps",
@@ -296,7 +296,7 @@ def test_shards_that_other_code_made_are_refused_by_what_differs(
     pq.write_table(with_metadata(pq.read_table(path, partitioning=None), about), path)
     with pytest.raises(
         ConfigError,
-        match=rf"Expected shards made by one code, got .*, which differ in ({expected})",
+        match=rf"Expected all shards to be run with the same code, got .*, which differ in ({expected})",
     ):
         list(merge_shards(parts, tmp_path / "all"))
     assert not (tmp_path / "all").exists()
@@ -339,7 +339,7 @@ def test_a_merge_that_is_killed_leaves_nothing_and_can_be_given_again(
 
 def test_a_folder_that_is_there_is_not_merged_into(parts: list[Path]) -> None:
     before = sorted(parts[0].rglob("*"))
-    with pytest.raises(ConfigError, match="the new folder as OUT"):
+    with pytest.raises(ConfigError, match="a new folder as OUT"):
         list(merge_shards(parts[1:], parts[0]))
     assert sorted(parts[0].rglob("*")) == before
 
@@ -425,7 +425,7 @@ def test_damaged_units_and_parts_that_read_something_else_are_not_merged(
     )
     with pytest.raises(
         ConfigError,
-        match=r"parts read the same, got .*part\d.*differs .* in file a\.npz\. Give",
+        match=r"same files, packages and environment variables, got .*part\d.*differs .* in file a\.npz\. Run",
     ):
         list(merge_shards(parts, tmp_path / "all"))
     scores = pa.array([0.25] * len(table))

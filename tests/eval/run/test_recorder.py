@@ -311,7 +311,7 @@ def test_what_is_asked_for_is_recorded(
     assert recorded(other) == wanted
     # The same again finds all done.
     run(dataset, other, risks=("mean", "cvar"), **given, say=said.append)
-    assert said[-1] == "4 of 4 units were there already"
+    assert said[-1] == "4 of 4 units were already finished"
 
 
 def test_plans_after_the_moment_of_figures_are_thinned(stakes: Path) -> None:
@@ -323,7 +323,7 @@ def test_plans_after_the_moment_of_figures_are_thinned(stakes: Path) -> None:
     assert recorder.observer.plan_interval == 5
     samples = torch.rand(4, 40, 30, 2)
     for step in (0, 150, 155, 900):
-        recorder.watch(step, Plan.empty(4, samples=samples), [0, 1, 2, 3])
+        recorder.store_plan(step, Plan.empty(4, samples=samples), [0, 1, 2, 3])
     for member, plans in recorder._plans.items():
         whole = drawn_plan(0, {"samples": samples[member]})
         assert [plan.step for plan in plans] == [0, 150, 155, 900]
@@ -359,10 +359,12 @@ def test_what_watched_episodes_know_is_kept_to_their_end(stakes: Path) -> None:
 
     knowing: Any = Knows()
     for step in (0, 4, 5, 8):
-        recorder.learn(step, knowing)
+        recorder.store_knowledge(step, knowing)
     states, actions = np.zeros((6, 3)), np.zeros((5, 2))
     for member, wanted in ((1, [0, 4, 5]), (3, [0, 4, 5]), (0, [])):
-        known = recorder.driven(member, "stuck", states, actions, np.zeros(5)).known
+        known = recorder.recording_from_states(
+            member, "stuck", states, actions, np.zeros(5)
+        ).known
         assert [each.step for each in known] == wanted
         for each in known:
             np.testing.assert_allclose(each.mean, first.mean / member, atol=1e-3)

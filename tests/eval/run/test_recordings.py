@@ -19,9 +19,9 @@ from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.failures import failures_table
 from benchnav.eval.folder.run_folder import open_run, read_table, write_run
 from benchnav.eval.folder.steps import read_steps
-from benchnav.eval.recording import GROUND, Ground, Recording
+from benchnav.eval.recording import GROUND, RecordedMap, Recording
 from benchnav.eval.report.write import write_report
-from benchnav.eval.run.recordings import keep_ground, record_driven, telling_map
+from benchnav.eval.run.recordings import most_differing_map, record_driven, write_ground
 from benchnav.eval.run.runner import run_suite
 from benchnav.eval.run.unit import Settings, build
 from tests.eval.forged import forge_rows
@@ -46,8 +46,10 @@ def test_the_map_that_is_kept_is_the_telling_one_with_λ_as_robots_met_it(
     dataset: Path, tmp_path: Path
 ) -> None:
     folder = run(dataset, tmp_path / "run", planners=PLANNERS, risks=("mean",))
-    kept = Ground.load(folder / GROUND)
-    assert dict(kept.about) == telling_map(pd.read_parquet(folder / "episodes.parquet"))
+    kept = RecordedMap.load(folder / GROUND)
+    assert dict(kept.about) == most_differing_map(
+        pd.read_parquet(folder / "episodes.parquet")
+    )
     same = on_map(folder, kept.about)
     assert len(same) == 2
     for recording in same:
@@ -77,8 +79,8 @@ def test_whichever_map_is_telling_is_kept_under_its_own_noise(
         # All succeed but one of the two on this map.
         arrived = ~here | (rows["planner"] == "straight")
         forge_rows(folder, rows.assign(outcome=np.where(arrived, "success", "timeout")))
-        keep_ground(folder)
-        kept = Ground.load(folder / GROUND)
+        write_ground(folder)
+        kept = RecordedMap.load(folder / GROUND)
         asked = {"seed": seed, "realisation": realisation, "map": map_index}
         assert {name: kept.about[name] for name in asked} == asked
         same = on_map(folder, kept.about)
@@ -132,7 +134,7 @@ def episodes(ended: dict[int, list[bool]]) -> pd.DataFrame:
 def test_the_map_is_one_on_which_outcomes_differ(
     ended: dict[int, list[bool]], map_index: int
 ) -> None:
-    about = telling_map(episodes(ended))
+    about = most_differing_map(episodes(ended))
     assert about == {"data": "paper-v1", "scenario": "std", "world": "stakes", "seed": 0, "realisation": 0,
                      "map": map_index}  # fmt: skip
     assert type(about["seed"]) is int
@@ -147,7 +149,7 @@ def test_noise_and_worlds_tell_maps_apart() -> None:
                  (7, 1, "mean", "b") else 9.0)
         for one in labels for seed in (0, 7) for draw in (0, 1)
     )  # fmt: skip
-    about = telling_map(rows)
+    about = most_differing_map(rows)
     assert (about["world"], about["seed"], about["realisation"]) == ("b", 7, 1)
 
 
@@ -209,7 +211,8 @@ def test_the_report_shows_failures_and_says_what_the_planner_was_told(
     assert (failed / "figures" / "failures.png").stat().st_size > 5000
     assert "![failures](figures/failures.png)" in (failed / "summary.md").read_text()
     assert any(
-        "the predicted λ̂ was " in said for said in next(iter(report.findings.values()))
+        "these episodes ended, λ̂ was " in said
+        for said in next(iter(report.findings.values()))
     )
     assert report.warnings == () or "No sheet" not in report.warnings[-1]
 

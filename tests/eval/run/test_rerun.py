@@ -1,4 +1,4 @@
-"""A run that is repeated says truly whether its rows came out the same, and what
+"""A run that is repeated says truly whether its rows are identical, and what
 differs around it.
 """
 
@@ -69,7 +69,7 @@ def test_a_run_that_was_extended_by_commands_is_repeated_whole(
     assert repeat(run, tmp_path / "again") == (
         True,
         [
-            f"all {2 * 2 + 2 * 1 + 2 * 2 * 2} rows came out the same",
+            f"all {2 * 2 + 2 * 1 + 2 * 2 * 2} rows are identical",
             "no difference between the recorded environments",
         ],
     )
@@ -117,7 +117,7 @@ def test_rows_that_differ_are_counted_and_the_first_named(
     )
     same, lines = repeat(run, tmp_path / "again")
     assert not same
-    assert lines[0] == "6 of 16 rows came out differently, in 1 of 2 conditions:"
+    assert lines[0] == "6 of 16 rows differ, in 1 of 2 conditions:"
     assert "planner Mine" in lines[1]
     assert lines[1].endswith("6 rows")
     named = [line for line in lines if "outcome timeout → success" in line]
@@ -128,7 +128,7 @@ def test_rows_that_differ_are_counted_and_the_first_named(
         "planner == 'Mine' and seed > 0"
     )
     greatest = (time_s["total_time_s"] - 12.5).abs().max()
-    assert f"greatest differences: total_time_s {greatest:.3g}" in lines
+    assert f"largest differences: total_time_s {greatest:.3g}" in lines
 
 
 def test_wall_time_is_no_difference(suite: Suite, tmp_path: Path) -> None:
@@ -147,7 +147,7 @@ def test_code_that_changed_is_named_beside_the_rows(
     )
     (tmp_path / "mine.py").write_text(slower)
     _, lines = repeat(run, tmp_path / "again")
-    assert lines[0].startswith("2 of 4 rows came out differently")
+    assert lines[0].startswith("2 of 4 rows differ")
     assert (
         len([line for line in lines if "outcome success → planner_failure" in line])
         == 2
@@ -190,11 +190,11 @@ def test_files_that_a_part_imports_or_is_named_are_seen_by_extension_resumption_
             copy, said = Path(shutil.copytree(run, tmp_path / "copy")), list[str]()
             finish(asked, copy, say=said.append)
             (line,) = [line for line in said if "are run again" in line]
-            assert f"finished by other code or maps {told} and are run again" in line
+            assert f"run with other code or maps {told} and are run again" in line
             shutil.rmtree(copy)
         if changed is weights:
             _, lines = repeat(run, tmp_path / "again")
-            assert lines[0].startswith("2 of 2 rows came out differently")
+            assert lines[0].startswith("2 of 2 rows differ")
             assert (
                 lines[-1]
                 == f"the environments differ in: weights.txt of {name}; file weights.txt"
@@ -204,7 +204,7 @@ def test_files_that_a_part_imports_or_is_named_are_seen_by_extension_resumption_
     next(steps)
     weights.write_text("3.0")
     with pytest.raises(
-        ConfigError, match=r"that the run was begun with, got changes: weights\.txt of"
+        ConfigError, match=r"with which the run was begun, got changes: weights\.txt of"
     ):
         list(steps)
     del sys.modules["helper_of_mine"]
@@ -250,7 +250,7 @@ def test_all_that_is_no_longer_there_is_told_before_anything_is_run(
     (tmp_path / "tiny.h5").unlink()
     with pytest.raises(
         ConfigError,
-        match=r"all inputs of .*run, got missing ones: .*dataset.*tiny\.h5.*mine\.py",
+        match=r"all inputs of .*run, but some are missing: .*dataset.*tiny\.h5.*mine\.py",
     ):
         repeat(run, tmp_path / "again")
     assert not (tmp_path / "again").exists()
@@ -334,13 +334,13 @@ def test_the_command_ends_with_0_1_or_2(  # type: ignore[no-untyped-def]
     run = finish(suite, tmp_path / "run")
     status, printed, _ = told(str(run))
     assert status == 0
-    assert "all 4 rows came out the same" in printed
+    assert "all 4 rows are identical" in printed
     assert (tmp_path / "run-rerun" / "episodes.parquet").exists()
     change_rows(run, {"score": 0.25}, "map == 1")
     status, printed, error = told(str(run))
     assert status == 1
-    assert "2 of 2 units were there already" in error
-    assert "2 of 4 rows came out differently" in printed
+    assert "2 of 2 units were already finished" in error
+    assert "2 of 4 rows differ" in printed
     status, _, error = told(str(run), "--overwrite", "--out", str(tmp_path / "other"))
     assert status == 1
     assert "already" not in error

@@ -11,11 +11,11 @@ from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.run.rollout import Episodes
 from benchnav.eval.run.rows import (
-    Draws,
+    References,
     episode_rows,
+    episodes_without_steps,
     finished_episodes,
     step_table,
-    unbegun_episodes,
 )
 from benchnav.metrics.base import Episode, Metric, MetricError
 from benchnav.metrics.shipped import SHIPPED
@@ -97,7 +97,9 @@ def rows(
     own: Unit | None = None,
     reference_time_s: tuple[float, float] = (0.1, 20.0),
 ) -> pd.DataFrame:
-    draws = Draws(reference_time_s=np.array(reference_time_s), rejected_draws=[0, 3])
+    draws = References(
+        reference_time_s=np.array(reference_time_s), rejected_draws=[0, 3]
+    )
     finished = finished_episodes(problem, episodes, draws)
     return episode_rows(own or unit(), GROUPS, finished, episodes.errors, compiled=True)
 
@@ -165,7 +167,7 @@ def test_rows_of_a_failed_model_have_the_columns_of_all_rows() -> None:
     problem, episodes = made()
     table, places = rows(problem, episodes), factories.places(torch.full((2, 2), 5.0))
     task, budget_s = problem.task, torch.tensor([50.0, 60.0])
-    unbegun = unbegun_episodes(task, places, budget_s, Outcome.MODEL_ERROR)
+    unbegun = episodes_without_steps(task, places, budget_s, Outcome.MODEL_ERROR)
     failed = episode_rows(
         unit(), GROUPS, unbegun, ["ValueError: no idea"] * 2, compiled=False
     )

@@ -93,9 +93,9 @@ def unused(suite: Suite, folder: Path, **options: object) -> str:
     said: list[str] = []
     rows = finish(suite, folder, say=said.append, **options)
     count = rows["condition"].nunique()
-    assert not any("were there already" in line for line in said)
+    assert not any("already finished" in line for line in said)
     (line,) = [line for line in said if "are run again" in line]
-    begun = f"{count} of {count} units were finished by other code or maps ("
+    begun = f"{count} of {count} units were run with other code or maps ("
     assert line.startswith(begun)
     differing, _, rest = line.removeprefix(begun).rpartition(") and are run again")
     assert rest.startswith("; --reuse-code")
@@ -227,7 +227,7 @@ def test_a_killed_run_goes_on_to_the_same_rows(
     )
     assert all(path.stat().st_mtime_ns == when for path, when in kept.items())
     measured = "measuring the planning time of a single robot"
-    assert said == [f"{len(kept)} of 14 units were there already", measured]
+    assert said == [f"{len(kept)} of 14 units were already finished", measured]
 
 
 def test_workers_end_with_a_command_that_was_killed(
@@ -276,7 +276,7 @@ def test_the_same_suite_again_runs_nothing_and_says_so(
     again = finish(quick(dataset_path), folder, say=said.append)
     pd.testing.assert_frame_equal(first, again)
     assert {path: path.stat().st_mtime_ns for path in before} == before
-    assert said == ["4 of 4 units were there already"]
+    assert said == ["4 of 4 units were already finished"]
 
 
 @pytest.mark.parametrize(
@@ -361,7 +361,7 @@ def test_an_extension_under_a_label_that_is_taken_is_refused(
 ) -> None:
     finish(quick(dataset_path, scenarios=("std",)), tmp_path / "run")
     late = {"part": "tests.eval.parts:Faulty", "options": {"after_s": 2.0}}
-    with pytest.raises(ConfigError, match="both called 'Faulty'"):
+    with pytest.raises(ConfigError, match="with the label 'Faulty'"):
         finish(
             quick(dataset_path, scenarios=("std",), planners=(late,)), tmp_path / "run"
         )
@@ -381,7 +381,7 @@ def test_code_that_changes_while_a_run_goes_on_makes_no_table(
     next(steps)
     mine.write_text(mine.read_text() + "# edited\n")
     with pytest.raises(
-        ConfigError, match=r"that the run was begun with, got changes: .*mine\.py"
+        ConfigError, match=r"with which the run was begun, got changes: .*mine\.py"
     ):
         list(steps)
     assert not (tmp_path / "run" / "episodes.parquet").exists()
@@ -404,7 +404,7 @@ def test_a_unit_of_another_run_counts_if_the_same_made_it(
         finish(suite, tmp_path / "two", say=said.append),
         pd.read_parquet(tmp_path / "one" / "episodes.parquet"),
     )
-    assert said == ["1 of 1 units were there already"]
+    assert said == ["1 of 1 units were already finished"]
     # Under other seeds it is another unit, also where it lies under its name.
     shutil.copy(
         tmp_path / "one" / unit,
@@ -471,7 +471,7 @@ def test_a_table_does_not_stay_beside_newer_units_than_it_holds(
     list(run_suite(narrow, tmp_path / "run", say=said.append))
     assert not (tmp_path / "run" / EPISODES).exists()
     assert "1 of 2 conditions" in said[-1]
-    assert "(1 of their units are of other code or maps)" in said[-1]
+    assert "(1 of their units were run with other code or maps)" in said[-1]
     # The units of the old code are still there and count again with it.
     monkeypatch.undo()
     list(run_suite(narrow, tmp_path / "run"))
@@ -594,7 +594,7 @@ def test_units_of_other_code_or_maps_are_kept_and_not_used_and_what_changed_is_n
         list[str](),
     )
     same(finish(suite, folder, say=said.append), rows)
-    assert said == ["2 of 2 units were there already"]
+    assert said == ["2 of 2 units were already finished"]
     assert {path: path.stat().st_mtime_ns for path in folder.glob("units/*/*")} == files
     assert len(files) == 4
 
@@ -614,19 +614,24 @@ def test_units_of_other_code_are_taken_when_asked_for_and_marked(
     rows = finish(
         replace(suite, seeds=(0, 5)), folder, reuse_code=True, say=said.append
     )
-    assert "1 of 2 units were there already" in said
+    assert "1 of 2 units were already finished" in said
     assert not any("not used" in line for line in said)
     codes = dict(zip(rows["seed"], rows["code"], strict=True))
     assert codes[0] == first["code"].iloc[0] != codes[5]
     about = open_run(folder).manifest
     assert set(about["codes"]) == set(codes.values())
-    line = f"1 of 2 units were made by other code (planner {mine}:Mine); column `code` indicates which rows"
+    line = (
+        f"1 of 2 units were run with other code (planner {mine}:Mine); the column "
+        "`code` identifies the code of each row"
+    )
     assert about["reused"] == line
     report = write_report(folder)
     assert f"warning: {line}" in report.warnings
     # Rows of other code are compared with none of this code, unless that is asked for.
     finish(replace(suite, seeds=(0, 5), risks=("cvar",)), folder, reuse_code=True)
-    with pytest.raises(ConfigError, match="got conditions made by different code"):
+    with pytest.raises(
+        ConfigError, match="got conditions that were run with different code"
+    ):
         compare_runs([folder], "risk", "", {}, 0.05)
     # Without it the unit is run anew, and nothing is marked.
     finish(replace(suite, seeds=(0, 5)), folder)
@@ -675,7 +680,7 @@ def test_what_was_recorded_by_other_code_is_not_taken_for_this(
     mine.write_text(MINE)
     said: list[str] = []
     finish(suite, folder, say=said.append)
-    assert "1 of 1 units are run again for recordings or steps that they lack" in said
+    assert "1 of 1 units have no recordings or steps and are run again" in said
     pd.testing.assert_frame_equal(read_steps(folder), driven)
     # What is lost is made again with all that was kept, though less is asked for now.
     shutil.rmtree(folder / "steps")
@@ -861,7 +866,7 @@ def test_a_run_that_lacks_maps_tells_how_they_are_made(tmp_path: Path) -> None:
         name: replace(recipe.splits[name], maps=2) for name in ("test/std", "test/hg")
     }
     path = factories.tiny_dataset(tmp_path / "few.h5", replace(recipe, splits=few))
-    made = "All maps of tiny-v1 are made with `benchnav-datagen create tiny-v1`"
+    made = "Create all maps of tiny-v1 by `benchnav-datagen create tiny-v1`"
     for changes, told in (
         ({"maps": 3}, True),
         ({"maps": 5}, False),
@@ -976,7 +981,7 @@ def test_hypotheses_are_fixed_before_the_first_unit_and_stay(
     report = write_report(folder)
     assert report.tests["n_episodes"].tolist() == [4]
     assert (
-        "extended after the hypotheses were fixed (episodes a condition: 2 then, 4 now)"
+        "extended after the hypotheses were fixed (episodes per condition: 2 then, 4 now)"
         in next(iter(report.findings.values()))[-1]
     )
     other = (given | {"metric": "score"},)

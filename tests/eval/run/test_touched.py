@@ -164,15 +164,17 @@ def test_what_a_part_reads_is_recorded_and_a_change_runs_its_unit_again(
         code["touched"]
         for code in open_run(own.parent / "run").manifest["codes"].values()
     ]
-    assert run(own, dataset_path, "run") == ["2 of 2 units were there already"]
+    assert run(own, dataset_path, "run") == ["2 of 2 units were already finished"]
 
     monkeypatch.setenv("OWN_GAIN", "0.5")
     assert changed_entries(touched) == ["variable OWN_GAIN"]
     assert run(own, dataset_path, "run", reuse_code=True) == [
-        "2 of 2 units were there already"
+        "2 of 2 units were already finished"
     ]
     reused = open_run(own.parent / "run").manifest["reused"]
-    assert reused.startswith("1 of 2 units were made by other code (variable OWN_GAIN)")
+    assert reused.startswith(
+        "1 of 2 units were run with other code (variable OWN_GAIN)"
+    )
     (own / "speed.json").write_text("0.4")
     (own / "helper.py").write_text("FACTOR = 0.9")
     _install(own.parent / "site", "ownlib", "2.0")
@@ -183,13 +185,13 @@ def test_what_a_part_reads_is_recorded_and_a_change_runs_its_unit_again(
         del sys.modules[name]
     sources.load_file.cache_clear()  # as in a new process
     done, again, *_ = run(own, dataset_path, "run")
-    assert done == "1 of 2 units were there already"
+    assert done == "1 of 2 units were already finished"
     start, _, changes = again.partition("changed: ")
-    assert start == "1 of 2 units are run again, since what their parts read "
+    assert start == "1 of 2 units are run again, since their parts read "
     assert {Path(change).name for change in changes.split("; ")} == {
         "speed.json", "helper.py", "variable OWN_GAIN", "package ownlib (1.0 to 2.0)",
     }  # fmt: skip
-    assert run(own, dataset_path, "run") == ["2 of 2 units were there already"]
+    assert run(own, dataset_path, "run") == ["2 of 2 units were already finished"]
 
 
 def test_a_process_that_imported_a_part_earlier_cannot_run_it_on_a_changed_file(
@@ -200,7 +202,7 @@ def test_a_process_that_imported_a_part_earlier_cannot_run_it_on_a_changed_file(
     (own / "speed.json").write_text("0.4")
     with pytest.raises(
         ConfigError,
-        match=r"stay the same during the run, got changes: file .*speed\.json",
+        match=r"not to change during the run, got changes: file .*speed\.json",
     ):
         run(own, dataset_path, "run")
 
@@ -226,7 +228,7 @@ def test_what_changes_during_a_run_ends_it(
     monkeypatch.setattr(runner, "measure_latencies", change)
     with pytest.raises(
         ConfigError,
-        match=r"stay the same during the run, got changes: file .*speed\.json\. Give",
+        match=r"not to change during the run, got changes: file .*speed\.json\. Run",
     ):
         run(own, dataset_path, "run")
 

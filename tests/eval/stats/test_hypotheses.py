@@ -147,19 +147,19 @@ def test_the_digest_is_that_of_all_that_is_claimed(change: dict[str, Any]) -> No
         ),
         ({"metrics": "score"}, r"keys of hypothesis 1 .*Did you mean 'metric'\?"),
         ({3: 4}, "keys of hypothesis 1 .*got '3'"),
-        ({"margin": 1}, "Leave it out"),
+        ({"margin": 1}, "Leave `margin` out"),
         (
             {"kind": "equivalence"},
-            "test of equivalence, above 0 and below 100 points, got 0",
+            "above 0 and below 100 points, since it claims equivalence, got 0",
         ),
         (
             {"kind": "superiority"},
-            "test of superiority, above 0 and below 100 points, got 0",
+            "above 0 and below 100 points, since it claims superiority, got 0",
         ),
         ({"kind": "equivalence", "margin": -1}, "above 0 .*got -1"),
-        ({"kind": "equivalence", "margin": 100}, "below 100 points, got 100"),
+        ({"kind": "equivalence", "margin": 100}, "below 100 points, since .*, got 100"),
         ({"kind": "equivalence", "margin": 1, "direction": "lower"}, "no `direction`"),
-        ({"one": MEAN}, "two conditions that are the same in"),
+        ({"one": MEAN}, "two conditions with the same labels in"),
         (
             {"one": {"planner": "straight"}, "other": {"planner": "mppi"}},
             r"differ in risk .*Name the risk in `other`",
@@ -184,17 +184,18 @@ def test_other_maps_worlds_budgets_and_doubles_are_refused() -> None:
         }
 
     with pytest.raises(
-        ConfigError, match="same maps under the same λ, got two of another scenario"
+        ConfigError,
+        match="same maps with the same draws of λ, got two that differ in scenario",
     ):
         fixed(named("scenario", "std", "hg"), scenarios=("std", "hg"))
-    with pytest.raises(ConfigError, match="two of another world"):
+    with pytest.raises(ConfigError, match="two that differ in world"):
         fixed(named("world", "paper", "stakes"), world=("paper", "stakes"))
     robots = {"robots": ("unicycle", "differential_drive"), "world": "stakes"}
     fixed(named("robot", "unicycle", "differential_drive"), **robots)
-    with pytest.raises(ConfigError, match="robots of different T"):
+    with pytest.raises(ConfigError, match="robots with different T"):
         fixed(named("robot", "unicycle", "differential_drive", "T_total"), **robots)
     same = {"one": CVAR, "other": MEAN, "metric": "success"}
-    with pytest.raises(ConfigError, match="got twice"):
+    with pytest.raises(ConfigError, match="got the same one twice"):
         fixed(same, dict(same))
 
 

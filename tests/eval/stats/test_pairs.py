@@ -196,31 +196,31 @@ def test_runs_that_share_conditions_are_compared_with_each_other() -> None:
         (
             {"value": {"world": {**STAKES, "correlation_m": 3.0}}},
             {},
-            "differ in their risk and in nothing else",
+            "differ only in their risk",
         ),
         (
             {"value": {"planner": {"part": "mppi", "options": {"samples": 9}}}},
             {},
-            "and in nothing else",
+            "differ only in their",
         ),
         (
             {"value": {"rules": {**RULES, "goal_radius_m": 2.0}}},
             {},
-            "differ in their risk and in nothing else",
+            "differ only in their risk",
         ),
-        ({"maps": ["a", "b", "x", "d"]}, {}, "other digests"),
+        ({"maps": ["a", "b", "x", "d"]}, {}, "whose maps differ"),
         (
             {"episodes": [row(condition("mppi", "cvar"), 0, seed=7)]},
             {},
             "seeds 7, realisations 0 and seeds 0",
         ),
-        ({"scenario": "hg"}, {}, "differ in their risk and in nothing else"),
+        ({"scenario": "hg"}, {}, "differ only in their risk"),
         (
             {"risk": "mean", "planner": "cl_rrt"},
             {},
-            r"They differ in planner \(cl_rrt, mppi\): try `--by planner`",
+            r"They differ in planner \(cl_rrt, mppi\). Try `--by planner`",
         ),
-        ({}, {"by": "scenario"}, "other maps"),
+        ({}, {"by": "scenario"}, "data and scenario determine the maps"),
         ({}, {"by": "planer"}, "Did you mean 'planner'"),
         ({}, {"against": "meen"}, "Did you mean 'mean'"),
         ({}, {"by": "risk", "against": "mppi"}, "Expected `against` among mean, cvar"),
@@ -258,7 +258,7 @@ def test_worlds_are_paired_where_the_same_λ_is_drawn() -> None:
         {"noise": "stored"},
         {"immobile": {"below": 0.2, "for_s": 2.0}},
     ):
-        with pytest.raises(ConfigError, match="λ itself differs between their worlds"):
+        with pytest.raises(ConfigError, match="Their worlds draw different λ"):
             find_pairs([world("stakes"), world("other", **other)], by="world")
     resampled = [
         world("paper", noise="resampled"),
@@ -273,7 +273,7 @@ def test_values_decide_and_labels_are_for_people() -> None:
         compared(risk="cvar:0.5", value=one_value),
         compared(risk="half", value=one_value),
     ]
-    with pytest.raises(ConfigError, match="differ in their risk and in nothing else"):
+    with pytest.raises(ConfigError, match="differ only in their risk"):
         find_pairs(conditions)
 
 
@@ -298,7 +298,7 @@ def test_two_values_under_one_label_are_refused(
     conditions = [compared(run="a"), compared(run="b", value=value)]
     with pytest.raises(
         ConfigError,
-        match=rf"one {kind} under each label, got two that a and b call .*level None and 0\.9",
+        match=rf"one {kind} for each label, got two with the label .* in a and b: .*level None and 0\.9",
     ):
         check_one_value_each(conditions)
     check_one_value_each([compared(run="a"), compared(run="b")])
@@ -363,7 +363,7 @@ def test_what_robots_know_by_is_compared_one_thing_at_a_time() -> None:
         assert pair.members[0].labels[by] != label
     with pytest.raises(
         ConfigError,
-        match=r"They differ in .*belief \(copula, static\): try `--by belief`",
+        match=r"They differ in .*belief \(copula, static\). Try `--by belief`",
     ):
         find_pairs([learning("contact"), compared("mppi")], "risk")
 

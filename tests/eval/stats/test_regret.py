@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 from matplotlib.colors import to_rgba
 
-from benchnav.eval.figures.regret import _ENDS, Regret
+from benchnav.eval.figures.regret import _GREY, Regret
 from benchnav.eval.report.write import write_report
 from benchnav.eval.stats.regret import find_chains, split_regret
 from benchnav.viz.style import BLUE, ORANGE
@@ -227,7 +227,7 @@ def test_bars_are_orange_where_the_next_is_better_and_lines_are_their_intervals(
         bars = [
             bar
             for bar in panel.patches
-            if bar.get_facecolor()[:3] != to_rgba(_ENDS)[:3]
+            if bar.get_facecolor()[:3] != to_rgba(_GREY)[:3]
         ]
         lines = [line for line in panel.lines if line.get_color() == "black"]
         assert len(bars) == len(lines) == 4

@@ -1,1 +1,1 @@
-"""Episodes to watch: files for the Rerun viewer, the viewer in a browser, and videos."""
+"""Playback of episodes: files for the Rerun viewer, serving the viewer, and videos."""

@@ -1,10 +1,8 @@
 """Contents of the Rerun viewer: terrain, maps, and each robot's state and plans.
 
-For robots that learn, it also shows their knowledge over time, and the sensors'
-footprint.
-
-The terrain is a mesh under `world`, in metres; maps are images under `map`, in cells,
-their first row at the bottom.
+For robots that learn, the viewer also shows the belief over time and the sensors'
+footprint. The terrain is a mesh with the path `world`, in metres. Maps are images with
+the path `map`, in cells, with the first row at the bottom.
 """
 
 from collections.abc import Sequence
@@ -25,21 +23,22 @@ from benchnav.viz.style import bytes_of
 
 TIMELINE = "time"
 
+# Radii of lines of plans, for a width of 1 point.
 _RADIUS_M = 0.02
 _RADIUS_CELLS = 0.06
-_HEADING_M = 1.2
-# Drawing intervals of each part of the driven path; each entry logs the part from its
-# start.
-_PIECE = 10
-# A cross (X) in one stroke, and its half width.
+_HEADING_M = 1.2  # length of the arrow of the heading
+# The driven path is logged in segments of this number of drawing intervals. At each
+# interval, the current segment is logged again from its start.
+_SEGMENT = 10
+# A cross (X) in one stroke, and half of its width.
 _CROSS = np.array([(-1, -1), (1, 1), (0, 0), (-1, 1), (1, -1)], dtype=np.float32)
 _CROSS_M = 1.0
-_MARK = (255, 255, 255)
+_MARK = (255, 255, 255)  # colour of the cross
 _TRANSLUCENT = 160  # opacity of a plan, in [0, 255]
-_LIFT_M = 0.12  # of lines over the terrain
-_CLOSED = (240, 240, 240)  # edge of non-free cells
+_LIFT_M = 0.12  # height of lines over the terrain
+_CLOSED = (240, 240, 240)  # colour of the edge of non-free cells
 
-# Archetypes over the terrain and on the maps.
+# Archetypes for the terrain and for the maps.
 _POINTS = (rr.Points3D, rr.Points2D)
 _STRIPS = (rr.LineStrips3D, rr.LineStrips2D)
 
@@ -51,7 +50,7 @@ class Driver:
     Args:
         recording: episode of the robot.
         name: unique name; empty if there is only one robot.
-        colour: red, green, blue and opacity, in [0, 255].
+        colour: RGB colour, optionally with opacity, in [0, 255].
     """
 
     recording: Recording
@@ -59,20 +58,25 @@ class Driver:
     colour: tuple[int, ...]
 
     def entity(self, root: str, *leaf: str) -> str:
-        """Return the path of an entity of the robot under a root."""
+        """Return the path of an entity of the robot.
+
+        Args:
+            root: start of the path, such as `world`.
+            *leaf: end of the path.
+        """
         branch = []
         if self.name:
             branch = ["conditions", rr.escape_entity_path_part(self.name)]
         return "/".join([root, *branch, *leaf])
 
     def entities(self, leaf: str) -> tuple[str, str]:
-        """Return the paths of an entity over the terrain and on the maps."""
+        """Return two paths of an entity: for the terrain, and for the maps."""
         return self.entity("world", leaf), self.entity("map/overlay", leaf)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Stage:
-    """Terrain and maps of one recording, which points, lines and images are logged on.
+    """Terrain and maps of one recording, on which points, lines and images are logged.
 
     Args:
         stream: recording stream of Rerun.
@@ -87,7 +91,13 @@ class Stage:
         self.stream.set_time(TIMELINE, duration=step * self.recording.dt_s)
 
     def image(self, entity: str, image: np.ndarray, static: bool = True) -> None:
-        """Log a map, uint8 of shape [H, W, 3], as an image, whose first row is on top."""
+        """Log a map as an image, whose first row is at the top.
+
+        Args:
+            entity: path of the image.
+            image: map, uint8, shape [H, W, 3]; its first row is at the bottom.
+            static: whether the image is valid for all times.
+        """
         flipped = np.ascontiguousarray(image[::-1])
         self.stream.log(entity, rr.Image(flipped), static=static)
 
@@ -115,12 +125,14 @@ class Stage:
         """Log points or lines over the terrain and on the maps.
 
         Args:
-            entities: over the terrain, and on the maps.
+            entities: paths for the terrain and for the maps.
             kinds: `_POINTS` or `_STRIPS`.
-            shapes: points, (x, y) of shape [2] each, or lines of shape [N, 2].
-            radii: in metres, and in cells.
-            lift_m: height over the terrain.
-            **looks: options of both archetypes; `static` logs for all times.
+            shapes: points (x, y) in metres, each of shape [2]; or lines, each of shape
+                [N, 2].
+            radii: radius in metres for the terrain, and in cells for the maps.
+            lift_m: height over the terrain in metres.
+            **looks: options of both archetypes; with `static`, the shapes are valid for
+                all times.
         """
         static = looks.pop("static", False)
         lifted = [self.lifted(shape, lift_m) for shape in shapes]
@@ -130,13 +142,13 @@ class Stage:
             self.stream.log(entities[index], drawn, static=static)
 
     def lifted(self, positions: np.ndarray, lift_m: float = _LIFT_M) -> np.ndarray:
-        """Return positions (x, y) of shape [..., 2] with their height over the terrain."""
+        """Return points (x, y, z) over the terrain at positions of shape [..., 2]."""
         height = self.recording.elevation_m[self.cells(positions)] + lift_m
         points = np.concatenate((positions, height[..., None]), axis=-1)
         return points.astype(np.float32)
 
     def flat(self, positions: np.ndarray) -> np.ndarray:
-        """Return positions (x, y) of shape [..., 2] in image coordinates."""
+        """Return image coordinates of positions (x, y) in metres, shape [..., 2]."""
         cells = positions / self.recording.resolution_m
         return cells * (1, -1) + (0, self.recording.grid.height)
 
@@ -150,7 +162,7 @@ class Stage:
 
 
 def log_terrain(stage: Stage) -> None:
-    """Log the terrain as a mesh, and the common maps: colour, layers, soft spots, λ."""
+    """Log the terrain as a mesh, and the maps that all robots share."""
     recording = stage.recording
     stage.stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     stage.stream.log("world/terrain", _mesh(recording), static=True)
@@ -172,7 +184,10 @@ def log_terrain(stage: Stage) -> None:
 
 
 def _mesh(recording: Recording) -> Any:
-    """Return the mesh of the terrain: a vertex per cell, two triangles per square."""
+    """Return the mesh of the terrain, with one vertex per cell.
+
+    Four neighbouring vertices form a square of two triangles.
+    """
     grid = recording.grid
     rows, columns = np.mgrid[: grid.height, : grid.width]
     x_m = (columns + 0.5) * grid.resolution_m
@@ -207,7 +222,7 @@ def log_driver(stream: Any, driver: Driver) -> None:
 
 
 def _log_known(stage: Stage, driver: Driver) -> None:
-    """Log a planner's λ̂, the edge of non-free cells, and the robot's knowledge."""
+    """Log a planner's λ̂, the edge of non-free cells, and the robot's belief."""
     recording = driver.recording
     learns = bool(recording.known)
     steps = [known_map.step for known_map in recording.known]
@@ -254,12 +269,15 @@ def _log_robot(stage: Stage, driver: Driver) -> None:
 
 
 def _times(recording: Recording, count: int) -> Any:
-    """Return the times of the first steps of an episode."""
+    """Return the times of the first `count` steps of an episode."""
     return rr.TimeColumn(TIMELINE, duration=np.arange(count) * recording.dt_s)
 
 
 def _log_series(stage: Stage, driver: Driver) -> None:
-    """Log observed and predicted λ, the free threshold, distance to goal, and commands."""
+    """Log time series: observed λ and the distance to the goal.
+
+    For a single robot, also log λ̂, the threshold of free cells, and the commands.
+    """
     recording = driver.recording
     positions = recording.track[:-1]
     n_steps = len(positions)
@@ -292,15 +310,15 @@ def _log_series(stage: Stage, driver: Driver) -> None:
 
 
 def _log_driven(stage: Stage, driver: Driver) -> None:
-    """Log the path driven so far, in colours of observed λ if there is only one robot."""
+    """Log the driven path over time, in colours of observed λ for a single robot."""
     recording = driver.recording
     positions = recording.track
     count = len(recording.traversability)
     interval = drawing_interval(recording.dt_s)
     colours = shades(recording.traversability)
-    length = _PIECE * interval
-    for piece, first in enumerate(range(0, count, length)):
-        entities = driver.entities(f"driven/{piece:03}")
+    length = _SEGMENT * interval
+    for segment, first in enumerate(range(0, count, length)):
+        entities = driver.entities(f"driven/{segment:03}")
         last = min(first + length, count)
         for step in [*range(first + interval, last, interval), last]:
             stage.at(step)
@@ -313,15 +331,15 @@ def _log_driven(stage: Stage, driver: Driver) -> None:
 
 
 def _log_plans(stage: Stage, driver: Driver) -> None:
-    """Log plans at their steps; only paths if there are several robots."""
+    """Log the plans at their steps; if there are several robots, only planned paths."""
     logged: dict[str, list[bytes]] = {}
     for plan in map(thinned, driver.recording.own_plans):
         stage.at(plan.step)
         for name, style in STYLES.items():
             lines = list(plan.lines.get(name, ()))
             content = [line.tobytes() for line in lines]
-            # An empty layer is logged, since it removes the earlier plan's; an
-            # unchanged one is not.
+            # An empty layer is logged, since it replaces that of the earlier plan.
+            # Unchanged layers are skipped.
             if (driver.name and name != "path") or logged.get(name) == content:
                 continue
             logged[name] = content

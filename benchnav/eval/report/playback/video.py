@@ -1,7 +1,7 @@
-"""Videos of episodes on one map, at one time base, 16:9.
+"""Videos of one or several episodes on one map, synchronous in time, in 16:9.
 
-A frame shows each planner's λ̂ with its plan, which changes as a robot learns, and next
-to these the λ field, once for all episodes on the same field.
+A frame shows the λ̂ of each planner with its plan, and the λ field. Episodes with the
+same λ field share one panel of it.
 """
 
 import textwrap
@@ -30,28 +30,27 @@ from benchnav.viz.style import (
     styled,
 )
 
-SIZE = (1280, 720)  # of a frame: width and height in pixels
+SIZE = (1280, 720)  # width and height of a frame in pixels
 FRAMES_A_SECOND = 20
-# Seconds of an episode in a second of video.
-SPEED = 4.0
+SPEED = 4.0  # seconds of an episode in a second of video
 HOLD_S = 2.0  # duration of the last frame, which shows the outcome
 MAX_CONDITIONS = 6
 
-# A frame has the size, letters and lines of a printed figure.
+# With this resolution, a frame has the text and line sizes of a printed figure.
 _DPI = 160
-# Height over and below all maps, and of the heading of each row of maps.
-_ENDS_IN = 0.8
-_HEADING_IN = 0.6
+# Dimensions in inches.
+_ENDS_IN = 0.8  # total height above and below all maps
+_HEADING_IN = 0.6  # height of the heading of each row of maps
 _BAR_IN = 0.9  # width of the colour bar
-_LETTER_IN = 0.068
-_MOMENTS = 9  # times of an episode whose contents the legend names
+_LETTER_IN = 0.068  # mean width of a letter of a title
+_N_LEGEND_TIMES = 9  # number of times whose contents the legend names
 
 
 def frame_times(end_s: float) -> np.ndarray:
-    """Return times in an episode that frames show; its end is repeated for `HOLD_S`.
+    """Return the time of each frame in seconds; the last is repeated for `HOLD_S`.
 
     Args:
-        end_s: end of the last episode, in seconds.
+        end_s: latest time of the end of an episode, in seconds.
     """
     moving = np.arange(0.0, end_s, SPEED / FRAMES_A_SECOND)
     return np.append(moving, np.full(round(HOLD_S * FRAMES_A_SECOND), end_s))
@@ -74,7 +73,7 @@ def write_video(
     if len(recordings) > MAX_CONDITIONS:
         raise ConfigError(
             f"Expected at most {MAX_CONDITIONS} conditions side by side, got "
-            f"{len(recordings)}. Select fewer."
+            f"{len(recordings)}. Select fewer conditions."
         )
     frames = Frames(recordings)
     times = frame_times(max(recording.end_s for recording in recordings))
@@ -96,14 +95,14 @@ def write_video(
 
 
 class Frames:
-    """Frames of episodes at any time.
+    """Renderer of the frames of a video.
 
     Args:
-        recordings: one or more, on one map.
+        recordings: one recording, or several on one map.
 
     Attributes:
-        given: panel of each recording with the planner's λ̂.
-        truths: panels of the λ field.
+        given: panel with the planner's λ̂, for each recording.
+        truths: panel with λ, for each group of recordings with the same λ.
         time: text with the time.
     """
 
@@ -111,9 +110,9 @@ class Frames:
     def __init__(self, recordings: Sequence[Recording]) -> None:
         """Draw the static contents."""
         self._recordings = recordings
-        self._shared = _groups_of_truth(recordings)
+        self._groups = _groups_by_truth(recordings)
         self._moving: list[Artist] = []
-        count = len(recordings) + len(self._shared)
+        count = len(recordings) + len(self._groups)
         extent_m = recordings[0].grid.extent_m
         width_in = SIZE[0] / _DPI
         size_in = (width_in, SIZE[1] / _DPI)
@@ -136,13 +135,13 @@ class Frames:
             _title(panel, title, letters, self._colours[index])
             if not recording.known:
                 moment.show_known(panel, recording, 0)
-        for panel, indices in zip(self.truths, self._shared, strict=True):
+        for panel, indices in zip(self.truths, self._groups, strict=True):
             recording = recordings[indices[0]]
             heading = "λ field of the episode"
             if recording.field is None:
                 heading = "mean of λ, resampled at each step"
             conditions = ""
-            if len(self._shared) > 1:
+            if len(self._groups) > 1:
                 conditions = "; ".join(names[index] for index in indices)
             _title(panel, f"{heading}\n{conditions}", letters)
             moment.show_truth(panel, recording)
@@ -162,7 +161,7 @@ class Frames:
         self.time = self._figure.text(**placement, family="monospace", animated=True)  # type: ignore[arg-type]
         maps.draw_bar(self._figure, "traversability λ, λ̂", aspect=30)
         end_s = max(recording.end_s for recording in recordings)
-        for time_s in np.linspace(0, end_s, _MOMENTS):
+        for time_s in np.linspace(0, end_s, _N_LEGEND_TIMES):
             self._put(float(time_s))
         legend_outside(self._figure, columns=5)
         engine = self._figure.get_layout_engine()
@@ -178,7 +177,8 @@ class Frames:
         """Draw a frame, uint8 of shape [height, width, 3].
 
         Args:
-            time_s: time since the start; ended episodes remain in their last state.
+            time_s: time since the start in seconds; after its end, an episode remains
+                in its last state.
         """
         self._canvas.restore_region(self._background)
         self._clear()
@@ -209,7 +209,7 @@ class Frames:
             corner: dict[str, Any] = {"transform": panel.transAxes, "ha": "right"}
             words = _state_in_words(recording, step)
             panel.text(1, -0.02, words, va="top", size=TEXT, **corner)
-        for panel, indices in zip(self.truths, self._shared, strict=True):
+        for panel, indices in zip(self.truths, self._groups, strict=True):
             for index in indices:
                 step = _step(self._recordings[index], time_s)
                 self._put_robot(panel, index, step)
@@ -230,13 +230,13 @@ class Frames:
 
 
 def _step(recording: Recording, time_s: float) -> int:
-    """Return the step of an episode at a time; the last once it has ended."""
+    """Return the step of an episode at a time; after its end, the last step."""
     step = int(time_s / recording.dt_s + 1e-6)
     return min(step, len(recording.traversability))
 
 
 def _state_in_words(recording: Recording, step: int) -> str:
-    """Return the outcome of an ended episode, or else the observed λ."""
+    """Return the outcome if the episode has ended, otherwise the observed λ."""
     if moment.has_ended(recording, step):
         return f"{recording.outcome}, {recording.end_s:.1f} s"
     if not step:
@@ -245,7 +245,12 @@ def _state_in_words(recording: Recording, step: int) -> str:
 
 
 def _columns(count: int, ratio: float) -> int:
-    """Return the number of columns that makes maps of a height/width ratio largest."""
+    """Return the number of columns for which the maps are largest.
+
+    Args:
+        count: number of maps.
+        ratio: height of a map divided by its width.
+    """
     wide, high = (size / _DPI for size in SIZE)
     widths = {}
     for columns in range(1, count + 1):
@@ -263,8 +268,8 @@ def _title(panel: Axes, words: str, letters: int, colour: str = "black") -> None
     panel.set_title("\n".join(lines), color=colour, parse_math=False)
 
 
-def _groups_of_truth(recordings: Sequence[Recording]) -> list[list[int]]:
-    """Return indices of recordings, grouped by equal true λ."""
+def _groups_by_truth(recordings: Sequence[Recording]) -> list[list[int]]:
+    """Return the indices of recordings, grouped by identical true λ."""
     groups: dict[bytes, list[int]] = {}
     for index, recording in enumerate(recordings):
         content = moment.true_colours(recording).tobytes()

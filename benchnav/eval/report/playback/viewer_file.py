@@ -1,10 +1,10 @@
 """Files for the Rerun viewer: one episode, or several on one map.
 
-A file contains the terrain as a mesh, its colours and layers, the true mean of λ, the λ
-field, each planner's λ̂ and plans, each robot with its heading, driven path and outcome,
-time series, and a blueprint that arranges them. For a robot that learns, λ̂, mean and
-spread of its belief, observed and measured cells, and the sensors' footprint change over
-time.
+A file contains the terrain as a mesh, maps (colour, layers, true mean of λ, λ field),
+the λ̂ and the plans of each planner, each robot with heading, driven path and outcome,
+time series, and a blueprint that arranges these contents. For a robot that learns, it
+also contains the belief, the observed and measured cells and the sensors' footprint,
+all over time.
 """
 
 from collections.abc import Sequence
@@ -35,15 +35,15 @@ from benchnav.viz.style import bytes_of, condition_colours
 
 APPLICATION = "benchnav"
 
-_ALONE = "#00aa00"
-# Maps of a robot that learns, with the titles of their views.
+_SINGLE_COLOUR = "#00aa00"  # of a single robot
+# Titles of views of a learning robot's maps, by name of the map.
 _LEARNT = {
     "mean": "Belief: mean of λ",
     "spread": f"Belief: spread of λ, 0 to {MAX_SPREAD:g}",
     "seen": "Observed cells light, measured λ blue",
 }
-_ALL = "/map/overlay/**"
-_PLACES = "/map/places/**"
+_OVERLAY = "/map/overlay/**"
+_START_AND_GOAL = "/map/places/**"
 
 
 def write_viewer_files(folder: Path) -> None:
@@ -69,7 +69,7 @@ def write_rerun(recordings: Sequence[Recording], path: Path) -> None:
         path: path of the file; the viewer shows its name.
     """
     drivers = drivers_of(recordings)
-    # One chunk for each entity, since a chunk has a header of more than a kilobyte.
+    # Each entity is one chunk, since the header of a chunk has more than a kilobyte.
     batches = rr.ChunkBatcherConfig.NEVER()
     stream = rr.RecordingStream(
         APPLICATION, recording_id=path.stem, batcher_config=batches
@@ -89,12 +89,14 @@ def write_rerun(recordings: Sequence[Recording], path: Path) -> None:
 
 
 def drivers_of(recordings: Sequence[Recording]) -> list[Driver]:
-    """Return drivers with unique names and colours; a single one has no name."""
+    """Return drivers with unique names and colours; a single driver has no name."""
     if len(recordings) == 1:
-        return [Driver(recording=recordings[0], name="", colour=bytes_of(_ALONE))]
+        return [
+            Driver(recording=recordings[0], name="", colour=bytes_of(_SINGLE_COLOUR))
+        ]
     labels = [recording.about for recording in recordings]
     names = contender_names(labels)
-    colours = condition_colours([of_one["planner"] for of_one in labels])
+    colours = condition_colours([row["planner"] for row in labels])
     drivers = []
     for recording, name, colour in zip(recordings, names, colours, strict=True):
         driver = Driver(recording=recording, name=name, colour=bytes_of(colour))
@@ -111,7 +113,7 @@ def _title(drivers: Sequence[Driver]) -> str:
 
 
 def arrange(drivers: Sequence[Driver]) -> Any:
-    """Arrange terrain and time series on the left, maps on the right."""
+    """Return the blueprint: terrain and time series on the left, maps on the right."""
     series = [
         rrb.TimeSeriesView(
             name="Observed λ",
@@ -143,10 +145,10 @@ def arrange(drivers: Sequence[Driver]) -> Any:
 
 
 def map_views(drivers: Sequence[Driver]) -> dict[str, list[str]]:
-    """Return the entities that each view of a map shows, by its title."""
+    """Return the paths of the entities that each view of a map shows, by title."""
     recording = drivers[0].recording
     is_single = len(drivers) == 1
-    overlays = [_ALL, _PLACES]
+    overlays = [_OVERLAY, _START_AND_GOAL]
     on_truth = ["/map/closed", *overlays] if is_single else overlays
     colour = "Colour, soft terrain hatched" if recording.soft.any() else "Colour"
     views = {colour: ["/map/colour", "/map/soft/**", *overlays]}
@@ -160,7 +162,7 @@ def map_views(drivers: Sequence[Driver]) -> dict[str, list[str]]:
         planner = driver.name or "the planner"
         title = f"λ̂ given to {planner}, free: {free_rule(driver.recording)}"
         overlay = driver.entity("/map/overlay", "**")
-        views[title] = [driver.entity("/map/risk"), overlay, _PLACES]
+        views[title] = [driver.entity("/map/risk"), overlay, _START_AND_GOAL]
     if is_single and recording.known:
         for name, title in _LEARNT.items():
             views[title] = [f"/map/{name}", *overlays]
@@ -168,7 +170,7 @@ def map_views(drivers: Sequence[Driver]) -> dict[str, list[str]]:
 
 
 def layer_title(name: str, layer: np.ndarray) -> str:
-    """Return the title of a layer's view: its name and the range of its colours."""
+    """Return the title of a layer's view: name and range of the layer."""
     if is_azimuth(name):
         return f"{name}, directions"
     scale = layer_scale(name, layer)

@@ -14,14 +14,14 @@ from benchnav.core.errors import BenchnavError
 
 HOST = "127.0.0.1"
 
-# The viewer's default ports, for users who forward ports to another machine.
+# Default ports of the viewer, which users may forward to another machine.
 _PAGE_PORT = 9090
 _DATA_PORT = 9876
 _START_S = 60.0
 
 
 def serve(path: Path) -> None:
-    """Serve the viewer with a recording, and print its address, until interrupted.
+    """Serve the viewer with a recording until Ctrl-C, and print its address.
 
     Args:
         path: an `.rrd` file.
@@ -41,11 +41,11 @@ def serve(path: Path) -> None:
         HOST,
     ]
     command += ["--web-viewer-port", str(page), "--port", str(data)]
-    # The viewer has a child process, so both are ended as a group.
+    # The viewer has a child process. Both end as a process group.
     viewer = subprocess.Popen(
         command, env={**os.environ, "RUST_LOG": "error"}, start_new_session=True
     )
-    # Background processes of scripts ignore Ctrl-C unless handlers are set.
+    # A background process of a script ignores Ctrl-C unless it sets handlers.
     before = {
         number: signal.signal(number, signal.default_int_handler)
         for number in (signal.SIGINT, signal.SIGTERM)
@@ -68,7 +68,7 @@ def serve(path: Path) -> None:
 
 
 def _free_port(preferred: int) -> int:
-    """Return a free port, the preferred one if possible."""
+    """Return the preferred port if it is free, otherwise any free port."""
     for port in (preferred, 0):
         with socket.socket() as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -77,7 +77,9 @@ def _free_port(preferred: int) -> int:
             except OSError:
                 continue
             return int(probe.getsockname()[1])
-    raise BenchnavError("Expected a free port to serve the viewer on, got none.")
+    raise BenchnavError(
+        "Expected a free port for the viewer, got none. Close other servers."
+    )
 
 
 def _wait_for(port: int, viewer: subprocess.Popen[bytes]) -> None:
@@ -88,5 +90,6 @@ def _wait_for(port: int, viewer: subprocess.Popen[bytes]) -> None:
                 return
         time.sleep(0.05)
     raise BenchnavError(
-        "The viewer did not start. Open the recording with `rerun` to see why."
+        f"Expected the viewer to start within {_START_S:g} s, but it did not. Open the "
+        "recording with `rerun` to see the reason."
     )
