@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from benchnav.planning.world.outcome import Outcome
-from benchnav.viz.drives import MARKS, Drive, draw_drive, end_mark
+from benchnav.viz.drives import MARKS, Drive, draw_drive, end_mark, mark
 from benchnav.viz.maps import IMMOBILISING, draw_scale, field_colours, scale_length
 from benchnav.viz.style import bytes_of
 
@@ -126,6 +126,13 @@ def test_a_robot_that_drives_is_shown_with_its_heading() -> None:
     _, marks = drawn_marks(heading_rad=1.0)
     np.testing.assert_allclose(np.ravel(marks["robot"].get_data()), (3.8, 3.2))
     assert not {"success", "immobilised"} & marks.keys()
+
+
+def test_a_mark_has_its_own_scale_whatever_was_drawn_before() -> None:
+    panel = Figure().subplots()
+    drawn = [mark(panel, "goal", (0, 0), scale) for scale in (2.0, 0.5, 1.0)]
+    sizes = np.array([line.get_markersize() for line in drawn])
+    np.testing.assert_allclose(sizes / sizes[-1], (2.0, 0.5, 1.0))
 
 
 @pytest.mark.parametrize(

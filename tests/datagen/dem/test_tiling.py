@@ -3,11 +3,14 @@
 import itertools
 
 import networkx as nx
+import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from benchnav.core.errors import ConfigError, DatasetError
+from benchnav.datagen.dem.extent import Layout
+from benchnav.datagen.dem.recipe_fit import _cells_of
 from benchnav.datagen.dem.tiling import Tiling, cut, read_shares
 
 SHARES = {"train": 0.7, "valid": 0.1, "test/site": 0.2}
@@ -149,3 +152,16 @@ def test_maps_are_of_one_group_just_where_they_overlap_directly_or_by_others(
     }
     assert tiling.groups(own).tolist() == [expected[number] for number in own]
     assert tiling.overlaps == (stride[0] < shape[0] or stride[1] < shape[1])
+
+
+@pytest.mark.parametrize("stride", [(5, 7), (3, 9)])
+def test_the_cells_of_a_run_begin_with_those_of_a_map_of_its_split(
+    stride: tuple[int, int],
+) -> None:
+    tiling = cut((60, 90), (5, 7), stride, SHARES)
+    for run in tiling.runs(4):
+        cells = _cells_of(run, Layout(tiling, np.zeros(2), "bilinear"))
+        assert tuple(map(len, cells)) == tiling.shape
+        row, column = np.meshgrid(*cells)
+        split = list(tiling.strips).index(run.split)
+        assert (tiling.split_of(row, column) == split).all()

@@ -1,3 +1,4 @@
+from copy import deepcopy
 from typing import Any
 
 import numpy as np
@@ -156,6 +157,10 @@ def test_the_digest_is_that_of_all_that_is_claimed(change: dict[str, Any]) -> No
             {"kind": "superiority"},
             "above 0 and below 100 points, since it claims superiority, got 0",
         ),
+        (
+            {"kind": "superiority", "metric": "end_time", "margin": 1},
+            "`direction` in hypothesis 1, .* neither direction of 'end_time' is better",
+        ),
         ({"kind": "equivalence", "margin": -1}, "above 0 .*got -1"),
         ({"kind": "equivalence", "margin": 100}, "below 100 points, since .*, got 100"),
         ({"kind": "equivalence", "margin": 1, "direction": "lower"}, "no `direction`"),
@@ -305,7 +310,7 @@ def test_each_metric_is_compared_in_its_unit_on_shared_episodes() -> None:
     assert ran("success", *groups)["n_maps"] == 5
 
 
-def test_holm_is_over_the_list() -> None:
+def test_holm_is_over_the_list_which_stays_as_it_was_fixed() -> None:
     labels = condition()
     sides = [
         [row(labels, i, 30.0 if i < count else None) for i in range(30)]
@@ -320,7 +325,10 @@ def test_holm_is_over_the_list() -> None:
     tests = [
         vars(hypothesis(direction=d)) | {"claim": d} for d in ("", "higher", "lower")
     ]
-    table = run_tests({"tests": tests}, episodes, {"a": WORLD, "b": WORLD})
+    about = {"tests": tests}
+    as_fixed = deepcopy(about)
+    table = run_tests(about, episodes, {"a": WORLD, "b": WORLD})
+    assert about == as_fixed
     p = 2 / 2**7
     np.testing.assert_allclose(table["p"], [p, p / 2, 1])
     np.testing.assert_allclose(table["p_holm"], [2 * p, 3 * p / 2, 1])

@@ -371,6 +371,10 @@ def test_what_robots_know_by_is_compared_one_thing_at_a_time() -> None:
 def test_a_blind_planner_is_compared_with_one_that_learns() -> None:
     blind = compared("straight", NOT_USED, model=NOT_USED)
     assert blind.labels["belief"] == NOT_USED
-    assert names(find_pairs([learning("probe", sensor="near"), blind], "planner")) == [
-        ("straight", "mppi")
-    ]
+    learns = learning("probe", sensor="near")
+    (pair,) = find_pairs([learns, blind], "planner")
+    assert (pair.one, pair.other) == ("straight", "mppi")
+    # What the blind planner does not use is named as the other one has it.
+    assert pair.shared == {
+        name: label for name, label in learns.labels.items() if name != "planner"
+    }

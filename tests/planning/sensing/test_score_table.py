@@ -9,6 +9,7 @@ from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.planning.sensing import score_table
 from benchnav.planning.sensing.score_table import (
     VALUES,
+    ScoreTable,
     TabulatedDistribution,
     scores_of,
 )
@@ -95,3 +96,14 @@ def test_a_row_has_the_scores_of_its_own_cell(
         0,
         len(VALUES),
     )
+
+
+def test_a_table_that_grows_by_parts_has_the_row_of_each_cell() -> None:
+    prior = mixture(3, 0.05, 0.3)
+    every = torch.ones(prior.shape, dtype=torch.bool)
+    number = torch.arange(every.numel()).view(prior.shape)
+    table = ScoreTable.empty(prior).with_rows(prior, number % 3 == 1)
+    table = table.without_rows(number % 2 == 0).with_rows(prior, every)
+    found = table.rows.scores[table.row_index[every]]
+    wanted = scores_of(prior.at(every))
+    torch.testing.assert_close(found, wanted, rtol=0, atol=1e-5)
