@@ -25,7 +25,7 @@ import torch
 from benchmarks.timing import show
 from benchnav import Grid, Terrain, TraversabilityMixture
 from benchnav.eval.experiment.unit import Unit
-from benchnav.eval.run.unit import Built, Settings, simulate
+from benchnav.eval.run.unit import Settings, UnitInputs, simulate
 from benchnav.planning import Copula, CovarianceModel, NoiseKey, Probe
 from benchnav.planning.sensing.belief import draw_scores
 from studies.units import build_unit, one_unit, stakes_suite
@@ -48,7 +48,7 @@ BELIEFS: dict[str, dict[str, Any]] = {
 }
 
 
-def drive(unit: Unit, built: Built, steps: int = STEPS) -> dict[str, float]:
+def drive(unit: Unit, built: UnitInputs, steps: int = STEPS) -> dict[str, float]:
     """Return CPU milliseconds per simulated second, and fractions of learning, planning."""
     cpu_start_s, start_s = time.process_time(), time.perf_counter()
     episodes, _ = simulate(unit, built, Settings(), stop=lambda step: step == steps)

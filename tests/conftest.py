@@ -30,7 +30,7 @@ def pytest_collection_finish() -> None:
 @pytest.fixture
 def whole_fonts(monkeypatch: pytest.MonkeyPatch) -> None:
     """Has figures saved as they are outside tests."""
-    monkeypatch.setattr(figures, "_SAVED", _SAVED)
+    monkeypatch.setattr(figures, "_SAVE_STYLE", _SAVED)
 
 
 @pytest.fixture(scope="session")

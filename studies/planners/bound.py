@@ -93,7 +93,7 @@ def gap(work: Work, folder: Path, maps: int = 50) -> dict[str, Rows]:
         bound_s = lower_bound_s(*arguments)
         seconds += time.process_time() - started
         with without(
-            excess=lambda mesh, value: 1.0, _CHECK_EVERY=lower_bound._MOST_STEPS
+            excess=lambda mesh, value: 1.0, _CHECK_EVERY=lower_bound._MAX_STEPS
         ):
             converged_s = lower_bound_s(*arguments)
         with without(_max_reaching=no_reach):

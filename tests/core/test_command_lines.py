@@ -251,7 +251,7 @@ BAD: list[tuple[str, str]] = [
     ('train classifier --data d --out o --classifier 3', "Expected --classifier as a mapping, got '3'."),
     ('train classifier --data d --out o --classifier.dice much', "Expected --classifier.dice as a number, got 'much'."),
     ("train classifier --data d --out o --classifier '{dise: 1}'", "Expected keys of --classifier among inputs, jitter, symmetries, crop, learning_rate, weight_decay, batch_size, max_epochs, patience, masking, architecture, encoder, pretrained, encoder_depth, decoder_channels, full_resolution, focal, dice, label_smoothing, got 'dise'. Did you mean 'dice'?"),
-    ('train classifier --data d --out o --classifier.dice -1', 'Expected `dice` ≥ 0, got -1.0.'),
+    ('train classifier --data d --out o --classifier.dice -1', 'Expected `dice` ≥ 0 and finite, got -1.0.'),
     ('train gp --data d --out o --gp.likelihood gausian', "Expected --gp.likelihood as 'censored' or 'gaussian', got 'gausian'. Did you mean 'gaussian'?"),
     ('eval run --config s.yml', "Expected --config as a YAML file, or one of demo, full, paper, risk, severity, got 's.yml', which does not exist. Did you mean 's.yaml'?"),
     ('eval run --config folder.yaml', "Expected a YAML file, got 'folder.yaml': Is a directory."),

@@ -184,7 +184,7 @@ def test_what_a_hub_lacks_is_one_line(
     cases = {
         "me/none@main": "does not exist or is private",
         "me/empty@v9": "got 'v9', which does not exist",
-        "me/empty@main": "got 0 files .h5",
+        "me/empty@main": "got 0 .h5 files",
     }
     for name, said in cases.items():
         done = run(tmp_path, "benchnav-datagen", "show", name, HF_ENDPOINT=address)

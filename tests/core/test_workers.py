@@ -164,7 +164,7 @@ def test_a_cluster_that_is_not_there_is_one_line(
     monkeypatch.setattr(workers, "_CONNECTION_S", 0.2)
     for scheduler, message in (
         ("127.0.0.1:8786", "tcp://HOST:PORT"),
-        ("tcp://127.0.0.1:9", "no answer"),
+        ("tcp://127.0.0.1:9", "did not answer"),
     ):
         with pytest.raises(ConfigError, match=message):
             list(run_calls([partial(square, 1)], scheduler=scheduler))

@@ -130,7 +130,7 @@ def test_shards_made_apart_are_one_dataset(datagen: Call, capsys) -> None:  # ty
             )
             == 0
         )
-        assert f"{folder}: shard {index}/2 is made" in capsys.readouterr().out
+        assert f"{folder}: shard {index}/2 is complete" in capsys.readouterr().out
     assert datagen("show", "part1") == 2
     assert "merge" in capsys.readouterr().err
     assert datagen("merge", "part1", "part2", "--out", "big") == 0
@@ -385,7 +385,8 @@ def test_faults_of_consecutive_maps_are_one_line(datagen: Call, capsys) -> None:
     assert capsys.readouterr().out.splitlines() == [
         "train: maps 0–2: field 'start_m' does not match its digest",
         "d.h5: 3 fault(s)",
-        "To repair it, create the file again with --overwrite. The same recipe and version give the same digests.",
+        "To repair the dataset, create the file again with --overwrite. The same recipe "
+        "and version yield the same digests.",
     ]
 
 
@@ -448,7 +449,7 @@ def test_faults_of_consecutive_maps_are_one_line(datagen: Call, capsys) -> None:
 def test_a_bad_recipe_is_one_clear_line_and_status_2(
     datagen: Call, capsys, old: str, new: str, said: str
 ) -> None:  # type: ignore[no-untyped-def]
-    own = RECIPE if "unused" in said else RECIPE.replace("id: tiny-v1", "id: mine")
+    own = RECIPE if "an `id` in" in said else RECIPE.replace("id: tiny-v1", "id: mine")
     text = new if old == RECIPE else own.replace(old, new, 1)
     assert text != RECIPE
     Path("r.yaml").write_text(text)

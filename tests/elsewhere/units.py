@@ -26,7 +26,7 @@ from benchnav.eval.run import recordings
 from benchnav.eval.run import unit as units_of_run
 from benchnav.eval.run.rollout import run_episodes
 from benchnav.eval.run.runner import run_suite
-from benchnav.eval.run.unit import Built, Settings, run_unit
+from benchnav.eval.run.unit import Settings, UnitInputs, run_unit
 from benchnav.models.base import TraversabilityModel, predict
 from benchnav.models.predictor import Oracle
 from benchnav.planning.planners.planner import Plan, Planner
@@ -133,7 +133,7 @@ def test_a_unit_is_the_same_on_another_device(
     unit = unit_of(dataset_path, **changes)
     used: set[torch.device] = set()
 
-    def simulate(unit: Unit, built: Built, *given: Any, **options: Any) -> Any:
+    def simulate(unit: Unit, built: UnitInputs, *given: Any, **options: Any) -> Any:
         problem = built.problem
         used.update(
             value.device

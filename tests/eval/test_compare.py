@@ -492,7 +492,7 @@ def test_command_prints_and_writes(tmp_path: Path, capsys) -> None:  # type: ign
         (("RUN", "--planner", "mpi"), "Did you mean 'mppi'"),
         (("RUN", "--points", "0"), r"`points` in [0.001, 100]"),
         (("RUN", "RUN"), "Expected runs that differ"),
-        (("RUN", "--by", "data"), "other maps"),
+        (("RUN", "--by", "data"), "determine the maps"),
     ],
 )
 def test_bad_input_ends_with_one_line_and_status_2(

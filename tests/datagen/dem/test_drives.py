@@ -683,7 +683,7 @@ MOVE = "".join(
         ),
         (
             "t,x_m,y_m,commanded_m_s,measured_m_s\n0,1,1,1,1\n",
-            "got no time_s. It has t, x_m",
+            "got no time_s. The file has t, x_m",
         ),
         (
             "time_s,longitude_deg,commanded_m_s,measured_m_s\n0,1,1,1\n",
@@ -708,7 +708,7 @@ MOVE = "".join(
             "`commanded_m_s` to be numbers in .*, got fast in row 1",
         ),
         (HEAD + "0,inf,1,1,1,a\n", "`x_m` to be numbers in .*, got inf in row 1"),
-        (HEAD + "0,1,1,1,1,\n", "`drive` in every row.*row 1"),
+        (HEAD + "0,1,1,1,1,\n", "`drive` in each row.*row 1"),
         (
             HEAD + "0,1,1,30,30,a\n0,1,1,100,1,a\n",
             "`commanded_m_s` in m/s.*median of 65.*Divide km/h by 3.6",

@@ -291,7 +291,8 @@ def test_the_numbers_of_groups_differ_between_grounds_and_maps_side_by_side_have
     plain = read(first)
     assert plain.field_names == tuple(FIELDS)
     with pytest.raises(
-        DatasetError, match=r"different fields \(group only in one: .*--stride\)"
+        DatasetError,
+        match=r"different fields \(group only in one dataset: .*--stride\)",
     ):
         list(merge([made[1].path, plain.path], tmp_path / "neither.h5"))
 

@@ -158,7 +158,7 @@ def test_datasets_with_one_set_of_layers_merge_and_others_are_refused_in_one_lin
     bare = tiny_dataset(tmp_path / "c.h5", small_stakes(seed=5))
     with pytest.raises(DatasetError) as caught:
         next(merge([path, bare], tmp_path / "no.h5"))
-    assert "different fields (vegetation_m only in one)" in str(caught.value)
+    assert "different fields (vegetation_m only in one dataset)" in str(caught.value)
     assert "\n" not in str(caught.value)
     other = tiny_dataset(
         tmp_path / "d.h5", grown(small_stakes(seed=6), 5.0, wet_clay=GRASS)
@@ -223,7 +223,10 @@ def test_the_command_refuses_unlike_layers_in_one_line(
     bare = tiny_dataset(tmp_path / "bare.h5", small_stakes(seed=5))
     assert call("datagen", "merge", path, bare, "--out", tmp_path / "no.h5") == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert f"{path} and {bare} have different fields (vegetation_m only in one)" in line
+    assert (
+        f"{path} and {bare} have different fields (vegetation_m only in one dataset)"
+        in line
+    )
     assert not (tmp_path / "no.h5").exists()
 
 

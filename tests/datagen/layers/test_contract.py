@@ -219,7 +219,7 @@ class Broken(Plain):
     ("method", "returned", "expected"),
     [
         ("draw", np.zeros((2, 3)), "values of `draw` of layer 'plain' of shape [2, 32, 32], got [2, 3]"),
-        ("draw", np.full((2, 32, 32), np.nan), "values of `draw` of layer 'plain' finite, got nan in 2048 cells"),
+        ("draw", np.full((2, 32, 32), np.nan), "values of `draw` of layer 'plain' finite, got nan, the first of 2048"),
         ("draw", np.full((2, 32, 32), np.inf), "values of `draw` of layer 'plain' finite, got inf"),
         ("draw", "dry", "values of `draw` of layer 'plain' as an array of numbers, got str"),
         ("draw", OSError("no\nfile"), "`draw` of layer 'plain' failed: OSError: no file"),

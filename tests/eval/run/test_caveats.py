@@ -31,7 +31,10 @@ FREE, STEERING = "tests.eval.parts:Faulty", "tests.eval.parts:Steering"
 TWO_MODES = "tests.eval.parts:TwoModes"
 HAZARD = {"part": "optimal", "label": "careful", "options": {"hazard": True}}
 LINE = "left out: planner Steering, robot bicycle: Expected a robot with actions"
-WARNING = "warning: in 2 of 2 maps of test/std a robot of 1 m/s cannot reach the goal within the time budget T"
+WARNING = (
+    "warning: in 2 of 2 maps of test/std, a robot with a top speed of 1 m/s cannot "
+    "reach the goal within the time budget T"
+)
 
 
 def suite_on(dataset: Path, **changes: Any) -> Suite:

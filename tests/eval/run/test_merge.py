@@ -179,7 +179,7 @@ def test_a_shard_has_rows_and_no_tables(parts: list[Path]) -> None:
         "run.json", "units", "steps", "playback", "errors.txt", "SHA256SUMS"
     }  # fmt: skip
     with pytest.raises(
-        ConfigError, match=r"shard 1/3 of a run and has no tables.*benchnav-eval merge"
+        ConfigError, match=r"shard 1/3 and has no tables.*benchnav-eval merge"
     ):
         read_table(part, "episodes.parquet")
 
@@ -188,7 +188,7 @@ def test_a_shard_has_rows_and_no_tables(parts: list[Path]) -> None:
 def test_a_folder_holds_one_shard(
     suite: Suite, parts: list[Path], other: Shard | None
 ) -> None:
-    with pytest.raises(ConfigError, match="holds shard 1/3"):
+    with pytest.raises(ConfigError, match="contains shard 1/3"):
         finish(suite, parts[0], other)
 
 
@@ -197,7 +197,7 @@ def test_a_whole_run_is_no_shard(
 ) -> None:
     with pytest.raises(ConfigError, match="contains an unsharded run"):
         finish(suite, whole, Shard(index=1, of=OF))
-    with pytest.raises(ConfigError, match="whole run"):
+    with pytest.raises(ConfigError, match="which is not a shard"):
         list(merge_shards([*parts, whole], tmp_path / "all"))
 
 
@@ -322,7 +322,7 @@ def test_a_unit_may_be_there_twice_if_it_is_the_same(
     pq.write_table(with_metadata(other, metadata(unit)), unit)
     with pytest.raises(
         ConfigError,
-        match=rf"{unit.stem.rpartition('-')[0]} .* differs between .*part1.* and .*again",
+        match=rf"{unit.stem.rpartition('-')[0]} .* rows differ between .*part1.* and .*again",
     ):
         list(merge_shards([*parts, again], tmp_path / "all2"))
 

@@ -262,7 +262,7 @@ def test_a_dataset_with_fewer_maps_is_told(suite: Suite, tmp_path: Path) -> None
     factories.tiny_dataset(tmp_path / "tiny.h5", factories.tiny_recipe(test_std=1))
     with pytest.raises(
         ConfigError,
-        match=r"Expected `maps` at most 1, the maps of test/std in .*, got 2",
+        match=r"Expected `maps` at most 1, the number of maps of test/std in .*, got 2",
     ):
         repeat(run, tmp_path / "again")
 
@@ -273,7 +273,7 @@ def test_a_folder_of_other_conditions_is_left_as_it_is(
     run = finish(suite, tmp_path / "run")
     other = finish(replace(suite, risks=("cvar",)), tmp_path / "other")
     before = {path: path.read_bytes() for path in other.rglob("*") if path.is_file()}
-    with pytest.raises(ConfigError, match="with other conditions"):
+    with pytest.raises(ConfigError, match="which has other conditions"):
         repeat(run, other)
     assert {
         path: path.read_bytes() for path in other.rglob("*") if path.is_file()
@@ -282,7 +282,7 @@ def test_a_folder_of_other_conditions_is_left_as_it_is(
 
 def test_what_cannot_be_repeated_is_refused(suite: Suite, tmp_path: Path) -> None:
     run = finish(suite, tmp_path / "run")
-    with pytest.raises(ConfigError, match="another folder"):
+    with pytest.raises(ConfigError, match="`out` to differ from the folder"):
         repeat(run, tmp_path / "x" / ".." / "run", overwrite=True)
     assert (run / "episodes.parquet").exists()
     part = finish(suite, tmp_path / "part", shard=Shard(index=1, of=1))

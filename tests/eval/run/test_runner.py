@@ -98,7 +98,7 @@ def unused(suite: Suite, folder: Path, **options: object) -> str:
     begun = f"{count} of {count} units were run with other code or maps ("
     assert line.startswith(begun)
     differing, _, rest = line.removeprefix(begun).rpartition(") and are run again")
-    assert rest.startswith("; --reuse-code")
+    assert rest.startswith("; pass --reuse-code")
     return differing
 
 
@@ -431,7 +431,7 @@ def test_a_narrower_command_runs_no_more_than_it_names(
     assert len(made) == 4
     (line,) = [line for line in said if "finished" in line]
     others = whole[["scenario", "risk"]].drop_duplicates().shape[0]
-    assert f"{others - 1} of {others} conditions of {folder} are not" in line
+    assert f"{others - 1} of {others} conditions of {folder} are unfinished" in line
     assert not (folder / EPISODES).exists()
     # The command says the same, has no report, and is content.
     config = tmp_path / "narrow.yaml"
@@ -718,7 +718,7 @@ def test_overwrite_drops_run_folders_alone(dataset_path: Path, tmp_path: Path) -
     precious.write_text("years")
     with pytest.raises(ConfigError):
         finish(quick(dataset_path), tmp_path / "run", overwrite=True)
-    with pytest.raises(ConfigError, match="something else"):
+    with pytest.raises(ConfigError, match="which is neither"):
         finish(quick(dataset_path), tmp_path / "run")
     assert precious.read_text() == "years"
     finish(quick(dataset_path, scenarios=("std", "hs")), tmp_path / "other")
@@ -770,7 +770,7 @@ def test_suites_are_checked_before_anything_is_run_or_dropped(
         ({"model": "no-such-model"}, "no-such-model"),
         ({"data": "no-such-data"}, "no-such-data"),
         ({"world": {"noise": "loud"}}, "loud"),
-        ({"maps": 9}, "0 takes all"),
+        ({"maps": 9}, "Use 0 for all maps"),
         ({"world": {"time_budget_s": 0.01}}, "time budget of at least one time step"),
         ({"planners": ("astar_dwa",), "robots": ("bicycle",)}, "steering_rad"),
         ({"planners": ("cl_rrt",), "robots": ("bicycle",)}, "steering_rad"),
@@ -895,7 +895,10 @@ def test_goals_out_of_reach_are_told_before_the_run(
         return [line for line in lines if "within the time budget T" in line]
 
     # 8 m by 8 m to the goal, of which the last metre is not driven: 10.3 s at 1 m/s.
-    line = "warning: in 2 of 2 maps of test/std a robot of 1 m/s cannot reach the goal within the time budget T"
+    line = (
+        "warning: in 2 of 2 maps of test/std, a robot with a top speed of 1 m/s cannot "
+        "reach the goal within the time budget T"
+    )
     assert told(10.2) == [line]
     assert told(10.4) == []
     assert told(10.2, {"part": "unicycle", "options": {"speed_mps": [0.0, 2.0]}}) == []

@@ -187,7 +187,10 @@ def test_what_a_part_reads_is_recorded_and_a_change_runs_its_unit_again(
     done, again, *_ = run(own, dataset_path, "run")
     assert done == "1 of 2 units were already finished"
     start, _, changes = again.partition("changed: ")
-    assert start == "1 of 2 units are run again, since their parts read "
+    assert (
+        start
+        == "1 of 2 units are run again, since their parts read files or variables that have "
+    )
     assert {Path(change).name for change in changes.split("; ")} == {
         "speed.json", "helper.py", "variable OWN_GAIN", "package ownlib (1.0 to 2.0)",
     }  # fmt: skip
