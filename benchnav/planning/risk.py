@@ -80,7 +80,7 @@ class CVaR(RiskMeasure):
 
 @dataclass(frozen=True)
 class ExpectedTime(RiskMeasure):
-    """λ̂ = 1 / E[1 / max(λ, floor)], under which the time of a path is its expectation.
+    """λ̂ = 1 / E[1 / max(λ, floor)]: a path's length over it is the expected time.
 
     The time of a path is its length over λ̂, at a commanded speed of 1. The measure
     suits a risk-neutral robot if the λ field is constant during an episode. In contrast

@@ -99,7 +99,7 @@ def test_a_figure_whose_needs_are_not_met_is_named(program: Results) -> None:
         def draw(self, data: Any) -> Any:
             raise AssertionError
 
-    with pytest.raises(ConfigError, match="what figure 'nothing' needs"):
+    with pytest.raises(ConfigError, match="the data that figure 'nothing' needs"):
         program.plot(Nothing())
 
 

@@ -117,7 +117,7 @@ def test_what_is_no_figure_is_an_error_before_anything_runs_or_is_written(
         "to be an instance of benchnav.viz.Figure, got Own" in capsys.readouterr().err
     )
     assert not (folder / "report.html").exists()
-    with pytest.raises(ConfigError, match=r"subclass of benchnav\.viz\.Figure"):
+    with pytest.raises(ConfigError, match=r"an instance of benchnav\.viz\.Figure"):
         check_suite(Suite(figures=(part,)), uses_workers=False)
 
 

@@ -156,7 +156,7 @@ def test_a_classifier_of_other_classes_is_refused() -> None:
             rgb = maps["rgb"]
             return rgb[:, :2].float()
 
-    with pytest.raises(ConfigError, match="of one shape"):
+    with pytest.raises(ConfigError, match="of the same shape"):
         FusedModel([Two()], linear_table(), NAMES).predict(make_terrain().observe())
 
 

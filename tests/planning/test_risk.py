@@ -79,7 +79,7 @@ def test_a_users_measure_is_applied_and_its_map_takes_the_mixtures_dtype() -> No
         (lambda mixture: None, "got NoneType"),
         (
             lambda mixture: mixture.mean() > 0.3,
-            "floating-point numbers, got torch.bool",
+            "floating-point tensor, got dtype torch.bool",
         ),
         (lambda mixture: mixture.mean() + 1, "in [0, 1], got values outside"),
         (lambda mixture: mixture.mean() - 1, "in [0, 1], got values outside"),

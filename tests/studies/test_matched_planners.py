@@ -148,7 +148,7 @@ def test_icem_pays_for_a_last_state_on_ground_that_is_not_free() -> None:
     ground[:, :, 8:] = 0.0
     problem = factories.problem(ground)
     planner = ICEM(ICEMConfig(samples=8, horizon_s=0.2, cost_to_go="map"))
-    to_go = planner.init(problem, rng.generator(0)).to_go
+    to_go = planner.init(problem, rng.generator(0)).cost_to_go
     assert to_go is not None
     edge = 8 * problem.grid.resolution_m
     costs = [

@@ -184,7 +184,7 @@ BAD: dict[str, tuple[Any, str]] = {
     ),
     "evolves on self": (OnSelf(), "Expected the same result from `update` when called again"),
     "what was begun on self": (LastBegun(), "Expected the same belief after `init` on other maps"),
-    "tells episodes of each other": (giving("update", shared), "an episode in which nothing was sensed"),
+    "tells episodes of each other": (giving("update", shared), "that `select` returns as in the batch"),
     "changed no map": (giving("changed", lambda c, *_: c[0]), "Expected a bool map of shape [4, 6, 8] from `changed`"),
     "changed too little": (giving("changed", lambda c, *_: c & False), "Expected `changed` to mark all cells"),
     "changed by scores alone": (
@@ -198,7 +198,7 @@ BAD: dict[str, tuple[Any, str]] = {
         giving("update", lambda new, old, s, *_: replace(
             new, std=torch.where(s.mask.flatten(1).any(1)[:, None, None] & ~s.mask, 1.3 * old.std, new.std)
         )),
-        "to reduce the variance on average",
+        "to reduce the variance of λ ≤ value on average",
     ),
     "learns though it says no": (having(learns=False), "a belief that does not learn (`learns`)"),
     "keeps the old prediction": (
@@ -212,8 +212,8 @@ BAD: dict[str, tuple[Any, str]] = {
     "fields by place": (giving("sample_fields", in_turn), "fields to depend only on its state and key"),
     "fields of the prediction": (giving("sample_fields", of_the_prior), "the belief's distribution"),
     "selects others": (having(select=lambda _, s, m: s.select(m.sort().values)), "episodes that `select` returns"),
-    "puts nothing": (having(put=lambda _, s, m, o: s), "`put` inserts"),
-    "puts elsewhere": (having(put=lambda b, s, m, o: s.put(m.flip(0), o)), "`put` inserts"),
+    "puts nothing": (having(put=lambda _, s, m, o: s), "`put` to insert"),
+    "puts elsewhere": (having(put=lambda b, s, m, o: s.put(m.flip(0), o)), "`put` to insert"),
     "selects nothing": (having(select=lambda _, s, m: s), "shape [2, 6, 8] for episodes that `select` returns"),
 }  # fmt: skip
 

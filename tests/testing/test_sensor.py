@@ -197,7 +197,7 @@ BAD: dict[str, tuple[Any, str]] = {
             "stored λ": lambda terrain, field: terrain.traversability.mean((1, 2)),
         }.items()
     },
-    "no sensor": (3, "subclass of benchnav.planning.Sensor, got int"),
+    "no sensor": (3, "an instance of benchnav.planning.Sensor, got int"),
     "raises": (
         probing(lambda found, *_: found[99]),
         "Expected a result from `sense`, got IndexError",

@@ -356,5 +356,5 @@ def test_a_report_holds_what_robots_knew_where_they_learnt(
     for name in ("learning", "knowledge-1", "knowledge-2"):
         assert f"![{name}](figures/{name}.png)" in text
     assert "knowledge-3" not in text
-    assert "for every 2 s" in text
+    assert "in bins of 2 s" in text
     assert "during its episode (A\\*+DWA)" in text

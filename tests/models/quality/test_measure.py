@@ -246,7 +246,7 @@ def test_splits_are_measured_one_at_a_time(dataset: TerrainDataset) -> None:
 def test_a_model_of_other_classes_is_refused(dataset: TerrainDataset) -> None:
     model = ColourModel()
     model.class_names = ("a", "b", "c")
-    with pytest.raises(CheckpointError, match="class table"):
+    with pytest.raises(CheckpointError, match="other classes than those of"):
         choose_splits(model, dataset)
 
 

@@ -105,7 +105,7 @@ def test_the_number_that_means_no_class_in_maps_is_a_class_of_a_log(
         (HEADER + "a,1,\nb,,1\n", "got 0 of 2"),
         (
             "class,slope,traversability\na,1,1\n",
-            "got no slope_deg.*It has class, slope, traversability",
+            "got no slope_deg.*The file has class, slope, traversability",
         ),
         ("a;b\n1;2\n", "got no class and no slope_deg and no traversability"),
         (HEADER + "a,1,0.5\na,,0.5\na,steep,0.5\n", "`slope_deg`.*got steep in row 3"),
@@ -113,10 +113,10 @@ def test_the_number_that_means_no_class_in_maps_is_a_class_of_a_log(
         (HEADER + "a,1,0.5\na,91,0.5\n", r"within \[0, 90\].*got 91 in row 2"),
         (HEADER + "a,1,-0.1\n", r"within \[0, 1\].*got -0.1 in row 1"),
         (HEADER + "a,inf,0.1\n", "got inf in row 1"),
-        (HEADER + "a,1,0.1\n,1,0.1\n", "`class` in every row.*row 2"),
+        (HEADER + "a,1,0.1\n,1,0.1\n", "`class` in each row.*row 2"),
         (
             "class,slope_deg,traversability,drive\na,1,0.1,x\na,1,0.1, \n",
-            "`drive` in every row.*row 2",
+            "`drive` in each row.*row 2",
         ),
         (
             "klass,slope_deg,traversability\na,1,1\n",

@@ -81,14 +81,14 @@ BROKEN = {
     "shape": ("return (scores * seen).sum() / seen.sum().clamp(min=1)", "return scores",
         "a loss that is a scalar, got shape"),
     "nan": ("(scores * seen).sum()", "(scores * seen).sum() * float('nan')", "a finite loss, got nan"),
-    "no gradient": ("(scores * seen).sum() /", "(scores * seen).sum().detach() /", "that has a gradient"),
-    "no number": ("return crps", "return lambda outputs, observed: 3.0", "one number, got float"),
+    "no gradient": ("(scores * seen).sum() /", "(scores * seen).sum().detach() /", "with a gradient, got"),
+    "no number": ("return crps", "return lambda outputs, observed: 3.0", "a scalar, got float"),
     "distribution": ("return TraversabilityMixture(torch.ones_like(mean), mean, std)", "return mean",
-                     "to give a TraversabilityDistribution, got Tensor"),
+                     "to return a TraversabilityDistribution, got Tensor"),
     "distribution's shape": ("TraversabilityMixture(torch.ones_like(mean), mean, std)",
                              "TraversabilityMixture(*(v[..., 1:] for v in (torch.ones_like(mean), mean, std)))",
                              r"to return a distribution of shape \[2, 32, 32\], got \[2, 32, 31\]"),
-    "means": ("mean, std)\n\n", "mean, std * torch.nan)\n\n", r"means of λ in \[0, 1\]"),
+    "means": ("mean, std)\n\n", "mean, std * torch.nan)\n\n", r"whose `mean` is in \[0, 1\]"),
     "quantiles": ("return TraversabilityMixture(torch.ones_like(mean), mean, std)", "return Own(mean[:, 0], std[:, 0])",
                   "a distribution whose `quantile` ascends"),
     "falling cdf": ("return TraversabilityMixture(torch.ones_like(mean), mean, std)",
@@ -97,9 +97,9 @@ BROKEN = {
                      "a frozen dataclass of maps, got Plain"),
     "raises": ("hidden = self.config.hidden", "hidden = self.config.width",
         r"no attribute 'width'. See own.py, line \d+, in `configure_network`."),
-    "no super": ("super().__init__(config)", "pass", r"call super\(\).__init__\(config\)"),
+    "no super": ("super().__init__(config)", "pass", r"calls super\(\).__init__\(config\)"),
     "device": ("return (scores * seen).sum() / seen.sum().clamp(min=1)", "return scores.sum().to('meta')",
-        "on cpu, got one on meta"),
+        "on cpu, got it on meta"),
 }  # fmt: skip
 
 
@@ -154,8 +154,8 @@ HOOKS = {
         "def predict(self, observation): return 1 / 0",
         "ZeroDivisionError",
     ),
-    "stride": ("stride = 0", "`stride` of CellModel ≥ 1, got 0"),
-    "inputs": ("inputs = 3", "CellModel with `inputs` .* TypeError"),
+    "stride": ("stride = 0", "`stride` of CellModel to be an integer ≥ 1, got 0"),
+    "inputs": ("inputs = 3", "`inputs` and settings of CellModel .* TypeError"),
 }
 
 
@@ -251,7 +251,7 @@ def test_a_class_of_a_name_that_is_ours_is_refused(
             "`inputs` of at least one layer, each named once",
         ),
         (["own.py:CellModel", "--settings.width", "3"], "got 'width'"),
-        (["own.py:CellModel", "--crop", "33"], r"`crop` in 8–32 cells"),
+        (["own.py:CellModel", "--crop", "33"], r"`crop` of 8 cells to 32"),
         (["own.py:CellModel", "--members", "0"], "`members` in 1–1000"),
         (
             ["own.py:CellConfig"],
@@ -271,7 +271,7 @@ def test_a_class_of_a_name_that_is_ours_is_refused(
         ),
         (
             ["fused", "--settings.clasifier.dice", "1"],
-            "`settings` of 'fused' among classifier, gp",
+            "`settings` of 'fused' to be among classifier and gp",
         ),
         (["fused", "--settings.classifier.architecture", "unett"], "unett"),
     ],

@@ -282,7 +282,7 @@ def test_a_checkpoint_of_a_users_class_needs_the_class(trained: Path) -> None:
     ):
         load_model(f"{trained / 'other.py'}:Other@{trained / 'c'}")
     with pytest.raises(
-        ConfigError, match=r"to be a benchnav\.models\.TrainableModel or ModelFamily"
+        ConfigError, match=r"to be a subclass of benchnav\.models\.TrainableModel or ModelFamily"
     ):
         load_model(f"{trained / 'own.py'}:CellConfig@{trained / 'c'}")
 
@@ -468,7 +468,7 @@ def test_a_class_that_keeps_the_contract_passes_and_one_that_does_not_is_told(
             return super().to_distribution(outputs + self.shift[0])
 
     with pytest.raises(
-        ConfigError, match="same prediction from the settings and tensors"
+        ConfigError, match="same prediction from a model restored from its settings"
     ):
         check_model(Forgetful)
 
@@ -538,6 +538,6 @@ def test_maps_without_a_layer_that_the_model_was_trained_on_are_refused(
 ) -> None:
     model = module.CellModel(module.CellConfig(inputs=("rgb", "vegetation_m"))).build()
     with pytest.raises(
-        ConfigError, match="vegetation_m among them, got rgb, elevation_m, slope_deg"
+        ConfigError, match="layers vegetation_m, .* got maps with rgb, elevation_m, slope_deg"
     ):
         model.predict(dataset.terrain("test/std").observe())

@@ -247,7 +247,7 @@ def test_a_part_of_an_earlier_version_has_the_defaults_of_settings_that_came_lat
     target = Target(tmp_path / "mine", shipped, classifier.data_digest, FitOptions())
     assert "encoder_depth" not in classifier.config
     assert target.has_part("classifier", ClassifierConfig(), 0)
-    with pytest.raises(CheckpointError, match="got one that does not"):
+    with pytest.raises(CheckpointError, match="got a part with seed 0"):
         target.has_part("classifier", ClassifierConfig(encoder_depth=3), 0)
 
 

@@ -120,9 +120,9 @@ def test_a_callback_of_a_file_is_called_and_recorded(
         ({"logger": {"class": "CSVLogger"}}, "{class_path: CLASS, init_args: {…}}"),
         (
             {"logger": {"class_path": "CSVLogger", "init_args": {"colour": 1}}},
-            "arguments that CSVLogger takes",
+            "arguments that CSVLogger accepts",
         ),
-        ({"callbacks": "nowhere.py:Note"}, "cannot be read"),
+        ({"callbacks": "nowhere.py:Note"}, "a file that can be read"),
         ({"callbacks": "no_such_module.Note"}, "no_such_module"),
         ({"callbacks": "pathlib.Path"}, "lightning's Callback"),
     ],

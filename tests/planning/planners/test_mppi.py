@@ -747,9 +747,9 @@ def test_a_dubins_path_is_driven_as_it_is_until_the_robot_faces_the_goal() -> No
     chosen, after, _ = planner.plan(first(problem), planner.init(problem, generator()))
     torch.testing.assert_close(chosen, actions[:, 0])
     straight = replace(after, mean=after.mean * torch.tensor([1.0, 0.0]))
-    assert bool(planner.plan(first(problem), straight)[1].follows)
+    assert bool(planner.plan(first(problem), straight)[1].on_dubins_path)
     assert not bool(
-        planner.plan(first(ahead), replace(straight, problem=ahead))[1].follows
+        planner.plan(first(ahead), replace(straight, problem=ahead))[1].on_dubins_path
     )
 
 

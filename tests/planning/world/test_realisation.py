@@ -121,7 +121,7 @@ def test_stored_noise_needs_every_cell_observed() -> None:
     holed[0, 3, 3] = torch.nan
     terrain = replace(terrain, traversability=holed)
     Realisation(terrain, World(noise="resampled"), PLACES, 10, KEY, [0])
-    with pytest.raises(ConfigError, match="not observed"):
+    with pytest.raises(ConfigError, match="cells without λ"):
         Realisation(terrain, World(noise="stored"), PLACES, 10, KEY, [0])
 
 
