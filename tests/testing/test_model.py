@@ -374,7 +374,7 @@ class Named(Quantiles):
 BAD_DISTRIBUTIONS = {
     "of descending quantiles": (lambda d: replace(d, values=d.values.flip(1)), "`quantile` to ascend"),
     "beyond 1": (lambda d: replace(d, values=d.values + 1), "`cdf` to ascend from 0 below λ = 0 to 1 at λ = 1"),
-    "under 0": (lambda d: replace(d, values=d.values - 0.3), "`quantile` to ascend within [0, 1]"),
+    "under 0": (lambda d: replace(d, values=d.values - 0.3), "`quantile` to ascend with the probability"),
     "with a hole": (
         lambda d: replace(d, values=d.values.where(d.values < d.values.max(), torch.nan)),
         "finite results of `quantile` of the distribution",

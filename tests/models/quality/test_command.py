@@ -210,7 +210,7 @@ def test_a_series_is_drawn_where_there_is_one(
         (["oracle", "--data", "DATA", "--splits", "[]"], "Expected `splits` among "),
         (
             ["other", "--data", "DATA", "--out", "new/x", "--json", "y.json"],
-            "class table",
+            "trained on other classes",
         ),
     ],
 )

@@ -538,6 +538,6 @@ def test_maps_without_a_layer_that_the_model_was_trained_on_are_refused(
 ) -> None:
     model = module.CellModel(module.CellConfig(inputs=("rgb", "vegetation_m"))).build()
     with pytest.raises(
-        ConfigError, match="layers vegetation_m, .* got maps with rgb, elevation_m, slope_deg"
+        ConfigError, match=r"layers vegetation_m, .* got maps with rgb, elevation_m, slope_deg"
     ):
         model.predict(dataset.terrain("test/std").observe())
