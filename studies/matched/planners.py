@@ -174,7 +174,9 @@ class ICEM(MPPI):
             )
             last = [mean[..., None]] if iteration == config.iterations - 1 else []
             samples = torch.cat((samples, retried, *last), dim=3)
-            cost = self._cost(problem, step.state, samples, target_m, plan_state.cost_to_go)
+            cost = self._cost(
+                problem, step.state, samples, target_m, plan_state.cost_to_go
+            )
             best = cost.topk(config.elites, dim=1, largest=False).indices
             elites = samples.gather(
                 3, best[:, None, None].expand(-1, *samples.shape[1:3], -1)

@@ -157,7 +157,7 @@ def test_shards_made_apart_are_one_dataset(datagen: Call, capsys) -> None:  # ty
     shard.unlink()
     assert datagen("validate", "big") == 1
     assert (
-        f"remove {shard.name} in big and repeat the command that made it"
+        f"remove {shard.name} in big and run the command that created it again"
         in capsys.readouterr().out
     )
     assert datagen("create", "tiny-v1", *SMALL, "--out", "big") == 0

@@ -206,7 +206,7 @@ def test_each_command_uses_the_device_that_it_is_given(
 
 
 def test_the_accelerator_is_the_device_and_has_no_second_name() -> None:
-    with pytest.raises(ConfigError, match="now `device`"):
+    with pytest.raises(ConfigError, match="Set `device` instead"):
         FitOptions(trainer={"accelerator": "cpu"})
     assert FitOptions(device="cpu").place == torch.device("cpu")
 

@@ -266,7 +266,10 @@ def test_an_episode_is_replayed_on_the_device_of_its_run(
     write_run(tmp_path / "run", {**about, "device": "cuda"})
     (unit,) = units(open_run(tmp_path / "run").conditions)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(ConfigError, match="GPU, on which this run was computed"):
+    with pytest.raises(
+        ConfigError,
+        match="a GPU that PyTorch can use, since this run was computed on one",
+    ):
         recordings.find_recording(tmp_path / "run", unit, 0)
     with elsewhere() as device:
         monkeypatch.setattr(recordings, "device_of_run", lambda about: device)

@@ -988,7 +988,9 @@ def test_hypotheses_are_fixed_before_the_first_unit_and_stay(
         in next(iter(report.findings.values()))[-1]
     )
     other = (given | {"metric": "score"},)
-    with pytest.raises(ConfigError, match=f"digest {fixed['digest']}.*got different ones"):
+    with pytest.raises(
+        ConfigError, match=f"digest {fixed['digest']}.*got different ones"
+    ):
         finish(replace(suite, hypotheses=other), folder)
     finish(quick(dataset_path, scenarios=("std",)), tmp_path / "plain")
     with pytest.raises(ConfigError, match="digest none"):

@@ -282,7 +282,8 @@ def test_a_checkpoint_of_a_users_class_needs_the_class(trained: Path) -> None:
     ):
         load_model(f"{trained / 'other.py'}:Other@{trained / 'c'}")
     with pytest.raises(
-        ConfigError, match=r"to be a subclass of benchnav\.models\.TrainableModel or ModelFamily"
+        ConfigError,
+        match=r"to be a subclass of benchnav\.models\.TrainableModel or ModelFamily",
     ):
         load_model(f"{trained / 'own.py'}:CellConfig@{trained / 'c'}")
 
@@ -538,6 +539,7 @@ def test_maps_without_a_layer_that_the_model_was_trained_on_are_refused(
 ) -> None:
     model = module.CellModel(module.CellConfig(inputs=("rgb", "vegetation_m"))).build()
     with pytest.raises(
-        ConfigError, match=r"layers vegetation_m, .* got maps with rgb, elevation_m, slope_deg"
+        ConfigError,
+        match=r"layers vegetation_m, .* got maps with rgb, elevation_m, slope_deg",
     ):
         model.predict(dataset.terrain("test/std").observe())
