@@ -125,8 +125,8 @@ def check_sign(log: DriveLog, is_driven: ndarray) -> None:
         is_driven: mask of the rows to check, bool, shape [N].
 
     Raises:
-        DatasetError: If the signs differ in most rows of a direction of the command, and
-            these are more than 5 % of all checked rows.
+        DatasetError: If the signs differ in most rows of a direction of the command,
+            and these are more than 5 % of all checked rows.
     """
     commanded = log.rows["commanded"].to_numpy()[is_driven]
     measured = log.rows["speed"].to_numpy()[is_driven]
