@@ -103,7 +103,7 @@ def check_wheels(log: DriveLog, track: pd.DataFrame) -> None:
 
 
 def _wheel_fraction(moving: pd.DataFrame) -> float:
-    """Return the fraction of spans in stretches where wheels slip under command."""
+    """Return the fraction of spans in stretches with the speed of slipping wheels."""
     stretch_number = moving.groupby("drive").cumcount() // _MIN_SPANS
     n_wheel_spans = 0
     for _, stretch in moving.groupby([moving["drive"], stretch_number]):

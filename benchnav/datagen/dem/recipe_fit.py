@@ -114,7 +114,7 @@ def _corrections(
     scalings: Iterator[Scaling],
     max_maps: int,
 ) -> Iterator[tuple[dict[str, Any], float | None]]:
-    """Yield settings and a stride in metres that make the maps fit, by scaling in order.
+    """Yield settings and a stride in metres with which maps fit, by scaling in order.
 
     The stride is None if maps are adjacent, which is the default.
 

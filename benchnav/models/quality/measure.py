@@ -88,7 +88,7 @@ class ClassQuality:
 class TraversabilityQuality:
     """Quality of predicted distributions of traversability.
 
-    Of the first four, lower is better.
+    For `rmse_observed`, `rmse_expected`, `nll` and `crps`, lower is better.
 
     Args:
         rmse_observed: root mean square of E[λ] − observed λ.
