@@ -2,9 +2,9 @@
 
 Lengths are in inches, and positions are from the upper left corner. Sizes of text are
 in points, for a figure that spans two columns of a page. A class has the same colour in
-all maps and figures: the colour of the class table, made lighter or darker for all
-look-alike classes except the first. Terrain of classes with soft spots is hatched or
-outlined.
+all maps and figures: the colour of the class table. In each group of look-alike
+classes, the colours of all but the first are made lighter or darker. Terrain of classes
+with soft spots is hatched or outlined.
 """
 
 import textwrap
@@ -51,7 +51,8 @@ def preview_figure(
 ) -> Figure:
     """Return a figure of maps of a split, with a row for each map.
 
-    Layers are in the right columns. The panel of a field has the label `FIELD ROW`.
+    Additional layers of the dataset are in the rightmost columns. The panel of a field
+    has the label `FIELD ROW`.
 
     Args:
         dataset: dataset of the maps.
@@ -161,7 +162,7 @@ def contact_sheet_figure(dataset: TerrainDataset, split: str) -> Figure:
         split: name of a split.
 
     Returns:
-        A figure about as wide as high; the thumbnails are the images of its only axes.
+        A roughly square figure with a single `Axes`, whose images are the thumbnails.
 
     Raises:
         DatasetError: If the split does not exist, or its data are damaged.
@@ -219,7 +220,7 @@ def contact_sheet_figure(dataset: TerrainDataset, split: str) -> Figure:
             image = np.concatenate([image, coloured[..., :3]], axis=1)
             soft = soft_ground(maps["class_id"][0], classes)
             edges = outline(soft, image_height / grid.height)
-            # The axes of the page point downward.
+            # The y axis of the page points downward.
             draw_lines(sheet, edges * (1, -1) + (x, lower), "black", 0.2, "white")
         box = (x, right, lower, y)
         sheet.imshow(
@@ -241,7 +242,8 @@ def soft_ground(class_id: np.ndarray, classes: Sequence[TerrainClass]) -> np.nda
 def class_colours(classes: Sequence[TerrainClass]) -> np.ndarray:
     """Return the colours in which classes are drawn, RGB in [0, 1], shape [C, 3].
 
-    They are the colours of the class table, made lighter or darker for look-alikes.
+    They are the colours of the class table. In each group of look-alike classes, the
+    colours of all but the first are made lighter or darker.
     """
     colours = np.array([item.colour for item in classes]) / 255
     for alike in set(look_alike_classes(tuple(classes))):

@@ -24,13 +24,13 @@ class FusedModel(ModelFamily):
     """P(λ) = Σ_c P(c)·P_c(λ | ψ), equation (1), with one component per class.
 
     Classes with soft spots have two components. P(c) is the average of the members'
-    probabilities, calibrated by a temperature. The paper's `single-class` option is
-    `TraversabilityMixture.most_likely` of the prediction.
+    probabilities, calibrated by a temperature. For the paper's `single-class` option,
+    call `TraversabilityMixture.most_likely` on the prediction.
 
     Args:
-        classifiers: the members, each a network from layers by name to logits
-            [B, C, H, W]. A member with an attribute `inputs` receives these layers; any
-            other member receives only `rgb`.
+        classifiers: the members. Each is a network that maps a dictionary of layers, by
+            name, to logits of shape [B, C, H, W]. A member with an attribute `inputs`
+            receives the layers named there; any other member receives only `rgb`.
         table: predictions of the GPs over slope.
         class_names: names of the C classes.
         pool_temperature: temperature of the averaged probabilities (see
@@ -59,11 +59,13 @@ class FusedModel(ModelFamily):
         """Predict on the observation's device.
 
         Args:
-            observation: B maps of any size. The classifiers are moved to its device.
+            observation: B maps of any size. The classifiers are moved to the device of
+                the observation.
 
         Returns:
-            Mixture with float32 parameters of shape [B, K, H, W]. Its components are the C
-            classes in order, then the second modes; `group` is the class of each.
+            Mixture with float32 parameters of shape [B, K, H, W]. Its K components are
+            the C classes in order, then the soft spots of each class that has them;
+            `group` gives the class of each component.
         """
         return self.fuse(self.member_probabilities(observation), observation)
 
@@ -76,7 +78,7 @@ class FusedModel(ModelFamily):
     def fuse_at(
         self, member_probabilities: Tensor, slope_deg: Tensor
     ) -> TraversabilityMixture:
-        """Return the prediction as `fuse`, from slopes in degrees, [B, H, W]."""
+        """Return the prediction as `fuse` does, from slopes in degrees, [B, H, W]."""
         mean_probability = member_probabilities.sum(0) / len(self.classifiers)
         weights = sharpen(mean_probability, self.pool_temperature)
         means, stds = self.table.lookup(slope_deg.float())
@@ -94,7 +96,7 @@ class FusedModel(ModelFamily):
         return TraversabilityMixture(weights, means, stds, group)
 
     def member_probabilities(self, observation: Observation) -> Tensor:
-        """Return class probabilities of each member, before the pool temperature.
+        """Return class probabilities of each member, without the pool temperature.
 
         Args:
             observation: B maps of any size.

@@ -1,4 +1,4 @@
-"""Problems and steps for the check of planners.
+"""Problems and steps for checking planners.
 
 Letters in shapes: B episodes.
 """
@@ -26,14 +26,14 @@ def invert_prediction(problem: Problem) -> Problem:
 
 
 def change_input(problem: Problem, name: str) -> Problem:
-    """Return the problem with an input changed, and the free space that follows from it.
+    """Return the problem with one input changed, and its free space updated to match.
 
     Args:
         problem: the problem.
         name: name of the input, one of `INPUTS`.
     """
     mixture = problem.distribution
-    assert isinstance(mixture, TraversabilityMixture)  # of `create_problem`
+    assert isinstance(mixture, TraversabilityMixture)  # as `create_problem` sets
     inverted = replace(mixture, means=1 - mixture.means)
     others: dict[str, Any] = {
         "risk_map": 1 - problem.risk_map,
@@ -60,7 +60,7 @@ def step_after(problem: Problem, step: Step, action: Tensor) -> Step:
 
 
 def numbered_step(problem: Problem, step: Step, ended: Tensor, number: int) -> Step:
-    """Return a step with a number, in which some episodes have ended.
+    """Return the step of index `number`, at which some episodes have ended.
 
     The robot of the first ended episode is off the map; the robots of other ended
     episodes are at the goal.
@@ -69,7 +69,7 @@ def numbered_step(problem: Problem, step: Step, ended: Tensor, number: int) -> S
         problem: problem of all episodes.
         step: step with the states of running robots.
         ended: mask of ended episodes, bool, shape [B].
-        number: number of the step; plans are drawn in odd steps.
+        number: index of the step, from 0; `draw` is set at odd steps.
     """
     first_ended = ended.nonzero()[:1, 0]
     position_m = problem.goal_m.index_fill(0, first_ended, -0.3)
@@ -127,7 +127,7 @@ def create_problem(
 
 
 def _fields_of(mixture: TraversabilityMixture, grid: Grid) -> Fields:
-    """Return joint samples of a prediction, with a correlation length of 1 m."""
+    """Return a source of joint samples of λ, with a correlation length of 1 m."""
     covariance = CovarianceModel(grid=grid, correlation_m=1.0)
     belief = Static()
     state = belief.init(mixture, covariance)

@@ -1,1 +1,1 @@
-"""Real elevation models and photos, into datasets of the same schema."""
+"""Import of real elevation models and photos into datasets of the same schema."""

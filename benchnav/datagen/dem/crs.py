@@ -1,6 +1,6 @@
 """Coordinate reference systems (CRS) of rasters, and positions in them.
 
-rasterio is an optional dependency of this package and imported on first use.
+rasterio is an optional dependency of this package. It is imported on first use.
 """
 
 import json
@@ -76,9 +76,14 @@ def local_crs(crs: Any, x: float, y: float) -> Any:
 
 
 def stretch(crs: Any, x: float, y: float) -> float:
-    """Return the maximum |scale − 1| of a projection at a position, over directions.
+    """Return the maximum |scale − 1| of a projection at a position, in any direction.
 
     The result is infinite if the position is not on the body.
+
+    Args:
+        crs: projected CRS.
+        x: eastward coordinate in the unit of `crs`.
+        y: northward coordinate in the unit of `crs`.
     """
     local = local_crs(crs, x, y)
     if local is None:

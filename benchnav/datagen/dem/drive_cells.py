@@ -1,6 +1,6 @@
 """Traversability of driven cells, and the split of each drive.
 
-Each split has a strip of the terrain; terrain between strips is in no map (`tiling`). A
+Each split has a strip of the terrain; terrain between strips is on no map (`tiling`). A
 drive usually belongs to the split whose strip contains most of the drive's rows. Its
 rows on other strips are left out, so no cell and no drive occurs in two splits. Letters
 in shapes: N rows, D drives, M driven cells.
@@ -29,14 +29,14 @@ from benchnav.datagen.dem.tiling import Tiling
 from benchnav.datagen.schema import Json
 
 BANDS = ("traversability", "drive_count", "drive_std")
-RATIO_LIMITS = (0.0, 1.0)  # limits to which the ratio of a row is clipped as stored λ
+RATIO_LIMITS = (0.0, 1.0)  # limits of stored λ, to which ratios of rows are clipped
 _BLOCK_ROWS = 64  # rows of cells that are read at once
 _CRS_REMEDY = "Log x_m and y_m in that CRS, or longitude_deg and latitude_deg."
 
 
 @dataclass(frozen=True)
 class DrivenCells:
-    """Cells that drives crossed, and statistics of λ in each.
+    """Cells that drives crossed, with statistics of λ in each cell.
 
     Args:
         cells: index of each cell, row · width + column, ascending, int64, shape [M].
@@ -50,7 +50,7 @@ class DrivenCells:
     width: int
 
     def read(self, rows: range, columns: range) -> ndarray:
-        """Return the values of all cells in some rows and columns.
+        """Return the values of all cells in a block of rows and columns.
 
         Args:
             rows: indices of the rows, counted northward.
@@ -121,7 +121,7 @@ def _check_in_metres(log: DriveLog, dem: Raster) -> None:
 
 
 def _off_terrain_error(log: DriveLog, dem: Raster, *, is_swapped: bool) -> DatasetError:
-    """Return an error on a log whose positions all lie off the elevation model.
+    """Return the error for a log whose positions all lie off the elevation model.
 
     Args:
         log: log of the drives.

@@ -1,6 +1,6 @@
 """Log of a robot's drives: positions, speeds, and the resulting λ.
 
-A row is a moment of a drive. Its columns are:
+Each row describes one moment of a drive. The columns are:
 
 - `time_s`: time in seconds;
 - `x_m` and `y_m`: position in the coordinate reference system of the elevation model;
@@ -32,13 +32,13 @@ from benchnav.datagen.files.robot_logs import (
     require_columns,
 )
 
-# Thresholds that are a choice of this package are marked (choice).
+# Thresholds that this package chooses without a source are marked "(choice)".
 MIN_SPEED_M_S = 0.1
-# Off-road robots are slower. A larger value indicates a speed in km/h or cm/s.
+# Off-road robots are slower. A higher speed indicates another unit, km/h or cm/s.
 MAX_SPEED_M_S = 15.0
-# Ratio of speed to the top command that no robot exceeds (choice).
+# Ratio of speed to the highest commanded speed that no robot exceeds (choice).
 TOP_RATIO = 1.5
-# Ratio of speed to command that is seldom exceeded, by noise or downhill (choice).
+# Ratio of speed to command that is rarely exceeded, due to noise or downhill (choice).
 OVER_SPEED = 1.2
 # Limits of the ratio of the distance by positions to the distance by measured speed,
 # within which the two count as equal (choice).
@@ -103,7 +103,7 @@ class Drives:
 
 @dataclass(frozen=True, kw_only=True)
 class DriveLog:
-    """Used rows of a log.
+    """Rows of a log that are used, and the number of those left out.
 
     Args:
         settings: path of the file, and the selection of its rows.
@@ -252,9 +252,14 @@ def _read_column(rows: pd.DataFrame, name: str, path: Path) -> ndarray:
 
 
 def _resolution_m(x: ndarray, y: ndarray, *, is_geographic: bool) -> float:
-    """Return the largest decimal step that divides all positions, in metres.
+    """Return the largest power of ten that divides all positions, as metres.
 
-    It is 0 if the step is below some centimetres.
+    The result is 0 if it would be less than a few centimetres.
+
+    Args:
+        x: eastward coordinates in metres, or longitudes in degrees.
+        y: northward coordinates in metres, or latitudes in degrees.
+        is_geographic: whether positions are longitudes and latitudes.
     """
     max_decimals = 6 if is_geographic else 2
     metres = _METRES_PER_DEGREE if is_geographic else 1

@@ -38,9 +38,9 @@ from benchnav.datagen.dem.drive_units import is_coarse, median_ratio
 from benchnav.datagen.dem.drive_velocity import speed_of_positions, velocity_of
 from benchnav.datagen.dem.drive_wheels import check_wheels
 
-# Thresholds that are a choice of this package are marked (choice).
-# Quantile of commanded speeds that counts as the top command. The maximum is not used,
-# since single commands may be wrong (choice).
+# Thresholds that this package chooses without a source are marked "(choice)".
+# Quantile of commanded speeds that counts as the highest command. The maximum is not
+# used, since single commands may be wrong (choice).
 _TOP_QUANTILE = 0.99
 # Maximum climb per horizontal distance. Steeper cells of a surface model are trees and
 # walls (choice).
@@ -55,7 +55,7 @@ _REMEDIES = {
 
 
 def compare_motion(log: DriveLog) -> DriveLog:
-    """Return a log without faulty rows, with λ of each row.
+    """Return a log without faulty rows, with λ in each row.
 
     λ is the ratio of measured speed (or of the speed from positions) to the command.
 
@@ -148,10 +148,10 @@ def compare_motion(log: DriveLog) -> DriveLog:
 
 
 def compare_slopes(log: DriveLog, elevation_m: ndarray) -> DriveLog:
-    """Check measured speed for that of wheels; correct speed from positions for slope.
+    """Reject measured speed of wheels; correct speed from positions for the slope.
 
-    Measured speed is that of wheels if its ratio to the command does not depend on the
-    slope, or if it equals the command while positions move less far.
+    Measured speed is the speed of wheels if its ratio to the command does not depend on
+    the slope, or if it equals the command while positions move less far.
 
     Args:
         log: log from `compare_motion`.
@@ -162,7 +162,7 @@ def compare_slopes(log: DriveLog, elevation_m: ndarray) -> DriveLog:
         The log. If its speed is from positions, speed and λ are along the slope.
 
     Raises:
-        DatasetError: If measured speed is that of wheels.
+        DatasetError: If measured speed is the speed of wheels.
     """
     track = track_of(log.rows.assign(z=elevation_m))
     if log.settings.speed == "":
@@ -185,12 +185,13 @@ def _leave_out(
 ) -> DriveLog:
     """Return a log without faulty rows; reject a log with too many of them.
 
-    A row with several reasons is counted under the first.
+    A row with several faults is counted under the first reason in `masks`.
 
     Args:
         log: log of the drives.
-        masks: masks of the rows to leave out, by reason.
-        remedies: remedies by reason that replace those of `_REMEDIES`, each a sentence.
+        masks: masks of the rows to leave out, by reason (key of `REASONS`), bool, shape
+            [N].
+        remedies: sentences by reason that replace those of `_REMEDIES`.
     """
     is_remaining = np.ones(len(log.rows), dtype=bool)
     for reason, mask in masks.items():
@@ -225,7 +226,7 @@ def _check_rest(log: DriveLog, is_unknown: ndarray) -> None:
 def _pace_ratios(spans: pd.DataFrame) -> dict[str, float | None]:
     """Return the ratio of distance by positions to distance by each speed, by name.
 
-    A ratio has three digits; it is None if it is unknown.
+    Ratios are rounded to three digits; an unknown ratio is None.
     """
     paces = {}
     for name, speed in (("pace", "measured"), ("commanded_pace", "commanded")):
@@ -235,7 +236,7 @@ def _pace_ratios(spans: pd.DataFrame) -> dict[str, float | None]:
 
 
 def _scale_remedies(log: DriveLog) -> dict[str, str]:
-    """Return remedies by reason if commands are logged too low; else an empty dict."""
+    """Return remedies by reason if logged commands are too low, otherwise none."""
     ratio = log.motion["commanded_pace"]
     if ratio is None or ratio <= OVER_SPEED:
         return {}
@@ -249,8 +250,8 @@ def _scale_remedies(log: DriveLog) -> dict[str, str]:
 def _n_reverses(log: DriveLog, positions_speed: ndarray, is_driven: ndarray) -> int:
     """Return the number of rows whose positions move opposite to the command.
 
-    Measured speed does not show this motion. The result is 0 if measured speed is
-    signed.
+    Measured speed without a sign does not show this motion. The result is 0 if measured
+    speed has a sign.
     """
     commanded = log.rows["commanded"].to_numpy()
     speed = log.rows["speed"].to_numpy()

@@ -36,7 +36,7 @@ def check_pace(
         log: log of the drives.
         rows: rows of the log without faulty ones.
         spans: spans of these rows.
-        is_jumpy: whether positions jump so often that the log is rejected only if a
+        is_jumpy: whether positions jump often; the log is then rejected here only if a
             unit explains the ratio.
 
     Raises:
@@ -103,7 +103,7 @@ def _unit_of(
 
 
 def _check_command(log: DriveLog, rows: pd.DataFrame, spans: pd.DataFrame) -> None:
-    """Reject a log whose distance by positions over the commanded one is no valid λ."""
+    """Reject a log whose ratio of positions to the command is implausible as λ."""
     least_speed = log.settings.least_speed
     is_geographic = log.is_geographic
     result = unit_of_command(rows, spans, least_speed, is_geographic=is_geographic)
@@ -125,8 +125,8 @@ def check_sign(log: DriveLog, is_driven: ndarray) -> None:
         is_driven: mask of the rows to check, bool, shape [N].
 
     Raises:
-        DatasetError: If the signs differ in more than 5 % of the rows and in most rows
-            of a direction.
+        DatasetError: If the signs differ in most rows of a direction of the command,
+            and these are more than 5 % of all checked rows.
     """
     commanded = log.rows["commanded"].to_numpy()[is_driven]
     measured = log.rows["speed"].to_numpy()[is_driven]
@@ -154,7 +154,7 @@ def off_pace(log: DriveLog, spans: pd.DataFrame) -> tuple[ndarray, str]:
         spans: spans of the log's rows.
 
     Returns:
-        The mask, bool, shape [N]; and a remedy, in sentences.
+        The mask, bool, shape [N]; and a remedy, as one or more sentences.
     """
     is_off = np.zeros(len(log.names), dtype=bool)
     for drive, drive_spans in spans.groupby("drive"):

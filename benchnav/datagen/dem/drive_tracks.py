@@ -15,26 +15,26 @@ import numpy as np
 import pandas as pd
 from numpy import ndarray
 
-# Thresholds that are a choice of this package are marked (choice).
+# Thresholds that this package chooses without a source are marked "(choice)".
 # Duration of a span, in which the distance is large compared with position noise.
 WINDOW_S = 2.0
 MIN_SPANS = 5  # minimum number of spans for a median (choice)
 # Maximum time between rows in a segment. In a longer gap, motion is unknown.
 GAP_S = 1.0
-# Maximum number of periods of fixes for which a position may stay the same (choice).
+# Maximum time for which a position may stay the same, in periods of fixes (choice).
 _FREEZE_FIXES = 3
-# Cosine of the angle between neighbouring spans above which they are straight: a chord
-# is then at most 1 % shorter than its arc.
+# Neighbouring spans are straight if the cosine of the angle between them exceeds this
+# value: a chord is then at most 1 % shorter than its arc.
 _STRAIGHT_COS = 0.9
 # A larger angle between neighbouring spans is a reversal (choice).
 _MAX_BEND = math.radians(150)
 
 
 def find_restarted(rows: pd.DataFrame) -> ndarray:
-    """Return a mask of rows whose time is before that of an earlier row of their drive.
+    """Return a mask of rows with a smaller time than a preceding row of the same drive.
 
     If sorting a drive's rows by time shortens the track, the rows are only out of
-    order; no time restarted, and the mask is False.
+    order: its clock did not restart, and the mask is False.
 
     Returns:
         bool, shape [N].
@@ -51,7 +51,7 @@ def find_restarted(rows: pd.DataFrame) -> ndarray:
 
 
 def _length_m(rows: pd.DataFrame) -> pd.Series:
-    """Return the length of each drive's track in metres, in the order of the rows."""
+    """Return the length of each drive's track in metres; rows are taken as ordered."""
     by_drive = rows.groupby("drive")
     step_m = np.hypot(by_drive["x"].diff(), by_drive["y"].diff())
     return step_m.groupby(rows["drive"]).sum()
@@ -87,14 +87,14 @@ def _fixes(track: pd.DataFrame) -> pd.DataFrame:
 
 
 def _period_s(fixes: pd.DataFrame) -> pd.Series:
-    """Return for each fix the median time between fixes of its drive; 0 for one fix."""
+    """Return, by fix, its drive's median time between fixes; 0 for a single fix."""
     step_s = fixes.groupby("drive")["time_s"].diff()
     by_drive = step_s.groupby(fixes["drive"])
     return by_drive.transform("median").fillna(0)
 
 
 def period_of(track: pd.DataFrame) -> float:
-    """Return the median time between fixes of all drives in seconds; 0 for one fix."""
+    """Return the median time between fixes in seconds; 0 if no drive has two fixes."""
     period_s = _period_s(_fixes(track)).median()
     return float(f"{period_s:.3g}")
 
@@ -125,16 +125,17 @@ def knots_of(track: pd.DataFrame) -> pd.DataFrame:
 def find_standing(
     track: pd.DataFrame, least_speed: float, *, by_positions: bool
 ) -> pd.DataFrame:
-    """Return masks of rows whose position stays the same for over three periods.
+    """Return masks of rows whose position stays the same for over three fix periods.
 
-    Only rows under a command are used. If the robot moves meanwhile, the receiver is
-    frozen: either the measured speed or a distant next position indicates this. A robot
-    that stands still under its command is immobilised, which is not a fault.
+    Only rows under a command are used. If the robot moves meanwhile, as its measured
+    speed or a distant next position shows, the receiver is frozen. A robot that stands
+    still under its command is immobilised, which is not a fault.
 
     Args:
         track: track from `track_of`; `speed` is NaN where it was not measured.
-        least_speed: minimum speed of used commands and of a moving robot [m/s].
-        by_positions: whether a frozen position also requires a distant next position.
+        least_speed: speed from which a command is used and a robot is moving [m/s].
+        by_positions: whether a receiver is frozen only if its next position, if there
+            is one, is distant.
 
     Returns:
         A table by the track's index, False in the first row of each fix:
@@ -181,7 +182,7 @@ def find_jumped(track: pd.DataFrame, limit_m_s: float) -> pd.Index:
     The longest stretch of a drive without a jump is correct. From there, forward and
     backward, a position is correct if the robot can reach it from the last correct
     position. Over short times, noise may exceed the distance that a robot can move, so
-    a time below a second is replaced by a second.
+    times below 1 s are taken as 1 s.
 
     Args:
         track: track from `track_of`.
@@ -262,7 +263,8 @@ def spans_of(
         columns.append("z")
     steps = firsts[columns].groupby("segment").diff(-1)
     chord_m = np.hypot(steps["x"], steps["y"])
-    # On an arc, the angle between neighbouring chords is the angle of a chord's arc.
+    # On a circular arc, neighbouring chords differ in direction by the angle that each
+    # chord subtends at the centre.
     next_steps = steps.groupby("segment").shift(-1)
     after = angle_between(steps, next_steps)
     before = after.groupby("segment").shift(1)
@@ -287,13 +289,13 @@ def spans_of(
 
 
 def _span_of(track: pd.DataFrame, knots: pd.DataFrame, span_s: float) -> pd.Series:
-    """Return the number of each row's span, that of the last measured position."""
+    """Return the number of each row's span: the span of the last measured position."""
     period_s = knots.groupby("segment")["time_s"].diff().median()
     times = track.groupby("drive")["time_s"]
     longest_s = (times.max() - times.min()).max()
     window_s = np.fmax(span_s, period_s)
-    # If times are logged in hours, the log seems short. Its shortened spans then allow
-    # `drive_units` to find this unit.
+    # If times are logged in hours, the log seems short. Shorter spans are then enough
+    # spans for `drive_units` to detect that the unit is the hour.
     if 0 < longest_s < MIN_SPANS * window_s:
         window_s = longest_s / MIN_SPANS
     span = np.floor(knots["time_s"] / window_s)

@@ -12,12 +12,14 @@ _MIN_LAMBDA = 0.05  # minimum median λ of a log
 _MAX_LAMBDA = 1.3  # maximum median λ of a log
 # A larger ratio of distance by positions to commanded distance indicates a wrong unit.
 _MAX_COMMAND_RATIO = 5.0
-# Quantile of λ over spans that counts as the maximum. A median could be that of an
+# Quantile of λ over spans that counts as the maximum. The median may be that of an
 # immobilised robot.
 _FAST_QUANTILE = 0.95
-# If the ratio of measured to commanded speed is lower, measured speed is over ground.
+# If the ratio of measured to commanded speed is lower, measured speed is the speed over
+# ground, not that of wheels.
 _MIN_WHEEL_RATIO = 0.9
-# Maximum ratio of the resolution of positions to the distance of a span.
+# Positions are coarse if the ratio of their resolution to the distance of a span is
+# higher.
 _COARSE = 0.25
 
 # Ratio of distance by positions to distance by measured speed, by the unit of speed.
@@ -106,8 +108,8 @@ def unit_of(
         resolution_m: resolution of positions in metres.
 
     Returns:
-        The unit, empty if no unit fits; the remedy without a full stop; whether the
-        unit is that of times or positions instead of speeds.
+        The unit, empty if no unit fits; the remedy, without a full stop; and whether
+        the unit is one of times or positions rather than speeds.
     """
     ratio = median_ratio(spans, "measured")
     for name, seconds in _TIMES.items():
@@ -151,8 +153,8 @@ def unit_of_command(
 ) -> tuple[float, str, str] | None:
     """Return the unit that explains the ratio of positions to the command.
 
-    The ratio of the distance by positions to the commanded distance is λ if units are
-    right. Only an implausible λ indicates another unit.
+    If the units are correct, the ratio of the distance by positions to the commanded
+    distance is λ. Only an implausible λ indicates a wrong unit.
 
     Args:
         rows: rows of a log.

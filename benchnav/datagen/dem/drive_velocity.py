@@ -10,16 +10,16 @@ from numpy import ndarray
 
 from benchnav.datagen.dem.drive_tracks import WINDOW_S, angle_between, knots_of
 
-# Thresholds that are a choice of this package are marked (choice).
-# Maximum time between fixes for which a turn of over 120° is impossible: robots turn at
-# up to 2.5 rad/s (choice).
+# Thresholds that this package chooses without a source are marked "(choice)".
+# Maximum time between fixes in which no robot can turn by more than 120°: robots turn
+# at up to 2.5 rad/s (choice).
 MAX_PERIOD_S = 0.8
 # Cosine of 120°. A larger turn between rows under one command is a reversal (choice).
 _REVERSAL_COS = -0.5
 # Minimum ratio of a velocity to its standard error for a reliable direction (choice).
 _CLEAR_ERRORS = 5.0
-# Number of windows without a reliable direction after which a robot may have turned
-# (choice).
+# After more than this number of windows without a reliable direction, a robot may have
+# turned (choice).
 _MAX_REST_WINDOWS = 2.0
 _ROWS_AT_ONCE = 4096
 
@@ -42,8 +42,9 @@ def velocity_of(track: pd.DataFrame, columns: list[str]) -> pd.DataFrame:
                 window.
             error: standard error of the slopes in m/s, from the scatter of the fixes in
                 the window, or from that of the whole drive if it is larger.
-            window_s: duration of the window.
-            reach_s: half of the time that the fixes would span if they were dense.
+            window_s: duration of the window in seconds.
+            reach_s: half of the time in seconds that the fixes would span if they were
+                dense.
     """
     results = [*columns, "error", "window_s", "reach_s"]
     fits = [pd.DataFrame(columns=results, dtype=float)]
@@ -82,7 +83,7 @@ def _fit(rows: pd.DataFrame, knots: pd.DataFrame, columns: list[str]) -> pd.Data
             count: number of knots.
             residual: sum of squared residuals over the columns, in m².
             spread_s2: sum of squared deviations of the times from their mean, in s².
-            window_s: duration of the window.
+            window_s: duration of the window in seconds.
     """
     row_s = rows["time_s"].to_numpy()
     knot_s = knots["time_s"].to_numpy()
@@ -155,13 +156,13 @@ def speed_of_positions(track: pd.DataFrame, least_speed: float) -> pd.Series:
     as commanded again. If fixes are rare, the robot may have turned between them, so
     reversals are ignored.
 
-    In a curve, the fitted line is shorter than the arc. The speed is corrected by the
-    turn rate of the track.
+    In a curve, the slope of the fitted line is less than the speed on the arc. The turn
+    rate of the track is used to correct this.
 
     Args:
         track: track from `track_of`.
-        least_speed: minimum speed of used commands; under slower commands, the robot
-            may turn round [m/s].
+        least_speed: minimum commanded speed of used rows [m/s]; under slower commands,
+            the robot may turn round.
 
     Returns:
         Speed in m/s by the track's index, positive forward; NaN where the velocity of

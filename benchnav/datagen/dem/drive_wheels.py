@@ -1,4 +1,4 @@
-"""Detection of measured speeds that come from wheels instead of motion over ground.
+"""Detection of measured speeds that are those of wheels instead of speeds over ground.
 
 Wheels follow the command on any terrain, so their speed hides slip.
 """
@@ -13,14 +13,15 @@ from benchnav.datagen.dem.drive_tracks import WINDOW_S, spans_of
 from benchnav.datagen.dem.drive_units import median_ratio
 
 # All thresholds are choices of this package.
-# Maximum relative spread of a constant ratio of measured to commanded speed. Terrain
-# causes a larger spread.
+# The ratio of measured to commanded speed is constant if its relative spread is below
+# this value. Terrain causes a larger spread.
 _MAX_SPREAD = 0.02
-_MIN_SPANS = 10  # minimum number of spans for a decision; 20 s
-# Fraction by which positions may move less than wheels whose speed equals the command.
+_MIN_SPANS = 10  # minimum number of spans for a decision (20 s)
+# Fraction by which positions may move less far than measured speed, if this equals the
+# command.
 _MAX_SHORTFALL = 0.05
-# Difference between the 5 % and 95 % quantiles of slope along a track above which λ
-# must vary.
+# If the difference between the 5 % and 95 % quantiles of slope along a track reaches
+# this value, λ must vary.
 _VARIED_SLOPE_DEG = 10.0
 
 
@@ -55,10 +56,11 @@ def _ratio_quantiles(spans: pd.DataFrame) -> list[float]:
 
 
 def check_wheels(log: DriveLog, track: pd.DataFrame) -> None:
-    """Reject a log whose measured speed is that of wheels, also in stretches only.
+    """Reject a log whose measured speed is that of wheels, everywhere or in stretches.
 
-    Spans of two lengths are used. Short spans follow alternating curves better; noise
-    only increases the distance by positions.
+    Spans of two durations are compared, and the one with longer distances by positions
+    counts: short spans follow alternating curves better, and noise can only increase
+    these distances.
 
     Args:
         log: log of the drives.

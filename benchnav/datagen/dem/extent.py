@@ -309,7 +309,7 @@ def _name_of(crs: Any) -> str:
 
 
 def _cells_within(size_m: ndarray, step: float) -> list[int]:
-    """Return the number of cells of width `step` within a size, in y and x."""
+    """Return how many cells of width `step` fit into a size, in y and x."""
     return np.floor(size_m / step + SLACK).astype(int).tolist()
 
 

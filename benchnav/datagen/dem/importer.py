@@ -73,7 +73,7 @@ REASONS = {
 # Records of each map: index in the terrain, lowest elevation in metres, and number of
 # unlabelled cells.
 _RECORDS = ("kept", "lowest_m", "unlabelled")
-# Input that a map must have, by the reason for which it is left out otherwise.
+# Input without which a map is left out, by the reason that is recorded for this.
 _REQUIRED = {
     "not_driven": "drive_count",
     "missing_elevation": "dem",
@@ -193,7 +193,7 @@ def _fields_of(survey: Survey) -> Fields:
 
 @dataclass
 class _SplitWriter:
-    """Writer of one split's maps, with records of stored and counts of omitted maps."""
+    """Writer of one split's maps; it records stored maps and counts omitted ones."""
 
     name: str
     recipe: Recipe
@@ -226,7 +226,7 @@ class _SplitWriter:
             self._flush()
 
     def _count_invalid(self, padded_m: ndarray, inputs: Maps) -> ndarray:
-        """Return a mask of valid maps, bool, shape [B]; count the reasons of others."""
+        """Return a mask of valid maps, bool, shape [B]; count the others by reason."""
         is_valid = np.ones(len(padded_m), dtype=bool)
         missing_masks = _missing_masks(inputs)
         for reason, name in _REQUIRED.items():

@@ -1,4 +1,4 @@
-"""Check that a recipe's maps fit an elevation model, with settings that correct them.
+"""Check that a recipe's maps fit an elevation model, and settings that make them fit.
 
 Maps must not be too many, and their cells must not be much smaller than those of the
 elevation model. If they are, the error contains a resolution, size or stride that fits.
@@ -114,7 +114,7 @@ def _corrections(
     scalings: Iterator[Scaling],
     max_maps: int,
 ) -> Iterator[tuple[dict[str, Any], float | None]]:
-    """Yield recipe settings and a stride in metres that fit, in the order of scalings.
+    """Yield settings and a stride in metres with which maps fit, by scaling in order.
 
     The stride is None if maps are adjacent, which is the default.
 

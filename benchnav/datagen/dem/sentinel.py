@@ -30,7 +30,7 @@ _SENTINELS = (
 # Sentinels of any quantity.
 _CERTAIN_SENTINELS = (-9999, -99999, -999999, -32767, -32768)
 _MAX_VALUE = 1e30  # a larger magnitude marks a missing value of any quantity
-_HUGE = 1e5  # a magnitude from which a value that is not a height marks a missing one
+_HUGE = 1e5  # magnitude from which values that are not heights mark missing cells
 _HEIGHTS_M = (-12_000.0, 30_000.0)  # limits of heights on the Earth, the Moon and Mars
 _MIN_GAP_M = 100.0  # minimum difference between a sentinel and all heights of a map
 # Minimum magnitude of a sentinel that is rarely a height.

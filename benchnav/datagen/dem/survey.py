@@ -60,8 +60,8 @@ class Survey:
 
     Attributes:
         tiling: tiling of the terrain into maps.
-        layers: resampled rasters by argument; `NAME min` and `NAME max` are the
-            extremes of averaged cells.
+        layers: resampled rasters by argument; `NAME min` and `NAME max` are the minimum
+            and maximum of the raster's values in each averaged cell.
         unlabelled: whether no cell has a class.
         driven: values of driven cells; None without a log of drives.
         arguments: names of the user's arguments; `layer NAME` for a layer.

@@ -3,7 +3,7 @@
 Maps are cut from the south-west corner of the terrain, a stride apart. Their indices
 increase eastward within a row of maps, and from row to row northward. Each split gets
 one strip across the longer side of the terrain, in the order of the splits. Between two
-strips, terrain of at least a map's width is in no map. Maps of different splits
+strips, terrain of at least a map's width is on no map. Maps of different splits
 therefore neither overlap nor touch.
 """
 
@@ -70,7 +70,7 @@ class Tiling(NamedTuple):
         return bool(np.less(self.stride, self.shape).any())
 
     def groups(self, map_indices: Sequence[int]) -> np.ndarray:
-        """Return the group of each map. Maps of a group overlap, also through others.
+        """Return each map's group: maps that overlap directly or through other maps.
 
         Args:
             map_indices: indices of the maps in the terrain.

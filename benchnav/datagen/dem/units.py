@@ -6,7 +6,7 @@ from benchnav.core.errors import DatasetError, expect
 from benchnav.datagen.dem.crs import horizontal
 from benchnav.datagen.dem.raster import Raster
 
-UNITS_M = {"m": 1.0, "ft": 0.3048, "us-ft": 1200 / 3937}  # by the names of PROJ
+UNITS_M = {"m": 1.0, "ft": 0.3048, "us-ft": 1200 / 3937}  # length by PROJ's unit name
 # Spellings of units that rasters declare, in lower case, by the value of `dem_unit`.
 _SPELLINGS = {
     "m": ("m", "metre", "meter", "metres", "meters"),
@@ -82,8 +82,8 @@ def check_metres(raster: Raster) -> None:
     """Check that a raster of a layer in metres does not declare another unit.
 
     Raises:
-        DatasetError: If the raster declares another unit; with a command that converts
-            it.
+        DatasetError: If the raster declares another unit. The message contains a
+            command that converts it.
     """
     declared = raster.file.units[0] or ""
     name = _dem_unit_of(declared)

@@ -29,7 +29,7 @@ def check_elevation(dem: Raster, values: Maps, cliff_m: float) -> None:
             does not exceed, in metres.
 
     Raises:
-        DatasetError: If they contain an undeclared sentinel.
+        DatasetError: If the elevations contain an undeclared sentinel.
     """
     lowest_m = values.get("dem min", values["dem"])
     highest_m = values.get("dem max", values["dem"])
@@ -56,7 +56,7 @@ def check_elevation(dem: Raster, values: Maps, cliff_m: float) -> None:
 def check_limits(
     raster: Raster, maps: Maps, minimum: float, maximum: float
 ) -> tuple[float, float]:
-    """Return the minimum and maximum of a raster's values, after a check.
+    """Check a raster's values against limits; return their minimum and maximum.
 
     If all values are missing, the minimum is ∞ and the maximum −∞.
 
@@ -78,7 +78,7 @@ def check_limits(
 
 
 def check_layer(raster: Raster, maps: Maps, field: Field) -> bool:
-    """Return whether a layer has at least one value on the maps, after a check.
+    """Check the values of a layer; return whether it has any value on the maps.
 
     Args:
         raster: raster of the layer.

@@ -20,7 +20,7 @@ _LINE = re.compile(r"([0-9a-f]{64})  (.+)")
 def read_checksums(folder: Path) -> dict[str, str]:
     """Return the recorded SHA-256 of files of a run folder, by path in the folder.
 
-    A line without a checksum is returned as a path with an empty SHA-256.
+    A line of another form is returned as a path with an empty SHA-256.
     """
     path = folder / SUMS
     text = path.read_text(errors="replace") if path.is_file() else ""

@@ -1,9 +1,10 @@
-"""Provenance of rows: code, maps, machine and commands.
+"""Provenance of result rows: code, maps, machine and commands.
 
 A unit of work is identified by a key: the digest of its condition, seed, realisation,
 maps and code. The code comprises all modules of benchnav that the unit imports (see
-`digests_of_package_modules`), the code and files of its parts, versions of installed packages, and
-the vector instructions of the processor.
+`digests_of_package_modules`), the code of its custom parts, the files of all its parts
+(such as planner and model), versions of installed packages, and the vector instructions
+of the processor.
 """
 
 import itertools
@@ -46,9 +47,9 @@ _UNIT = "benchnav.eval.run.unit"
 _MAX_NAMED = 3
 
 Code = dict[str, dict[str, Any]]
-METRICS = "metrics"  # group of the code of further metrics
-# Key next to the groups of code: files, packages and environment variables that custom
-# parts read, which are known only after a run.
+METRICS = "metrics"  # group of `Code` for metrics in addition to the built-in ones
+# Additional key in `Code`, beside its groups: files, packages and environment variables
+# that custom parts read, which are known only after a run.
 TOUCHED = "touched"
 
 
@@ -59,7 +60,7 @@ class Origin:
     Args:
         code: values by group: `environment` (versions, processor, device, time limit of
             planners); `modules` (digests of benchnav's modules); `parts` (digests of
-            other code and files); and, if rows have further metrics, `metrics` from
+            other code and files); and, if rows have additional metrics, `metrics` from
             `describe_metrics`.
         maps: digest of the split's properties, followed by digests of the maps.
     """
@@ -142,7 +143,7 @@ def describe_parts(condition: Condition) -> Code:
 
 
 def describe_metrics(metrics: Iterable[Part]) -> dict[str, Any]:
-    """Return part, options and digest of code and files of each metric, by column."""
+    """Return each metric's part, options, and digest of code and files, by column."""
     described = {}
     for part in metrics:
         target = part.found
@@ -159,7 +160,7 @@ def describe_metrics(metrics: Iterable[Part]) -> dict[str, Any]:
 
 
 def lacks_metrics(code: Mapping[str, Any], expected: Code) -> list[str]:
-    """Return the columns of further metrics that rows lack, according to their code.
+    """Return the columns of additional metrics that rows lack, by their code.
 
     Args:
         code: code of the rows.
@@ -199,11 +200,11 @@ def map_digests(dataset: TerrainDataset, split: str, maps: Sequence[int]) -> lis
 
 
 def code_differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """Describe the entries that two codes have in common and that differ.
+    """Describe the entries that are in both codes but have different values.
 
     Args:
         earlier: code as in `Origin.code`; it may also contain `TOUCHED`.
-        now: the code that is compared with it, in the same form.
+        now: the code that is compared with `earlier`, in the same form.
     """
     lines = []
     modules = _differing(earlier, now, "modules")
@@ -224,7 +225,7 @@ def code_differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list
 def _differing(
     earlier: Mapping[str, Any], now: Mapping[str, Any], group: str
 ) -> list[str]:
-    """Return the names of entries of a group that both codes have and that differ."""
+    """Return names of a group's entries that are in both codes but differ in value."""
     values = now.get(group, {})
     return [
         name
@@ -236,11 +237,11 @@ def _differing(
 def dataset_differences(
     earlier: Mapping[str, Any], now: Mapping[str, Any]
 ) -> list[str]:
-    """Describe the maps that two runs have in common and that differ.
+    """Describe the maps that both runs use but whose contents or properties differ.
 
     Args:
-        earlier: datasets of a run, from `describe_datasets`.
-        now: datasets of the run that is compared with it.
+        earlier: datasets of the earlier run, from `describe_datasets`.
+        now: datasets of the run that is compared with `earlier`.
     """
     changed = []
     for data, entry in earlier.items():
@@ -264,9 +265,10 @@ def describe_machine() -> dict[str, Any]:
 def extend_history(
     earlier: Iterable[Mapping[str, Any]], suite: Mapping[str, Any]
 ) -> list[Mapping[str, Any]]:
-    """Append an entry for this command to a history, unless the command is repeated.
+    """Append an entry for this command to a history, unless it already has the entry.
 
-    An entry has command, suite, date, machine, version and git commit of benchnav. The
+    An entry contains the command, the suite, the date, the machine, and the version and
+    git commit of benchnav. Entries that differ only in their date are the same. The
     commit ends in `+` if files differ from it; it is empty if benchnav is not in a git
     repository of its own.
 

@@ -36,8 +36,8 @@ class Results:
         run: the run; if it is not finished, `codes` in its manifest are those of the
             finished units.
         episodes: one row per episode.
-        finished: number of finished units; 0 if the run is finished.
-        units: number of units of the run; 0 if the run is finished.
+        finished: number of finished units of an unfinished run; 0 if it is finished.
+        units: number of all units of an unfinished run; 0 if it is finished.
         without: names of the conditions without an episode.
         is_partial: whether the run has no table yet, even if all units are finished.
     """
@@ -136,7 +136,7 @@ def read_results(folder: Path, partial: bool = False) -> Results:
 def newest_units(run: Run) -> list[tuple[Unit, Finished | None]]:
     """Return the units of a run in the order of its table, each with its newest file.
 
-    Unfinished units have None.
+    An unfinished unit has None instead of a file.
     """
     newest = []
     for unit in in_table_order(units(run.conditions), run.conditions):

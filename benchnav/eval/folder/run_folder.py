@@ -122,7 +122,7 @@ def write_run(folder: Path, manifest: Mapping[str, Any]) -> None:
 
 
 def caveats(manifest: Mapping[str, Any]) -> list[str]:
-    """Return lines with the warnings and the left-out combinations of a run.
+    """Return lines that state the warnings and the left-out combinations of a run.
 
     Args:
         manifest: contents of `run.json`, at least `warnings` and `dropped`.
@@ -183,7 +183,7 @@ def damaged(path: Path, remedy: str) -> Iterator[None]:
 
     Args:
         path: path of the file, for the message.
-        remedy: sentence on how to replace the file.
+        remedy: sentence that tells the user how to replace the file.
     """
     try:
         yield

@@ -27,8 +27,8 @@ STEPS = "steps"
 LAST_COLUMN = "traversability"
 # RMSE of E[λ], and mean log score of the belief, over the terrain ahead of a robot.
 AHEAD_COLUMNS = ("ahead_rmse", "ahead_log_score")
-AHEAD_M = 5.0  # range of the terrain ahead of a robot
-AHEAD_DEG = 45.0  # half the angle of this terrain
+AHEAD_M = 5.0  # range of the terrain ahead of a robot, in metres
+AHEAD_DEG = 45.0  # maximum angle between this terrain and the heading, in degrees
 _ORDER = ["condition", *DRAW, "step"]
 _REMEDY = (
     "Remove the folder of steps, which the report does not need, or run the suite "
@@ -54,7 +54,7 @@ def _write(path: Path, table: pa.Table, file_metadata: Mapping[str, Any]) -> Non
 
 
 def align_steps(folder: Path, finished: Iterable[Unit]) -> None:
-    """Give all files of steps the same columns, even if robots' actions differ.
+    """Give all files of steps the same columns, even if action dimensions differ.
 
     Readers of several files use the columns of the first file.
 

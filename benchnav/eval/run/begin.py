@@ -40,7 +40,7 @@ from benchnav.eval.run.unit import Settings
 
 @dataclass(frozen=True, kw_only=True)
 class Work(Checked):
-    """A checked suite with the further options of a command.
+    """A checked suite, with the other options of a command.
 
     Args:
         suite: the suite as the user wrote it, for `run.json`.
@@ -262,7 +262,7 @@ def _about(
 def _still_dropped(
     dropped: Iterable[dict[str, str]], conditions: Conditions
 ) -> list[dict[str, str]]:
-    """Return the left-out combinations that no condition has, without repetitions.
+    """Return the left-out combinations that no condition covers, without repetitions.
 
     After a change of its parts, a combination that was left out may have been run.
     """

@@ -1,4 +1,4 @@
-"""Checks before a run, which build the conditions of a suite without planning.
+"""Checks before a run: the conditions of a suite are built, without planning.
 
 A suite is a product, and some of its combinations may be invalid, such as a planner
 that cannot steer a robot, or `single-class` with a model without classes. Invalid

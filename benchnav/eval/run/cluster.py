@@ -90,7 +90,7 @@ def check_worker(worker: Any, settings: Settings) -> None:
 
 
 def store_files(folder: Path, unit: Unit, files: Mapping[str, bytes]) -> None:
-    """Write a unit's files into a run folder, the rows last: they mark it finished."""
+    """Write a unit's files into a run folder; the rows, last, mark it finished."""
     clear_unit(folder, unit)
     for name in sorted(files, key=lambda name: name.startswith("units/")):
         with replacing(folder / name) as partial:

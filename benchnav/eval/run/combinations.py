@@ -123,7 +123,7 @@ def _is_single_class(condition: Condition) -> bool:
 
 
 def _unprepared(condition: Condition) -> str:
-    """Return the reason for which a shipped planner rejects its options, or ""."""
+    """Return why a shipped planner rejects its options; empty if it accepts them."""
     planner: Part = condition.planner
     if not planner.found.shipped:
         return ""

@@ -35,10 +35,10 @@ def check_determinism(
     """Run the first unit of each condition in two processes and compare the rows.
 
     Rows are compared bit for bit, except planning times. The second process runs units
-    and maps in reverse order, twice. The rows of its second repetition are compared, so
-    that state that parts retain has had time to grow. If rows differ, a third process
-    repeats the units of the first, which distinguishes retained state from external
-    input.
+    and maps in reverse order, twice. The rows of its second repetition are compared,
+    since parts that retain state have accumulated it by then. If rows differ, a third
+    process repeats the units of the first, which distinguishes retained state from
+    external input.
 
     Args:
         suite: suite whose conditions are checked.

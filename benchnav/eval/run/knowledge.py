@@ -26,7 +26,7 @@ from benchnav.planning.sensing.learner import Learner
 from benchnav.planning.world.outcome import Outcome
 
 _MIN_CHANGE = 0.02  # a planner replans if λ̂ of any cell changes by more
-_MIN_LOG_SCORE = -10.0  # lower limit of the log score, such as for a density of 0
+_MIN_LOG_SCORE = -10.0  # lower limit of the log score, e.g. for a density of 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +55,7 @@ class KnowledgeTracker:
         problem: the planner's problem at the start.
 
     Attributes:
-        revisions: number of changes of each episode's map, int64, shape [B].
+        revisions: number of changes of each robot's map of λ̂, int64, shape [B].
         seen_cells: number of cells whose appearance each robot has observed up to its
             last update, int64, shape [B].
         sensed_cells: number of cells whose λ each robot has measured up to its last
@@ -179,7 +179,7 @@ class KnowledgeTracker:
         return self._problem
 
     def _merged_belief(self, state: Any, indices: Tensor) -> Any:
-        """Return a belief state in which those of some episodes are the current ones.
+        """Return `state` with the belief of some episodes replaced by the current one.
 
         Args:
             state: belief state of the remaining episodes in the planner's problem.
@@ -233,7 +233,7 @@ class KnowledgeTracker:
         return is_near & (turn.abs() <= math.radians(AHEAD_DEG))
 
     def maps_of(self, step: int, episode_indices: Iterable[int]) -> dict[int, KnownMap]:
-        """Return the known maps of those given episodes that remain.
+        """Return the known maps of those of the given episodes that still remain.
 
         Args:
             step: index of the step.

@@ -1,7 +1,7 @@
 """Merging the shards of a run into one run folder.
 
-The merged run can be reported, resumed and extended like any other. A unit is a file
-that is identified by its origin. Merging therefore checks and copies these files.
+The merged run can be reported, resumed and extended like any other. A finished unit
+is one file, which its origin identifies, so merging checks and copies these files.
 """
 
 import shutil
@@ -166,7 +166,7 @@ def _check_alike(runs: Sequence[Run]) -> None:
 
 
 def _unlike(first: Run, second: Run) -> list[str]:
-    """List differences in the manifests of two shards, which should be of one run."""
+    """List differences of two shards' manifests that show that their runs differ."""
     lines = []
     n_first = _shard(first).of
     n_second = _shard(second).of

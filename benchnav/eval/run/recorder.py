@@ -57,7 +57,7 @@ class Recorder:
         }
 
     def store_plan(self, step: int, plan: Plan, planned: list[int]) -> None:
-        """Store the plan of a step; plans after the time that figures show are thinned.
+        """Store the plan of a step; thin its lines after the time that figures show.
 
         Args:
             step: index of the step.

@@ -1,4 +1,4 @@
-"""Recordings created again from a run, and the map that its figures show."""
+"""Recordings that are recreated from a run, and the map that its figures show."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -61,7 +61,7 @@ def find_recording(
             return Recording.load(stored)
     row = _row(folder, unit, unit.maps[episode_index])
     device = device_of_run(open_run(folder).manifest)
-    # No time limit of planners, since it changes no action.
+    # Planners have no time limit here, since a limit changes no action.
     settings = Settings(device=device.type)
     with one_thread():
         recorder, inputs = _recorder(unit, settings, [episode_index])
@@ -215,7 +215,7 @@ def _check_unchanged(run: Run, unit: Unit, code_digest: str) -> None:
 def most_differing_map(episodes: pd.DataFrame) -> dict[str, Any]:
     """Choose the map and the draw of λ on which the success of conditions differs most.
 
-    The number of successes or of failures, whichever is smaller, is then largest. Ties
+    On this map, the smaller of the numbers of successes and failures is largest. Ties
     are decided by the number of conditions, then by the order of the rows.
 
     Args:

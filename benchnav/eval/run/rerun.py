@@ -1,4 +1,4 @@
-"""Repetition of a run from its provenance, and comparison of every row.
+"""Repetition of a run from its provenance, and comparison of all rows.
 
 All conditions of `run.json` are repeated with their extents, including those that later
 commands added.
@@ -41,7 +41,7 @@ from benchnav.eval.run.combinations import find_left_out
 from benchnav.eval.run.runner import run_work
 from benchnav.eval.run.unit import Settings
 
-_MAX_SHOWN = 5  # rows that a comparison lists
+_MAX_SHOWN = 5  # maximum number of rows that a comparison lists
 
 
 def rerun(

@@ -62,26 +62,26 @@ class Observer:
 class Episodes:
     """Trajectories and outcomes of a batch of episodes, on the CPU.
 
-    After the last of an episode's `steps`, its state is constant.
+    Once an episode has ended, after its `steps` steps, its state is constant.
 
     Args:
         states: robot states, shape [B, N + 1, S].
         actions: commanded actions, shape [B, N, A].
         traversability: observed λ of each step, shape [B, N].
-        speed_mps: speed of the robot with the same action on terrain with λ = 1, in
-            m/s, shape [B, N].
-        turn_rate_radps: turn rate of the robot with the same action on terrain with
-            λ = 1, in rad/s, shape [B, N].
+        speed_mps: speed that the action of each step would give on terrain with λ = 1,
+            in m/s, shape [B, N].
+        turn_rate_radps: turn rate that the action of each step would give on terrain
+            with λ = 1, in rad/s, shape [B, N].
         outcome: codes of `Outcome`, int64, shape [B].
         steps: number of steps to the end, int64, shape [B].
         begin_s: wall time of the planner's preparation for the batch, in seconds.
         planning_s: wall time of planning at each step, for all planned episodes, in
             seconds, shape [N].
         planned: number of planned episodes at each step, int64, shape [N].
-        revisions: number of changes of each episode's map, int64, shape [B].
+        revisions: number of changes of each robot's map of λ̂, int64, shape [B].
         learning_s: wall time of sensing and updates in all steps, in seconds.
-        errors: error that ended each episode in one line, length B; empty without an
-            error.
+        errors: one-line description of the error that ended each episode, length B;
+            empty without an error.
         traceback: traceback of the exception that ended episodes; empty without one.
         seen_cells: number of cells whose appearance each robot observed, int64, shape
             [B]; None if robots do not learn.
@@ -395,7 +395,7 @@ class _Batch:
         return indices
 
     def part_of(self, values: Tensor) -> Tensor:
-        """Return the values of the planned episodes from values of all, [B, ...]."""
+        """Select the planned episodes from `values` of all, shape [B, ...]."""
         return values[self._index]
 
     def revise(self, problem: Problem, generator: torch.Generator) -> None:
@@ -429,7 +429,7 @@ class _Batch:
 
 
 class RobotError(BenchnavError):
-    """The robot dynamics F raised in the simulation, so that no row is meaningful."""
+    """The robot dynamics F raised an error in the simulation; no result is valid."""
 
 
 def _move(

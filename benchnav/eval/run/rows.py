@@ -27,8 +27,8 @@ class References:
     Args:
         reference_time_s: grid reference time of each map at 1 m/s, in seconds, shape
             [B]; NaN if missing.
-        rejected_draws: number of draws of λ that were rejected, since they had no
-            feasible path to the goal, for each episode, length B.
+        rejected_draws: number of draws of λ that were rejected for each episode, since
+            they had no feasible path to the goal, length B.
         lower_bound_s: lower bound of the time to the goal for each episode, in seconds,
             length B; infinite if no trajectory reaches the goal. Empty if no bound was
             computed.
@@ -165,13 +165,14 @@ def episode_rows(
         unit: the unit, with its metrics in addition to the built-in ones.
         groups: group index of each map, shape [B].
         finished: episodes of the unit, length B.
-        errors: error of each episode in one line, length B; empty without an error.
+        errors: one-line description of each episode's error, length B; empty without
+            an error.
         compiled: whether the planner ran compiled.
 
     Returns:
         The condition's id and labels, `seed`, `realisation`, `map`, `group`, `outcome`;
         the columns of `benchnav.metrics.SHIPPED`; `compiled`, `error`; and the columns
-        of the unit's further metrics.
+        of the unit's additional metrics.
 
     Raises:
         MetricError: If a metric raises, or returns an infinite value or no number.

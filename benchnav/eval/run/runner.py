@@ -214,7 +214,7 @@ class _Steps:
     def __init__(
         self, named: Sequence[Unit], missing: Sequence[Unit], in_turn: bool
     ) -> None:
-        """Take the requested units, those that are run, and whether they run in turn."""
+        """Store the requested units, those to run, and whether they run in turn."""
         self._names = unit_names(named)
         self._total = len(named)
         self._episodes = sum(len(unit.maps) for unit in named)

@@ -40,7 +40,7 @@ _SEVERITY: tuple[tuple[str, str], ...] = (
     ("In the 90 % interval", "coverage"),
     ("Under VaR at 0.9", "tail_rate"),
 )
-_IDEALS = {"coverage": 0.9, "tail_rate": 0.1}  # ideal values inside the range
+_IDEALS = {"coverage": 0.9, "tail_rate": 0.1}  # ideal values within a range
 _N_CLASS_MEASURES = 4  # number of measures of ClassQuality, which come first
 
 

@@ -1,7 +1,4 @@
-"""Figures of predicted traversability: PIT histograms and latent functions.
-
-Letters in shapes: C classes, G nodes.
-"""
+"""Figures of predicted traversability: PIT histograms and latent functions."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -27,11 +24,13 @@ _RARE_FRACTION = 1e-3  # of the cells of a class
 
 
 def _slope_quantile(cells: Sequence[int], fraction: float) -> float:
-    """Return the least whole degree of slope that at most a fraction of cells exceeds.
+    """Return the smallest slope such that at most a fraction of the cells is steeper.
+
+    The slope is in whole degrees.
 
     Args:
-        cells: number of cells in each whole degree of slope.
-        fraction: fraction of the cells, in [0, 1).
+        cells: number of cells by slope, in bins of 1° from 0°.
+        fraction: maximum fraction of steeper cells, in [0, 1).
     """
     n_steeper = np.cumsum(cells[::-1])[::-1]
     threshold = fraction * n_steeper[0]
@@ -123,7 +122,7 @@ class Latent(Figure):
     )
 
     def needs(self, data: QualityData) -> bool:
-        """Return whether the model has Gaussian processes, and classes were measured."""
+        """Return whether the model has Gaussian processes and class scores exist."""
         return data.table is not None and bool(data.by_class)
 
     def draw(self, data: QualityData) -> Drawing:
@@ -210,7 +209,7 @@ class Latent(Figure):
         panel.plot(x, expected, "k:", lw=1, label="true E[λ]")
 
     def _shade_steep(self, panel: Axes, cells: Sequence[int]) -> None:
-        """Shade slopes that few cells exceed, and more darkly slopes that none exceeds."""
+        """Shade slopes that few cells exceed, and darker those that no cell exceeds."""
         shades = (
             (_RARE_FRACTION, 0.12, "steeper: 1 cell in 1000"),
             (0.0, 0.25, "steeper: no cell of the class"),

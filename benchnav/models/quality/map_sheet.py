@@ -36,7 +36,7 @@ _LAYERS: dict[str, tuple[str, str, str]] = {
     "entropy": ("Entropy", "nats", "magma"),
     "information": ("Mutual information", "nats", "magma"),
 }
-_SCALE_LEVEL = 0.995  # fraction of the cells that a scale covers
+_SCALE_LEVEL = 0.995  # fraction of the cells whose values a scale covers
 _ROUND_NUMBERS = np.array([1, 1.5, 2, 3, 4, 5, 6, 8, 10])
 
 

@@ -1,4 +1,4 @@
-"""Sums of a model's scores in each map, from which `scores_of_maps` computes scores.
+"""Sums of a model's cell scores by map, from which `scores_of_maps` derives scores.
 
 Letters in shapes: B maps of a chunk, M maps of a split, C classes, N cells.
 """
@@ -22,7 +22,8 @@ from benchnav.models.quality.scores import (
 )
 from benchnav.stats.scores import Sums
 
-STEPS = 50  # number of points of a sparsification curve; the first has all cells
+# Number of points of a sparsification curve. No cell is removed at the first.
+STEPS = 50
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,13 +54,13 @@ class CellScores:
 
 
 class MapTally:
-    """Sums of scores in each map; maps are added in chunks.
+    """Sums of the scores of cells, by map; maps are added in chunks.
 
     Args:
         classes: number of classes C; 0 for a model without classes.
         truth: whether the true distribution of λ is available.
-        quantiles: whether to compute sums that need quantiles of all cells, which take most
-            of the time.
+        quantiles: whether to compute the sums that need quantiles of the predictions,
+            which takes most of the time.
     """
 
     def __init__(self, classes: int, truth: bool, quantiles: bool = True) -> None:
@@ -73,7 +74,7 @@ class MapTally:
         self.ranked = np.zeros((2, STEPS))
 
     def add(self, cells: CellScores | None, count: int) -> None:
-        """Add `count` maps, given their observed cells; None if no cell is observed."""
+        """Add `count` maps; `cells` has the observed cells, None if there are none."""
         sums = {name: torch.zeros(count, dtype=torch.float64) for name in self.names}
         if cells is not None:
             sums |= self._sums_of(cells, count)
@@ -82,7 +83,7 @@ class MapTally:
             self._append(name, values)
 
     def _sums_of(self, cells: CellScores, count: int) -> dict[str, Tensor]:
-        """Return the sums of scores by map, each of shape [count]; update the curves."""
+        """Return the sums of scores by map, each of shape [count]; update `ranked`."""
         scores = dict(cells.scores)
         scores["cells"] = torch.ones_like(cells.observed)
         scores["inside"] = (cells.transformed - 0.5).abs() <= LEVEL / 2
@@ -126,7 +127,8 @@ class MapTally:
         """Return the sparsification curves, shape [3, STEPS].
 
         The rows are the fraction of removed cells, the mean error of the remaining cells
-        if cells are removed by width, and the mean error if they are removed by error.
+        if the cells with the widest predicted intervals are removed first, and their
+        mean error if the cells with the largest errors are removed first.
         """
         n_cells = sum(float(counts.sum()) for counts in self.parts["cells"])
         removed = np.arange(STEPS) / STEPS
@@ -137,7 +139,7 @@ class MapTally:
         self.parts.setdefault(name, []).append(array)
 
     def _rank(self, cells: CellScores, width: Tensor, count: int) -> Tensor:
-        """Return the AUSE of each cell's map, [N]; add the maps to the mean curves."""
+        """Return the AUSE of each cell's map, [N]; add the maps' curves to `ranked`."""
         areas = torch.zeros_like(width)
         error = (cells.expected - cells.observed)[0].abs()
         steps = torch.arange(STEPS, device=width.device)
@@ -168,16 +170,17 @@ _OF_QUANTILES = ("pinball", "width", "areas")
 
 
 def by_group(sums: Sums, groups: np.ndarray) -> dict[str, np.ndarray]:
-    """Sum the maps of each group, such as overlapping maps, as one statistical unit.
+    """Add up the sums of each group of maps, so that it counts as one statistical unit.
 
-    Units without observed cells are left out.
+    For example, overlapping maps are a group. Groups without observed cells are left
+    out.
 
     Args:
         sums: sums by name, each of shape [M]; sums by class have shape [M, C].
         groups: group id of each map, shape [M].
 
     Returns:
-        Sums of the units by name, in the order of the group ids.
+        Sums of the groups by name, in the order of the group ids.
     """
     group_ids, index = np.unique(groups, return_inverse=True)
     totals = {}

@@ -88,7 +88,7 @@ class ClassQuality:
 class TraversabilityQuality:
     """Quality of predicted distributions of traversability.
 
-    Of the first four, lower is better.
+    For `rmse_observed`, `rmse_expected`, `nll` and `crps`, lower is better.
 
     Args:
         rmse_observed: root mean square of E[λ] − observed λ.
@@ -217,8 +217,8 @@ def measure_split(
         seed: root seed of the random PIT values within atoms; all models of a comparison
             have the same seed.
         device: device of the computation.
-        by_map: whether to return sums by map for a comparison, which need quantiles of
-            all cells.
+        by_map: whether to return sums by map for a comparison; they need quantiles of
+            the predictions in all cells.
     """
     alike = look_alike_classes(dataset.recipe.classes)
     truth = dataset.truth_of(split) == "generated"
@@ -246,8 +246,8 @@ def measure(
         alike: ids of each class and its look-alikes, by class; empty if no classes look
             alike.
         truth: whether the true distribution of λ is available.
-        by_map: whether to return sums by map for a comparison, which need quantiles of
-            all cells.
+        by_map: whether to return sums by map for a comparison; they need quantiles of
+            the predictions in all cells.
         classes: whether to measure class probabilities, if the model predicts classes.
     """
     n_maps = 0

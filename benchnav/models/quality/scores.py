@@ -90,7 +90,7 @@ def tail_rate(transformed: Tensor, level: float = LEVEL) -> float:
 def lower_fifth_and_width(
     distribution: TraversabilityDistribution, observed: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return the pinball loss of the lower fifth and the width of the central interval.
+    """Return the pinball loss of quantiles up to 0.2, and the central interval's width.
 
     The loss is the mean over the levels u = 0.01, 0.02, …, 0.20 of max(u·(λ − Q(u)), (u
     − 1)·(λ − Q(u))), a proper score of these quantiles. The interval contains 90 % of the

@@ -1,5 +1,6 @@
-"""Scores of models as functions of sums over maps (`map_sums`), with their direction.
+"""Scores of models, computed from sums by map (`map_sums`).
 
+Each score states whether higher or lower is better, or neither.
 Scores that tables of a single model also show have the headings and meanings of
 `columns`.
 """
@@ -51,7 +52,7 @@ def _root(squares: np.ndarray, cells: np.ndarray) -> np.ndarray:
 
 
 def _miou(hits: np.ndarray, true: np.ndarray, predicted: np.ndarray) -> np.ndarray:
-    """Return the intersection over union, averaged over the classes that are true."""
+    """Return the intersection over union, averaged over classes that occur in truth."""
     union = true + predicted - hits
     divisor = np.where(union > 0, union, 1)
     overlap: np.ndarray = np.where(true > 0, hits / divisor, 0.0)
@@ -84,7 +85,7 @@ def _score(
     )
 
 
-# The width has no better direction: a narrow interval is good only if it covers λ.
+# Neither direction of the width is better: a narrow interval must also cover λ.
 COMPARED = (
     _score("accuracy", "hits", "true", better="higher"),
     _score("miou", "hits", "true", "found", of=_miou, better="higher"),

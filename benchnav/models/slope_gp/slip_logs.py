@@ -1,4 +1,4 @@
-"""Slip logs of a robot, from which class-wise GPs can be trained instead of from maps.
+"""Slip logs of a robot, which can replace maps to train class-wise GPs.
 
 A log is a table (CSV, TSV or Parquet) with one row per location driven over. Columns:
 `class` (name or integer id), `slope_deg` (0–90), `traversability` (λ, 0–1; 1 minus the
@@ -29,7 +29,7 @@ from benchnav.models.slope_gp.cells import Cells
 
 _LIMITS = {"slope_deg": (0, 90), "traversability": (0, 1)}
 COLUMNS = ("class", *_LIMITS)
-# A log in degrees with at least this many rows has a slope above 1.6°, unlike radians.
+# With at least this many rows, slopes that never exceed π/2 are taken to be in radians.
 _MIN_ROWS_TO_CHECK_UNIT = 20
 _MAX_CLASSES = 256  # class ids are stored in a byte
 
@@ -55,7 +55,7 @@ def read_slip_logs(path: str | Path, class_names: tuple[str, ...] = ()) -> SlipL
     """Read a slip log.
 
     Args:
-        path: path of the log, which ends in one of `ENDINGS`.
+        path: path of the log, a CSV, TSV or Parquet file (`robot_logs.ENDINGS`).
         class_names: names of the classes, in the order of their ids. If empty, they are
             derived from the log: its class names in alphabetical order, or "0", "1", …
             up to the largest integer id.

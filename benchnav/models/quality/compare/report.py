@@ -184,7 +184,7 @@ def _cell(name: str, marked: set[tuple[str, str, str]], row: Row) -> str:
 
 
 def difference_table(comparison: Comparison) -> Table:
-    """Return differences to the best, one row per split, measure and competing model."""
+    """Return differences from the best model by split, measure and competing model."""
     rows = comparison.best[comparison.best["difference"].notna()]
 
     def p_cell(row: Row) -> str:
