@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
+from rich.cells import cell_len
 
 from benchnav.core import part_lookup, registry
 from benchnav.core.errors import ConfigError
@@ -194,7 +195,7 @@ def test_a_table_where_there_is_one(
 def test_tables_fit_and_break_no_option(kind: str, width: int) -> None:
     text = to_terminal(make_table(kind), width=width, styled=True)
     text = re.sub(r"\x1b\[[0-9;]*m", "", text)
-    assert max(map(len, text.splitlines())) <= width
+    assert max(map(cell_len, text.splitlines())) <= width
     for entry in list_entries(kind):
         assert entry.name in text
         assert all(option in text for option in entry.options)

@@ -74,7 +74,7 @@ class MapTally:
         self.ranked = np.zeros((2, STEPS))
 
     def add(self, cells: CellScores | None, count: int) -> None:
-        """Add `count` maps; `cells` has the observed cells, None if there are none."""
+        """Add the scores of `count` maps; `cells` is None if no cell was observed."""
         sums = {name: torch.zeros(count, dtype=torch.float64) for name in self.names}
         if cells is not None:
             sums |= self._sums_of(cells, count)

@@ -777,7 +777,7 @@ def test_suites_are_checked_before_anything_is_run_or_dropped(
         ({"planners": ({"part": "mppi", "options": {"noise": [0.5]}},)}, "noise"),
         (
             {"robots": ("tests.eval.parts:Faulty",)},
-            "a subclass of benchnav.planning.Robot, got Faulty",
+            "an instance of benchnav.planning.Robot, got Faulty",
         ),
         (
             {"planners": ("benchnav.planning.robots:Unicycle",)},
