@@ -781,11 +781,11 @@ def test_suites_are_checked_before_anything_is_run_or_dropped(
         ),
         (
             {"planners": ("benchnav.planning.robots:Unicycle",)},
-            r"a subclass of benchnav.planning.Planner, got Unicycle\. Write class Unicycle\(Planner\)",
+            r"an instance of benchnav.planning.Planner, got Unicycle\. Write class Unicycle\(Planner\)",
         ),
         (
             {"objectives": ("benchnav.planning.robots:Unicycle",)},
-            "a subclass of benchnav.planning.Objective, got Unicycle",
+            "an instance of benchnav.planning.Objective, got Unicycle",
         ),
         ({"conditions": ({"task": 3},)}, "mapping"),
         ({"conditions": ({"planners": []},)}, "at least one condition"),
