@@ -24,8 +24,8 @@ _HEADINGS = (
     "straight\nline free",
 )
 _NOTES = (
-    "stuck: cells with true mean λ ≤ λ_stuck. soft ground: classes with soft spots. "
-    "soft spots: expected cells.",
+    "stuck: true mean λ ≤ λ_stuck. soft ground: classes with soft spots. soft spots: "
+    "expected part of all cells.",
     "time s: fastest path around stuck cells, in solvable splits. straight line free: "
     "maps with no stuck cell on it.",
 )

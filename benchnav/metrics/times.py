@@ -21,7 +21,7 @@ class Success(Recorded):
 
 
 class TotalTime(Metric):
-    """T_total: the time to the goal, or the time budget T for a failure."""
+    """Time to the goal, or the time budget T for a failure."""
 
     name = words = "T_total"
     column = "total_time_s"

@@ -167,7 +167,7 @@ class Immobile:
 
 
 def cells_at_goal(grid: Grid, goal_m: Tensor, radius_m: float) -> Tensor:
-    """Return a mask of cells of which some point is nearer to the goal than a radius.
+    """Return a mask of cells with a point nearer to the goal than a radius.
 
     Args:
         grid: grid of the maps.

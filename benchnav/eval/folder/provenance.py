@@ -48,7 +48,7 @@ _MAX_NAMED = 3
 
 Code = dict[str, dict[str, Any]]
 METRICS = "metrics"  # group of `Code` for metrics in addition to the built-in ones
-# Additional key in `Code`, beside its groups: files, packages and environment variables
+# Additional key in `Code`, next to its groups: files, packages and environment variables
 # that custom parts read, which are known only after a run.
 TOUCHED = "touched"
 
