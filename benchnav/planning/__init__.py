@@ -46,6 +46,7 @@ __getattr__, __dir__, __all__ = face(
             "Bicycle",
             "DifferentialDrive",
             "Robot",
+            "SkidSteer",
             "Unicycle",
         ),
         "benchnav.planning.sensing.belief": ("Belief", "CovarianceModel", "Static"),
@@ -62,7 +63,9 @@ __getattr__, __dir__, __all__ = face(
             "Sensor",
             "Step",
         ),
+        "benchnav.planning.footprint": ("Footprint", "minimum_over_footprint"),
         "benchnav.planning.world.simulation": ("Simulation",),
+        "benchnav.planning.world.tracks": ("create_simulation",),
         "benchnav.planning.world.world": ("Endpoints", "World"),
     },
 )

@@ -1,3 +1,4 @@
+from benchnav.planning.footprint import Footprint, minimum_over_footprint
 from benchnav.planning.free_space import FreeSpace, Rules
 from benchnav.planning.objective import GoalDistance, Objective, TravelTime, distance
 from benchnav.planning.planners.astar.astar_dwa import AStarDWA
@@ -26,6 +27,7 @@ from benchnav.planning.robots import (
     Bicycle,
     DifferentialDrive,
     Robot,
+    SkidSteer,
     Unicycle,
 )
 from benchnav.planning.sensing.belief import Belief, CovarianceModel, Static
@@ -43,6 +45,7 @@ from benchnav.planning.sensing.sensor import (
     Step,
 )
 from benchnav.planning.world.simulation import Simulation
+from benchnav.planning.world.tracks import create_simulation
 from benchnav.planning.world.world import Endpoints, World
 
 __all__ = [
@@ -65,6 +68,7 @@ __all__ = [
     "DifferentialDrive",
     "Endpoints",
     "ExpectedTime",
+    "Footprint",
     "FreeSpace",
     "Full",
     "GoalDistance",
@@ -89,6 +93,7 @@ __all__ = [
     "Sensor",
     "Simulation",
     "SingleClass",
+    "SkidSteer",
     "Static",
     "Step",
     "Straight",
@@ -98,6 +103,8 @@ __all__ = [
     "Unicycle",
     "VaR",
     "World",
+    "create_simulation",
     "distance",
+    "minimum_over_footprint",
     "pose_problem",
 ]

@@ -25,6 +25,7 @@ PENALTY = 1e4
 It exceeds the cost of any path over free terrain. The paper has the same penalty of a
 step.
 """
+IMMOBILE_BY = ("cell", "observed")
 UNSEEN = ("prior", "optimistic", "pessimistic")
 _LATER = {"unseen": "prior", "replan_every_s": 0.5}
 
@@ -149,13 +150,17 @@ class Immobile:
     """Rule of immobilisation.
 
     Args:
-        below: λ under the robot below which terrain immobilises it, in (0, 1].
+        below: observed λ below which terrain immobilises a robot, in (0, 1].
         for_s: consecutive time in seconds on such terrain after which a robot is
-            immobilised and its episode ends, whatever the robot commands.
+            immobilised and its episode ends.
+        by: `cell`, λ of the cell at the robot's position, whatever the robot commands;
+            or `observed`, the achieved fraction of the commanded motion of its wheels.
+            With `observed`, only steps that command wheel motion count.
     """
 
     below: float = 0.1
     for_s: float = 2.0
+    by: str = "cell"
 
     def __post_init__(self) -> None:
         """Validate the rule."""
@@ -163,6 +168,10 @@ class Immobile:
         expect(
             0 < self.for_s < float("inf"),
             f"`immobile.for_s` > 0 and finite, got {self.for_s}.",
+        )
+        expect(
+            self.by in IMMOBILE_BY,
+            f"`immobile.by` {' or '.join(map(repr, IMMOBILE_BY))}, got {self.by!r}.",
         )
 
 

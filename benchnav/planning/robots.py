@@ -19,6 +19,7 @@ from torch import Tensor
 
 from benchnav.core.errors import expect
 from benchnav.core.specified import Specified
+from benchnav.planning.footprint import Footprint
 
 # Names of actions, by which planners recognise the actions that they can command.
 SPEED = "speed_mps"
@@ -60,6 +61,11 @@ class Robot(Specified, ABC):
     @property
     def action_rates(self) -> tuple[float, ...] | None:
         """Maximum change of each action per second; None if unlimited."""
+        return None
+
+    @property
+    def footprint(self) -> Footprint | None:
+        """Contacts with the terrain; None for a point."""
         return None
 
     @abstractmethod
@@ -136,6 +142,29 @@ class Unicycle(_Vehicle):
         """Return the state after one time step; see `Robot`."""
         scale = traversability * self.dt_s
         return _stack(_drive(state, action[..., 0], action[..., 1], scale))
+
+
+@dataclass(frozen=True, kw_only=True)
+class SkidSteer(Unicycle):
+    """A unicycle on four wheels, two on each side, whose sides can slip apart.
+
+    Planners assume the motion of a unicycle, and leave room for the contacts.
+
+    Args:
+        dt_s: time step.
+        speed_mps: minimum and maximum linear velocity v.
+        turn_rate_radps: minimum and maximum angular velocity ω.
+        track_m: distance between the left and the right wheels.
+        wheelbase_m: distance between the front and the rear wheels.
+    """
+
+    track_m: float = 0.5
+    wheelbase_m: float = 0.5
+
+    @property
+    def footprint(self) -> Footprint:
+        """The four wheels, around the middle of the robot."""
+        return Footprint(track_m=self.track_m, wheelbase_m=self.wheelbase_m)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -28,6 +28,7 @@ from benchnav.core.errors import ConfigError, expect
 from benchnav.core.grid import Grid
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Terrain
+from benchnav.planning.footprint import minimum_over_footprint
 from benchnav.planning.world.world import Endpoints, World
 
 MAX_ATTEMPTS = 100
@@ -101,7 +102,19 @@ class Realisation:
         Returns:
             λ in [0, 1], shape [B].
         """
-        x, y = state[:, 0], state[:, 1]
+        return self.at_positions(state[:, :1], state[:, 1:2], step)[:, 0]
+
+    def at_positions(self, x: Tensor, y: Tensor, step: Tensor) -> Tensor:
+        """Return λ at positions in the next step; 0 off the map.
+
+        Args:
+            x: positions in metres, shape [B, P].
+            y: positions in metres, shape [B, P].
+            step: number of steps taken, int64, shape [B].
+
+        Returns:
+            λ in [0, 1], shape [B, P].
+        """
         if self.field is not None:
             return self._grid.lookup(self._padded_layers[:, 0], x, y)
         last = self._noise.shape[1] - 1
@@ -109,12 +122,13 @@ class Realisation:
         noise = self._noise.gather(1, index)[:, :, None]
         count = self._padded_layers.shape[1]
         layers = self._padded_layers.flatten(0, 1)
-        layer_x = x.repeat_interleave(count)
-        layer_y = y.repeat_interleave(count)
+        layer_x = x.repeat_interleave(count, dim=0)
+        layer_y = y.repeat_interleave(count, dim=0)
         values = self._grid.lookup(layers, layer_x, layer_y)
-        weights, means, stds = values.view(len(x), 3, count // 3, 1, 1).unbind(1)
+        shape = len(x), 3, count // 3, 1, x.shape[1]
+        weights, means, stds = values.view(shape).unbind(1)
         mixture = TraversabilityMixture(weights, means, stds)
-        traversability = mixture.from_normal(noise)[:, 0, 0]
+        traversability = mixture.from_normal(noise)[:, 0]
         return torch.where(self._grid.contains(x, y), traversability, 0.0)
 
     def field_at(self, step: int) -> Tensor:
@@ -226,6 +240,8 @@ def draw_frozen(
         if world.immobile is None:
             return field, attempts
         is_firm = drawn >= world.immobile.below
+        if world.clearance_m is not None:
+            is_firm = minimum_over_footprint(is_firm, grid, world.clearance_m)
         is_feasible = are_connected(is_firm, grid, places.select(pending))
         pending = pending[~is_feasible]
         if len(pending) == 0:

@@ -18,6 +18,11 @@ from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.realisation import Realisation
 from benchnav.planning.world.world import Endpoints, World
 
+# A step that commands less motion of the faster side observes nothing.
+MIN_WHEEL_SPEED_MPS = 0.05
+# Distance of the sides of a robot without a footprint, for its wheel speed (choice).
+POINT_TRACK_M = 0.5
+
 
 @dataclass(frozen=True)
 class SimulationState:
@@ -126,13 +131,12 @@ class Simulation:
             action: actions, which are clipped to the robot's bounds, shape [B, A].
 
         Returns:
-            The next state, and λ under each robot during the step, shape [B].
+            The next state, and the λ that each robot observed in this step, shape [B].
         """
         traversability = self._realisation.at(now.state, now.step)
         action = action.clamp(self._low, self._high)
-        # The state is cloned, since a custom robot may modify its arguments.
-        moved_state = self.robot(now.state.clone(), action, traversability)
-        state = torch.where(now.running[:, None], moved_state, now.state)
+        moved, observed = self._move(now, action, traversability)
+        state = torch.where(now.running[:, None], moved.state, now.state)
         step = now.step + now.running
         is_at_goal = distance(state, self._goal_m) < self._goal_radius_m
         is_on_map = self._grid.contains(state[:, 0], state[:, 1])
@@ -140,14 +144,57 @@ class Simulation:
         dwell_steps = now.dwell_steps
         rule = self._immobile_rule
         if rule is not None:
-            immobilises = traversability < rule.below
-            dwell_steps = torch.where(immobilises, dwell_steps + 1, 0)
+            is_observed = rule.by == "observed"
+            met = observed if is_observed else traversability
+            counted = torch.where(met < rule.below, dwell_steps + 1, 0)
+            if is_observed:
+                is_commanded = self._wheel_speed(now, action) >= MIN_WHEEL_SPEED_MPS
+                counted = torch.where(is_commanded, counted, dwell_steps)
+            dwell_steps = counted
             is_immobilised = dwell_steps >= steps_in(rule.for_s, self.robot.dt_s)
             outcome = torch.where(is_immobilised, Outcome.IMMOBILISED, outcome)
         outcome = torch.where(is_on_map, outcome, Outcome.OUT_OF_BOUNDS)
         outcome = torch.where(is_at_goal, Outcome.SUCCESS, outcome)
         outcome = torch.where(now.running, outcome, now.outcome)
-        return SimulationState(state, outcome, step, dwell_steps), traversability
+        after = replace(
+            moved, state=state, outcome=outcome, step=step, dwell_steps=dwell_steps
+        )
+        return after, observed
+
+    def _move(
+        self, now: SimulationState, action: Tensor, traversability: Tensor
+    ) -> tuple[SimulationState, Tensor]:
+        """Return the state after the motion of a step, and the observed λ.
+
+        Args:
+            now: current state; not modified.
+            action: actions within the bounds, shape [B, A].
+            traversability: λ of the cell at each robot's position, shape [B].
+
+        Returns:
+            The state with the robots' new states, for all episodes, and with
+            everything that the backend adds; and the achieved fraction of the commanded
+            motion, shape [B].
+        """
+        moved = self.robot(now.state.clone(), action, traversability)
+        return replace(now, state=moved), traversability
+
+    def _velocity(self, now: SimulationState, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the commanded (v, ω): the motion at λ = 1, each of shape [B]."""
+        before = now.state
+        after = self.unhindered(now, action)
+        heading = before[:, 2]
+        x, y = (after[:, :2] - before[:, :2]).unbind(1)
+        along_m = x * heading.cos() + y * heading.sin()
+        dt_s = self.robot.dt_s
+        return along_m / dt_s, (after[:, 2] - heading) / dt_s
+
+    def _wheel_speed(self, now: SimulationState, action: Tensor) -> Tensor:
+        """Return the speed of the faster side that is commanded, in m/s, shape [B]."""
+        footprint = self.robot.footprint
+        track_m = POINT_TRACK_M if footprint is None else footprint.track_m
+        speed, turn_rate = self._velocity(now, action)
+        return speed.abs() + turn_rate.abs() * track_m / 2
 
     def unhindered(self, now: SimulationState, action: Tensor) -> Tensor:
         """Return the states that an action would lead to at λ = 1, shape [B, S].

@@ -14,9 +14,10 @@ from benchnav.core.batch import Batch
 from benchnav.core.copula import KERNELS
 from benchnav.core.errors import ConfigError, expect
 from benchnav.core.settings import check_known, plain, read
-from benchnav.planning.free_space import FreeSpace, Immobile, Rules
+from benchnav.planning.free_space import IMMOBILE_BY, FreeSpace, Immobile, Rules
 
 NOISES = ("resampled", "stored", "frozen")
+BACKENDS = ("kinematic", "tracks")
 
 MAX_STEPS = 10**6
 """Maximum number of steps of an episode; at 0.1 s per step, 28 hours."""
@@ -53,6 +54,16 @@ class World:
             exp(−d²/2ℓ²).
         kernel: kernel of frozen noise: `gaussian`, or `matern32`, a rougher field with
             the same correlation at distance ℓ. Beliefs assume the Gaussian kernel.
+        backend: model of how λ slows a robot. `kinematic`: λ of the cell at its
+            position scales its motion. `tracks`: the mean λ of the contacts on each
+            side scales that side, so that the sides slip apart; this needs a robot
+            with a footprint.
+        lag_s: time constant of the wheel speeds in seconds, for `tracks`; None for
+            wheels that follow the command at once.
+        clearance_m: minimum clearance of an acceptable draw of frozen noise: start and
+            goal are connected by cells around which no cell within this distance, in
+            metres, immobilises a robot. None for the cells themselves. A suite takes
+            the largest footprint of its robots.
         immobile: rule by which terrain immobilises a robot and ends its episode; None
             if terrain only slows robots.
         time_budget_s: time budget T in seconds, after which an episode fails; None to
@@ -66,6 +77,9 @@ class World:
     noise: str = "resampled"
     correlation_m: float = 1.5
     kernel: str = KERNELS[0]
+    backend: str = BACKENDS[0]
+    lag_s: float | None = None
+    clearance_m: float | None = None
     immobile: Immobile | None = None
     time_budget_s: float | None = 100.0
     time_budget_ratio: float | None = None
@@ -86,6 +100,21 @@ class World:
             0 <= self.correlation_m < float("inf"),
             f"`correlation_m` ≥ 0 and finite, got {self.correlation_m}.",
         )
+        expect(
+            self.backend in BACKENDS,
+            f"`backend` {' or '.join(map(repr, BACKENDS))}, got {self.backend!r}.",
+        )
+        if self.lag_s is not None:
+            expect(
+                0 < self.lag_s < float("inf") and self.backend == "tracks",
+                "`lag_s` > 0 and finite, with `backend` 'tracks', got "
+                f"{self.lag_s} with {self.backend!r}.",
+            )
+        if self.clearance_m is not None:
+            expect(
+                0 < self.clearance_m < float("inf"),
+                f"`clearance_m` > 0 and finite, got {self.clearance_m}.",
+            )
         is_ratio = self.time_budget_s is None
         expect(
             is_ratio != (self.time_budget_ratio is None),
@@ -189,18 +218,23 @@ class World:
     def to_dict(self) -> dict[str, Any]:
         """Return all settings that affect episodes, as plain data for JSON.
 
-        Settings that the noise does not use are omitted. The kernel `gaussian` is also
-        omitted, since version 1 had only this kernel, and ids must not change.
+        Settings that the noise does not use are omitted. The first kernel, backend and
+        rule of immobilisation are also omitted, since version 1 had no others, and ids
+        must not change.
         """
         unused = {"preset"}
         if self.noise != "frozen":
             unused |= {"correlation_m", "kernel"}
         if self.kernel == KERNELS[0]:
             unused.add("kernel")
+        if self.backend == BACKENDS[0]:
+            unused.add("backend")
         settings = {}
         for name, value in plain(self).items():
             if value is not None and name not in unused:
                 settings[name] = value
+        if self.immobile is not None and self.immobile.by == IMMOBILE_BY[0]:
+            del settings["immobile"]["by"]
         return settings
 
 
@@ -312,5 +346,7 @@ def _differences(preset: Any, value: Any) -> list[str]:
             text = f"{after:g}"
         elif name == "immobile":
             text = f"{after.below:g}/{after.for_s:g}s" if after else "none"
+            if after and after.by != IMMOBILE_BY[0]:
+                text += f"/{after.by}"
         changed.append(f"{name}={text}")
     return changed
