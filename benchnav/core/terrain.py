@@ -67,6 +67,8 @@ class Terrain(Batch):
             colour: in each cell, the mixture of the distributions of the look-alike
             classes, weighted by their frequencies. If None, no classes are look-alikes,
             and the best prediction is `truth`.
+        slope_law: function from slopes in degrees, shape [N], to the mean λ of firm
+            terrain of each class, shape [C, N]; None if the dataset has no such laws.
         layers: optional layers by name, as in `Observation`.
     """
 
@@ -78,6 +80,7 @@ class Terrain(Batch):
     traversability: Tensor
     grid: Grid
     look_alikes: "Callable[[Terrain], TraversabilityMixture] | None" = None
+    slope_law: Callable[[Tensor], Tensor] | None = None
     layers: Mapping[str, Tensor] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -12,6 +12,7 @@ from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Terrain
 from benchnav.datagen.layers.layer import DrawnMaps
 from benchnav.datagen.recipe import latent
+from benchnav.datagen.recipe.classes import ClassTable
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.datagen.schema import KNOWN, MAP_FIELDS, TRUTH, Maps
 
@@ -42,6 +43,7 @@ def terrain_of(maps: Maps, recipe: Recipe) -> Terrain:
         truth=_mixture(parameters, (0,) * n_components),
         grid=recipe.grid,
         look_alikes=look_alikes,
+        slope_law=partial(_slope_law, recipe.classes),
         layers=layers,
     )
 
@@ -67,6 +69,13 @@ def _look_alikes(recipe: Recipe, terrain: Terrain) -> TraversabilityMixture:
         n_components = 2 if item.soft else 1
         group += [class_id] * n_components
     return _mixture(parameters, tuple(group)).to(terrain.class_id.device)
+
+
+def _slope_law(classes: ClassTable, slope_deg: torch.Tensor) -> torch.Tensor:
+    """Return f_c(ψ) of each class, float64, shape [C, N]; see `latent.latent_mean`."""
+    class_id = np.arange(len(classes))[:, None]
+    mean = latent.latent_mean(class_id, _to_float64(slope_deg), classes)
+    return torch.from_numpy(mean)
 
 
 def _to_float64(tensor: torch.Tensor) -> np.ndarray:

@@ -33,12 +33,14 @@ class Outcome(IntEnum):
     # The planner raised an error, exceeded its time limit, or returned an invalid
     # action.
     PLANNER_ERROR = 7
-    # The model or risk measure raised an error, or returned an invalid value.
+    # The model or risk measure raised an error, or returned an invalid value; or the
+    # simulated physics failed.
     MODEL_ERROR = 8
     # The robot was on immobilising terrain for as long as the world allows.
     IMMOBILISED = 9
     SENSOR_ERROR = 10  # The sensor raised an error, or returned an invalid measurement.
     BELIEF_ERROR = 11  # The belief raised an error, or returned an invalid value.
+    ROLLOVER = 12  # The robot tipped over.
 
 
 # Names of the outcomes that an error in user code causes.

@@ -92,6 +92,11 @@ class Realisation:
         # Padded for lookups, shape [B, 1 or 3·K, (H + 2)·(W + 2)].
         self._padded_layers = self._grid.pad(layers, outside=0.0)
 
+    @property
+    def truth(self) -> TraversabilityMixture:
+        """True distribution of λ; parameters have shape [B, K, H, W]."""
+        return self._truth
+
     def at(self, state: Tensor, step: Tensor) -> Tensor:
         """Return λ under robots during their next step, 0 off the map.
 

@@ -15,6 +15,8 @@ from torch import Tensor
 from benchnav.core.errors import expect
 from benchnav.core.terrain import Terrain
 from benchnav.planning.problem import Task
+from benchnav.planning.world.contact_checks import check_contacts
+from benchnav.planning.world.physics.simulation import PhysicsSimulation
 from benchnav.planning.world.simulation import Simulation, SimulationState
 from benchnav.planning.world.world import Endpoints, World
 
@@ -55,18 +57,12 @@ class TrackSimulation(Simulation):
             f"'tracks', got {type(task.robot).__name__}, which is a point.",
         )
         assert footprint is not None
-        goal_radius_m = task.rules.goal_radius_m
-        expect(
-            footprint.radius_m <= goal_radius_m,
-            f"a footprint within the goal's disc of {goal_radius_m:g} m, got contacts "
-            f"{footprint.radius_m:g} m from the robot's position. Increase "
-            "`task.goal_radius_m`.",
-        )
-        resolution_m = terrain.grid.resolution_m
-        expect(
-            resolution_m <= 2 * footprint.track_m,
-            f"cells of at most twice the track, {2 * footprint.track_m:g} m, for "
-            f"`world.backend` 'tracks', got cells of {resolution_m:g} m.",
+        check_contacts(
+            "tracks",
+            terrain.grid,
+            task.rules.goal_radius_m,
+            footprint.radius_m,
+            footprint.track_m,
         )
         super().__init__(terrain, task, world, places, noise_key, maps)
         self._footprint = footprint
@@ -119,7 +115,11 @@ class TrackSimulation(Simulation):
         return replace(now, state=state, velocity=velocity), observed
 
 
-SIMULATIONS = {"kinematic": Simulation, "tracks": TrackSimulation}
+SIMULATIONS = {
+    "kinematic": Simulation,
+    "tracks": TrackSimulation,
+    "physics": PhysicsSimulation,
+}
 
 
 def create_simulation(

@@ -15,9 +15,10 @@ from benchnav.core.copula import KERNELS
 from benchnav.core.errors import ConfigError, expect
 from benchnav.core.settings import check_known, plain, read
 from benchnav.planning.free_space import IMMOBILE_BY, FreeSpace, Immobile, Rules
+from benchnav.planning.world.physics.settings import Physics, differences
 
 NOISES = ("resampled", "stored", "frozen")
-BACKENDS = ("kinematic", "tracks")
+BACKENDS = ("kinematic", "tracks", "physics")
 
 MAX_STEPS = 10**6
 """Maximum number of steps of an episode; at 0.1 s per step, 28 hours."""
@@ -57,7 +58,9 @@ class World:
         backend: model of how λ slows a robot. `kinematic`: λ of the cell at its
             position scales its motion. `tracks`: the mean λ of the contacts on each
             side scales that side, so that the sides slip apart; this needs a robot
-            with a footprint.
+            with a footprint. `physics`: rigid bodies on wheels that soil pulls.
+        physics: soil, body, entrapment and sub-step of the backend `physics`; None for
+            the defaults. Other backends ignore it.
         lag_s: time constant of the wheel speeds in seconds, for `tracks`; None for
             wheels that follow the command at once.
         clearance_m: minimum clearance of an acceptable draw of frozen noise: start and
@@ -78,6 +81,7 @@ class World:
     correlation_m: float = 1.5
     kernel: str = KERNELS[0]
     backend: str = BACKENDS[0]
+    physics: Physics | None = None
     lag_s: float | None = None
     clearance_m: float | None = None
     immobile: Immobile | None = None
@@ -102,8 +106,11 @@ class World:
         )
         expect(
             self.backend in BACKENDS,
-            f"`backend` {' or '.join(map(repr, BACKENDS))}, got {self.backend!r}.",
+            f"`backend` {', '.join(map(repr, BACKENDS[:-1]))} or {BACKENDS[-1]!r}, got "
+            f"{self.backend!r}.",
         )
+        if self.backend == "physics" and self.physics is None:
+            object.__setattr__(self, "physics", Physics())
         if self.lag_s is not None:
             expect(
                 0 < self.lag_s < float("inf") and self.backend == "tracks",
@@ -147,9 +154,9 @@ class World:
     @property
     def spec(self) -> dict[str, Any]:
         """Name of the preset and all fields that differ from it, for `read_world`."""
-        base = plain(PRESETS[self.preset].world)
+        base = _plain(PRESETS[self.preset].world)
         spec: dict[str, Any] = {"preset": self.preset}
-        for name, value in plain(self).items():
+        for name, value in _plain(self).items():
             if value != base[name]:
                 spec[name] = value
         return spec
@@ -229,8 +236,10 @@ class World:
             unused.add("kernel")
         if self.backend == BACKENDS[0]:
             unused.add("backend")
+        if self.backend != "physics":
+            unused.add("physics")
         settings = {}
-        for name, value in plain(self).items():
+        for name, value in _plain(self).items():
             if value is not None and name not in unused:
                 settings[name] = value
         if self.immobile is not None and self.immobile.by == IMMOBILE_BY[0]:
@@ -273,6 +282,16 @@ PRESETS: Mapping[str, Preset] = {
         ),
     ),
 }
+
+
+def _plain(world: World) -> dict[str, Any]:
+    """Return all fields of a world as plain data."""
+    settings = {}
+    for entry in fields(world):
+        value = getattr(world, entry.name)
+        is_physics = isinstance(value, Physics)
+        settings[entry.name] = value.to_dict() if is_physics else plain(value)
+    return settings
 
 
 def _changed_preset(name: str, changes: Mapping[str, Any]) -> World:
@@ -340,6 +359,9 @@ def _differences(preset: Any, value: Any) -> list[str]:
             continue
         if isinstance(after, FreeSpace):
             changed += _differences(before, after)
+            continue
+        if isinstance(after, Physics):
+            changed += differences(Physics().to_dict(), after.to_dict())
             continue
         text = str(after)
         if isinstance(after, float):
