@@ -247,7 +247,7 @@ def test_the_defaults_leave_ids_as_they_are() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"backend": "magic"}, "`backend` 'kinematic' or 'tracks', got 'magic'"),
+        ({"backend": "magic"}, "`backend` 'kinematic', 'tracks' or 'physics', got"),
         ({"lag_s": 0.3}, "with `backend` 'tracks', got 0.3 with 'kinematic'"),
         ({"backend": "tracks", "lag_s": 0.0}, "`lag_s` > 0 and finite"),
         ({"clearance_m": -1.0}, "`clearance_m` > 0 and finite, got -1.0"),

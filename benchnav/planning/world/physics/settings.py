@@ -81,7 +81,7 @@ class Body:
     track_m: float = 0.45
     lag_s: float = 0.1
     yaw_rate_loop: bool = True
-    loop_gain: float = 5.0
+    loop_gain: float = 10.0
     max_rim_speed: float = 1.5
 
     def __post_init__(self) -> None:
@@ -124,7 +124,7 @@ class Physics:
         return self.soil
 
     def to_dict(self) -> dict[str, Any]:
-        """Return all settings as plain data, for `Physics(**settings)`."""
+        """Return all settings as plain data, for `settings.read`."""
         entrapment = None if self.entrapment is None else plain(self.entrapment)
         return {
             "soil": plain_soil(self.law),
