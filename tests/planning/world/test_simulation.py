@@ -196,7 +196,7 @@ def test_some_episodes_are_exchanged_with_their_goals() -> None:
 def test_every_outcome_but_success_and_running_is_a_failure() -> None:
     assert {outcome.name for outcome in FAILURES} == {
         "TIMEOUT", "STUCK", "STALLED", "OUT_OF_BOUNDS", "PLANNER_FAILURE", "PLANNER_ERROR", "MODEL_ERROR",
-        "IMMOBILISED", "SENSOR_ERROR", "BELIEF_ERROR",
+        "IMMOBILISED", "SENSOR_ERROR", "BELIEF_ERROR", "ROLLOVER",
     }  # fmt: skip
 
 

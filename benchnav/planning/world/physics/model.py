@@ -83,7 +83,7 @@ class TerrainMaps(ctypes.Structure):
 
 @dataclass(frozen=True)
 class Drive:
-    """What the model takes from a robot.
+    """Dimensions and bounds of a robot that the model needs.
 
     Args:
         is_steered: whether the second action is a steering angle.
@@ -103,7 +103,7 @@ class Drive:
 
 
 def drive_of(robot: Robot, body: Body) -> Drive:
-    """Return what the model takes from a robot.
+    """Return the dimensions and bounds of a robot that the model needs.
 
     Raises:
         ConfigError: If the robot's actions are not (v, ω) or (v, δ), or a robot with
@@ -178,7 +178,7 @@ class Workspace:
 
     Args:
         physics: settings of the backend.
-        drive: what the model takes from the robot.
+        drive: dimensions and bounds of the robot.
 
     Attributes:
         n_wheels: number of wheels W.
