@@ -10,6 +10,7 @@ from benchnav.core.errors import ConfigError
 from benchnav.env.egocentric_batch import EgocentricBatch
 from benchnav.planning.footprint import minimum_over_footprint
 from benchnav.planning.robots import SkidSteer
+from benchnav.planning.sensing.sensor import Contact
 from benchnav.planning.world.tracks import TrackState
 
 TRACKS = {"preset": "stakes", "backend": "tracks", "lag_s": 0.5}
@@ -50,6 +51,7 @@ def test_policies_see_inflated_maps_of_draws_with_room(dataset_path: Path) -> No
     batch.reset(generators, np.array([True, True]), None)
     radius_m = SkidSteer().footprint.radius_m
     assert batch._world.clearance_m == radius_m
+    assert batch._experience._learner.ground == Contact().mounted(SkidSteer())
     raw = batch._experience._current().risk_map
     expected = minimum_over_footprint(raw, batch._maps.grid, radius_m)
     assert torch.equal(batch._experience.map_knowledge.risk_map, expected)

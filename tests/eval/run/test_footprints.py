@@ -16,6 +16,7 @@ from benchnav.eval.run.runner import run_suite
 from benchnav.eval.run.unit import Settings, UnitInputs, build, read_block
 from benchnav.planning.footprint import minimum_over_footprint
 from benchnav.planning.robots import SkidSteer
+from benchnav.planning.sensing.sensor import Contact
 from benchnav.planning.world.realisation import are_connected
 from benchnav.planning.world.simulation import Simulation
 from benchnav.planning.world.tracks import TrackSimulation
@@ -82,6 +83,19 @@ def test_all_conditions_have_the_fields_of_the_largest_footprint(
     assert kinds == {TrackSimulation: 1, Simulation: 2}
 
 
+def test_the_clearance_is_that_of_the_largest_footprint(dataset_path: Path) -> None:
+    robots = (*ROBOTS, "skid_steer")
+    conditions = conditions_of(suite_of(dataset_path, robots=robots))
+    for condition in conditions:
+        assert condition.world.clearance_m == pytest.approx(RADIUS_M)
+    clearances = {"clearance_m": 0.6}
+    worlds = tuple(world | clearances for world in WORLDS)
+    for condition in conditions_of(suite_of(dataset_path, world=worlds)):
+        assert condition.world.clearance_m == 0.6
+    paper = conditions_of(suite_of(dataset_path, world=("paper",)))
+    assert {condition.world.clearance_m for condition in paper} == {None}
+
+
 def test_accepted_draws_have_a_way_for_the_footprint(
     conditions: list[Condition], dataset_path: Path
 ) -> None:
@@ -118,6 +132,7 @@ def test_updated_maps_are_inflated(dataset_path: Path) -> None:
         planners=("astar_dwa",),
         robots=("skid_steer",),
         sensors=("near",),
+        beliefs=("copula",),
         world=(KINEMATIC,),
         risks=("mean",),
     )
@@ -125,6 +140,7 @@ def test_updated_maps_are_inflated(dataset_path: Path) -> None:
     inputs = inputs_of(condition)
     learning = inputs.learning
     assert learning is not None
+    assert learning.learner.ground == Contact().mounted(SkidSteer())
     tracker = KnowledgeTracker(learning, inputs.problem)
     state = inputs.problem.start.clone()
     state[:, :2] += 3.0  # far enough to see new terrain
