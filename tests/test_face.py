@@ -31,11 +31,13 @@ FACES = {
     "benchnav.models": "Checkpoint ModelFamily Part TrainOptions TrainableModel TrainingConfig "
     "TraversabilityModel Window evaluate_model find_checkpoint fit_model list_checkpoints load_checkpoint "
     "load_model measure_margin predict predict_tiles save_checkpoint write_risk_maps",
-    "benchnav.planning": "AStarDWA AStarMPPI Appearance Belief Bicycle CLRRT Classes Contact Copula CovarianceModel "
-    "DifferentialDrive Endpoints FreeSpace Full GoalDistance LocalPlanner MPPI MPPIConfig Measurement Near NearOptimal "
-    "NoiseKey Objective Optimal Plan PlanStatus Planner Probe Problem Robot Rules SPEED STEERING "
-    "Sensor Simulation Static Step Straight TURN_RATE Task TravelTime Unicycle World distance pose_problem CVaR Chance "
-    "Prediction ExpectedTime Mean RiskMeasure SingleClass TimeCVaR VaR",
+    "benchnav.planning": "AStarDWA AStarMPPI Ackermann Appearance Belief Bicycle CLRRT Classes Contact Copula "
+    "CovarianceModel DifferentialDrive Endpoints Footprint FreeSpace Full GoalDistance "
+    "LocalPlanner MPPI MPPIConfig Measurement Near NearOptimal NoiseKey Objective Optimal "
+    "Plan PlanStatus Planner Probe Problem Robot Rules SPEED STEERING Sensor Simulation "
+    "SkidSteer Static Step Straight TURN_RATE Task TravelTime Unicycle World "
+    "create_simulation distance minimum_over_footprint pose_problem CVaR Chance Prediction "
+    "ExpectedTime Mean RiskMeasure SingleClass TimeCVaR VaR",
     "benchnav.testing": "check_belief check_metric check_model check_objective check_planner check_risk check_robot "
     "check_sensor",
 }

@@ -12,7 +12,7 @@ PACKAGE = Path(__file__).parent.parent / "benchnav"
 
 # The values that the folders of `planning` share, and the shells that Gymnasium is
 # given.
-VALUES = ("free_space", "objective", "problem", "risk", "robots")
+VALUES = ("footprint", "free_space", "objective", "problem", "risk", "robots")
 PLANNING = tuple(f"planning.{name}" for name in VALUES)
 DRAWN = ("datagen.noise", "datagen.schema")  # what all of synthesis shares
 SYNTHESIS = ("datagen.synth", "datagen.recipe", "datagen.layers", *DRAWN)
@@ -78,6 +78,11 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "planning": PLANNING,
     "planning/world": (*PLANNING, "planning.world"),
     "planning/sensing": ("planning.sensing",),
+    "planning/sensing/sensor.py": (
+        "planning.sensing",
+        "planning.footprint",
+        "planning.robots",
+    ),
     "planning/sensing/knowledge.py": (*PLANNING, "planning.sensing", "planning.world"),
     "planning/sensing/learner.py": (*PLANNING, "planning.sensing", "planning.world"),
     "planning/sensing/appearance.py": (

@@ -26,6 +26,7 @@ from benchnav.planning.robots import Robot
 from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.realisation import check_traversability
 from benchnav.planning.world.simulation import Simulation, SimulationState
+from benchnav.planning.world.tracks import check_backend, create_simulation
 from benchnav.planning.world.world import Endpoints, World, read_world
 
 SUCCESS_REWARD = 10.0
@@ -74,8 +75,10 @@ class EnvBatch:
         guard.warn_of_default_world(world)
         if not isinstance(world, World):
             world = read_world(world or "paper")[0]
-        self._world = world
         robot_model: Any = registry.take("robot", robot)
+        footprint = robot_model.footprint
+        radius_m = 0.0 if footprint is None else footprint.radius_m
+        self._world = world.with_clearance(radius_m)
         self._objective: Any = None
         if objective:
             self._objective = registry.take(
@@ -105,9 +108,10 @@ class EnvBatch:
         stored = dataset.read(split, fields=["start_m", "goal_m", "reference_time_s"])
         places = {name: torch.from_numpy(values) for name, values in stored.items()}
         self._places = Endpoints(**places)
-        # Both calls raise for an unsuitable world here instead of in the first reset.
+        # These calls raise for an unsuitable world here instead of in the first reset.
         self._world.budget_s(self._places.reference_time_s, robot_model.top_speed_mps)
         check_traversability(self._maps, self._world)
+        check_backend(self._task, self._world, self._maps.grid)
         self._map = np.zeros(size, dtype=np.int64)
         self._noise_seed = np.zeros(size, dtype=np.int64)
         self._simulation: Simulation | None = None
@@ -148,7 +152,7 @@ class EnvBatch:
         # Tensors created in inference mode could not be changed in place later.
         with torch.inference_mode(False):
             places = self._places.select(maps)
-            new_simulation = Simulation(
+            new_simulation = create_simulation(
                 self._maps.select(maps),
                 self._task,
                 self._world,

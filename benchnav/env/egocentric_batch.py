@@ -128,9 +128,10 @@ class EgocentricBatch(EnvBatch):
         measure = perception.risk
         if not callable(measure):
             measure = registry.make("risk", measure)
+        ground: Any = registry.take("ground", perception.ground)
         learner = Learner(
             sensor=sensor,
-            ground=registry.take("ground", perception.ground),
+            ground=ground.mounted(self._task.robot),
             belief=belief,
             covariance=self._covariance(predictor, statistics),
             measure=measure,
@@ -140,7 +141,7 @@ class EgocentricBatch(EnvBatch):
         )
         update_steps = steps_in(perception.replan_every_s, self._task.robot.dt_s)
         self._experience = Experience(
-            learner, update_steps, is_cacheable=not is_clairvoyant
+            self._task, learner, update_steps, is_cacheable=not is_clairvoyant
         )
         self._bounds: tuple[Tensor, Tensor] | None = None
         if perception.normalised_actions:

@@ -17,6 +17,7 @@ from torch import Tensor
 from benchnav.core.batch import Batch, map_tensors
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.env.view import MapKnowledge
+from benchnav.planning.problem import Task
 from benchnav.planning.sensing.knowledge import Knowledge, Truth
 from benchnav.planning.sensing.learner import Learner
 from benchnav.planning.sensing.sensor import Measurement
@@ -41,14 +42,18 @@ class Experience:
     """Knowledge of the robots of B sub-environments during their episodes.
 
     Args:
+        task: task of the robots, whose footprint inflates λ̂.
         learner: parts that sense, predict and update the belief.
         update_steps: number of steps between two updates of the knowledge.
         is_cacheable: whether the prediction of a whole map is the same in all episodes
             on the map.
     """
 
-    def __init__(self, learner: Learner, update_steps: int, is_cacheable: bool) -> None:
+    def __init__(
+        self, task: Task, learner: Learner, update_steps: int, is_cacheable: bool
+    ) -> None:
         """Create the knowledge before the first episode."""
+        self._task = task
         self._learner = learner
         self._update_steps = update_steps
         self._senses = learner.belief.learns or not learner.sensor.sees_all
@@ -63,7 +68,7 @@ class Experience:
         knowledge = self._current()
         assert knowledge.spread is not None
         return MapKnowledge(
-            risk_map=knowledge.risk_map,
+            risk_map=self._task.inflate(knowledge.risk_map, knowledge.observation.grid),
             spread=knowledge.spread,
             elevation_m=knowledge.observation.elevation_m,
             seen=knowledge.seen,

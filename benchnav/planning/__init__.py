@@ -43,6 +43,7 @@ __getattr__, __dir__, __all__ = face(
             "SPEED",
             "STEERING",
             "TURN_RATE",
+            "Ackermann",
             "Bicycle",
             "DifferentialDrive",
             "Robot",

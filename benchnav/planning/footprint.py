@@ -18,15 +18,18 @@ from benchnav.core.grid import Grid
 
 @dataclass(frozen=True, kw_only=True)
 class Footprint:
-    """Contacts of a robot: two on each side, symmetric about its reference point.
+    """Contacts of a robot: two on each side, the corners of a rectangle.
 
     Args:
         track_m: distance between the left and the right contacts, in metres.
         wheelbase_m: distance between the front and the rear contacts, in metres.
+        ahead_m: distance of the rectangle's centre ahead of the robot's position, in
+            metres.
     """
 
     track_m: float
     wheelbase_m: float
+    ahead_m: float = 0.0
 
     def __post_init__(self) -> None:
         """Validate the lengths."""
@@ -36,11 +39,16 @@ class Footprint:
                 0 < value < float("inf"),
                 f"`{name}` of a footprint > 0 and finite, got {value}.",
             )
+        expect(
+            math.isfinite(self.ahead_m),
+            f"`ahead_m` of a footprint finite, got {self.ahead_m}.",
+        )
 
     @property
     def radius_m(self) -> float:
-        """Distance of the contacts from the reference point, in metres."""
-        return math.hypot(self.track_m, self.wheelbase_m) / 2
+        """Largest distance of a contact from the robot's position, in metres."""
+        reach_m = self.wheelbase_m / 2 + abs(self.ahead_m)
+        return math.hypot(self.track_m / 2, reach_m)
 
     def contacts(self, state: Tensor) -> Tensor:
         """Return the positions of the contacts.
@@ -52,7 +60,8 @@ class Footprint:
             Positions (x, y) in metres, shape [*B, 2, 2, 2]: left and right side, front
             and rear contact, coordinates.
         """
-        along = state.new_tensor([self.wheelbase_m / 2, -self.wheelbase_m / 2])
+        half_m = self.wheelbase_m / 2
+        along = state.new_tensor([self.ahead_m + half_m, self.ahead_m - half_m])
         across = state.new_tensor([self.track_m / 2, -self.track_m / 2])[:, None]
         cos = state[..., 2].cos()[..., None, None]
         sin = state[..., 2].sin()[..., None, None]

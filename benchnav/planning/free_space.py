@@ -26,8 +26,9 @@ It exceeds the cost of any path over free terrain. The paper has the same penalt
 step.
 """
 IMMOBILE_BY = ("cell", "observed")
+INFLATIONS = ("disc", "none")
 UNSEEN = ("prior", "optimistic", "pessimistic")
-_LATER = {"unseen": "prior", "replan_every_s": 0.5}
+_LATER = {"unseen": "prior", "replan_every_s": 0.5, "inflation": "disc"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,6 +84,9 @@ class Rules:
             over all training maps. `optimistic`: λ = 1. `pessimistic`: the mean of the
             worst fifth of the prior; unobserved cells are nevertheless free.
         replan_every_s: time between two updates of a robot's belief, in seconds.
+        inflation: how planners allow for the footprint of a robot. `disc`: λ̂ of a cell
+            is the minimum of λ̂, and a cell is free if all cells are free, within the
+            disc of the footprint around it. `none`: planners plan for a point.
     """
 
     free_space: FreeSpace = FreeSpace()
@@ -90,6 +94,7 @@ class Rules:
     goal_radius_m: float = 1.0
     unseen: str = "prior"
     replan_every_s: float = 0.5
+    inflation: str = INFLATIONS[0]
 
     def __post_init__(self) -> None:
         """Validate the rules."""
@@ -109,6 +114,11 @@ class Rules:
         expect(
             0 < self.replan_every_s < float("inf"),
             f"`replan_every_s` > 0 and finite, got {self.replan_every_s}.",
+        )
+        expect(
+            self.inflation in INFLATIONS,
+            f"`inflation` {' or '.join(map(repr, INFLATIONS))}, got "
+            f"{self.inflation!r}.",
         )
 
     def free(

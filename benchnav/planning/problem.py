@@ -17,6 +17,7 @@ from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import ConfigError, expect
 from benchnav.core.grid import Grid
 from benchnav.core.terrain import Observation
+from benchnav.planning.footprint import minimum_over_footprint
 from benchnav.planning.free_space import PENALTY, Immobile, Rules, cells_at_goal
 from benchnav.planning.objective import Objective
 from benchnav.planning.robots import Robot
@@ -50,6 +51,24 @@ class Task:
     objective: Objective
     rules: Rules = field(default_factory=Rules)
 
+    @property
+    def inflation_m(self) -> float:
+        """Radius in metres by which planners inflate maps; 0 for a point robot."""
+        footprint = self.robot.footprint
+        if footprint is None or self.rules.inflation == "none":
+            return 0.0
+        return footprint.radius_m
+
+    def inflate(self, values: Tensor, grid: Grid) -> Tensor:
+        """Return the minimum of maps over the robot's footprint in each cell.
+
+        Args:
+            values: maps of λ̂ or masks of free cells, shape [*K, H, W]. A point robot
+                leaves them unchanged.
+            grid: size and resolution of the maps.
+        """
+        return minimum_over_footprint(values, grid, self.inflation_m)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Problem(Batch):
@@ -59,9 +78,10 @@ class Problem(Batch):
         task: the task.
         observation: the robots' observation.
         distribution: the predicted distribution of λ, shape [B, H, W].
-        risk_map: λ̂ of the risk setting, in [0, 1], shape [B, H, W].
-        free: mask of free cells (S_free in the paper), including the goal's disc, bool,
+        risk_map: λ̂ of the risk setting, in [0, 1], inflated by the robot's footprint,
             shape [B, H, W].
+        free: mask of free cells (S_free in the paper), inflated likewise, and including
+            the goal's disc, bool, shape [B, H, W].
         start: initial states, shape [B, S].
         goal_m: goals (x, y) in metres, shape [B, 2].
         time_budget_s: T of each episode in seconds, shape [B].
@@ -137,7 +157,7 @@ class Problem(Batch):
     def sample_fields(
         self, count: int, key: int, cells: Tensor | None = None
     ) -> Tensor:
-        """Draw correlated fields of λ from the belief.
+        """Draw correlated fields of λ from the belief, inflated like `risk_map`.
 
         Args:
             count: number of fields M.
@@ -157,7 +177,11 @@ class Problem(Batch):
                 "Expected a problem with `fields` to draw from, got None. Pass them "
                 "to `pose_problem`."
             )
-        return self.fields.sample(count, key, cells).to(self.risk_map)
+        if cells is not None:
+            # A cell is needed if its value changes the minimum in a needed cell.
+            cells = ~self.task.inflate(~cells, self.grid)
+        fields = self.fields.sample(count, key, cells).to(self.risk_map)
+        return self.task.inflate(fields, self.grid)
 
     def select(self, members: Tensor) -> "Problem":
         """Return the problems of the episodes at these indices (int64)."""
@@ -303,9 +327,9 @@ class Prediction:
     Args:
         observation: the robots' observation.
         distribution: the predicted distribution of λ, shape [B, H, W].
-        risk_map: λ̂ of the risk setting, in [0, 1], shape [B, H, W].
-        free: mask of free cells, before the cells at the goal are set free, bool, shape
-            [B, H, W]; None to derive it by the rules of the task.
+        risk_map: λ̂ of each cell under the risk setting, in [0, 1], shape [B, H, W].
+        free: mask of free cells, before inflation and before the cells at the goal are
+            set free, bool, shape [B, H, W]; None to derive it by the rules of the task.
         fields: source of correlated fields of λ; None if no planner uses them.
     """
 
@@ -326,6 +350,8 @@ def pose_problem(
 ) -> Problem:
     """Return the problem of driving from start to goal, initially facing the goal.
 
+    λ̂ and free cells are inflated by the footprint of the task's robot.
+
     Args:
         task: the task.
         prediction: prediction of B maps.
@@ -340,7 +366,8 @@ def pose_problem(
     free = prediction.free
     if free is None:
         free = rules.free(prediction.risk_map, prediction.distribution)
-    at_goal = cells_at_goal(observation.grid, goal_m, rules.goal_radius_m)
+    grid = observation.grid
+    at_goal = cells_at_goal(grid, goal_m, rules.goal_radius_m)
     pose = heading_to(start_m, goal_m)
     device = goal_m.device
     budget_s = torch.as_tensor(time_budget_s, dtype=torch.float64, device=device)
@@ -348,8 +375,8 @@ def pose_problem(
         task=task,
         observation=observation,
         distribution=prediction.distribution,
-        risk_map=prediction.risk_map,
-        free=free | at_goal,
+        risk_map=task.inflate(prediction.risk_map, grid),
+        free=task.inflate(free, grid) | at_goal,
         start=task.robot.initial_state(pose),
         goal_m=goal_m,
         time_budget_s=budget_s.expand(len(goal_m)).clone(),

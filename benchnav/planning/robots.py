@@ -151,11 +151,11 @@ class SkidSteer(Unicycle):
     Planners assume the motion of a unicycle, and leave room for the contacts.
 
     Args:
-        dt_s: time step.
-        speed_mps: minimum and maximum linear velocity v.
-        turn_rate_radps: minimum and maximum angular velocity ω.
-        track_m: distance between the left and the right wheels.
-        wheelbase_m: distance between the front and the rear wheels.
+        dt_s: time step in seconds.
+        speed_mps: minimum and maximum linear velocity v in m/s.
+        turn_rate_radps: minimum and maximum angular velocity ω in rad/s.
+        track_m: distance between the left and the right wheels in metres.
+        wheelbase_m: distance between the front and the rear wheels in metres.
     """
 
     track_m: float = 0.5
@@ -261,6 +261,29 @@ class Bicycle(_Vehicle):
         turn_rate = speed * action[..., 1].tan() / self.wheelbase_m
         scale = traversability * self.dt_s
         return _stack(_drive(state, speed, turn_rate, scale))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ackermann(Bicycle):
+    """A kinematic bicycle on four wheels, whose sides can slip apart.
+
+    Args:
+        dt_s: time step in seconds.
+        speed_mps: minimum and maximum velocity v of the rear axle in m/s.
+        steering_rad: maximum steering angle δ to both sides in radians.
+        wheelbase_m: distance between the axles in metres.
+        track_m: distance between the left and the right wheels in metres.
+    """
+
+    track_m: float = 0.4
+
+    @property
+    def footprint(self) -> Footprint:
+        """The four wheels; the robot's position is the middle of the rear axle."""
+        ahead_m = self.wheelbase_m / 2
+        return Footprint(
+            track_m=self.track_m, wheelbase_m=self.wheelbase_m, ahead_m=ahead_m
+        )
 
 
 def _drive(

@@ -21,6 +21,7 @@ from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.quantiles import LEVELS, QuantileDistribution
 from benchnav.planning import risk
+from benchnav.planning.footprint import Footprint
 from benchnav.planning.free_space import Rules
 from benchnav.planning.robots import Robot, Unicycle
 from benchnav.testing.breaches import NOTHING, Breaches, Draws, same
@@ -88,6 +89,12 @@ def _try_robot(
     robot: Robot, draws: Draws, stands_at_zero: bool, breaches: Breaches
 ) -> None:
     expect = breaches.expect
+    footprint = robot.footprint
+    expect(
+        footprint is None or isinstance(footprint, Footprint),
+        "Expected `footprint` to be a `Footprint`, or None for a point, got "
+        f"{footprint!r}.",
+    )
     pose = draws.uniform((0, 0, -3), (9, 9, 3)).reshape(-1, 3)
     state = breaches.watch(
         "initial_state", lambda: robot.initial_state(pose), pose=pose

@@ -273,9 +273,12 @@ def conditions_of(
             or a condition is listed twice.
     """
     conditions: list[Condition] = []
-    for listed in suite.products:
+    products = [list(_product(listed, scenarios_of)) for listed in suite.products]
+    clearance_m = _clearance_m(itertools.chain.from_iterable(products))
+    for product in products:
         ids: set[str] = set()
-        for condition in _product(listed, scenarios_of):
+        for condition in product:
+            condition = _with_clearance(condition, clearance_m)
             if condition.id in ids:
                 words = " ".join(label_words(condition.labels))
                 raise ConfigError(
@@ -286,6 +289,29 @@ def conditions_of(
     check_labels(conditions)
     by_id = {condition.id: condition for condition in conditions}
     return merge_alike(by_id.values())
+
+
+def _clearance_m(conditions: Iterable[Condition]) -> float:
+    """Return the radius in metres of the largest footprint; 0 for point robots."""
+    clearance_m = 0.0
+    robots = {id(condition.robot): condition.robot for condition in conditions}
+    for robot in robots.values():
+        footprint = robot.object.footprint
+        if footprint is not None:
+            clearance_m = max(clearance_m, footprint.radius_m)
+    return clearance_m
+
+
+def _with_clearance(condition: Condition, clearance_m: float) -> Condition:
+    """Return a condition whose draws of λ leave room for the run's largest footprint.
+
+    All conditions of a run then have the same fields, whatever their robot or world.
+    """
+    world = condition.world.with_clearance(clearance_m)
+    if world == condition.world:
+        return condition
+    label = f"{condition.world_label} clearance_m={clearance_m:.3g}"
+    return replace(condition, world=world, world_label=label)
 
 
 def merge_alike(conditions: Iterable[Condition]) -> list[Condition]:

@@ -15,6 +15,7 @@ from benchnav.models.base import PrivilegedModel
 from benchnav.planning.planners.planner import check_steers
 from benchnav.planning.problem import Prediction, pose_problem
 from benchnav.planning.sensing.belief import CovarianceModel, Fields, Static
+from benchnav.planning.world.tracks import check_backend
 
 LeftOut = dict[str, str]  # incompatible labels by column, and `reason`
 
@@ -60,6 +61,15 @@ def _unsteered(condition: Condition) -> str:
     planner = condition.planner
     try:
         check_steers(planner.object, condition.task.robot, planner.label)
+    except ConfigError as error:
+        return str(error)
+    return ""
+
+
+def _unsuited(condition: Condition) -> str:
+    grid = condition.dataset.grid
+    try:
+        check_backend(condition.task, condition.world, grid)
     except ConfigError as error:
         return str(error)
     return ""
@@ -163,6 +173,7 @@ def _unprepared(condition: Condition) -> str:
 # are compatible. Slow rules come last.
 _RULES: Mapping[tuple[str, ...], Callable[[Condition], str]] = {
     ("planner", "robot"): _unsteered,
+    ("robot", "world", "data"): _unsuited,
     ("planner", "sensor", "belief"): _plans_once,
     ("planner", "model"): _given_truth,
     ("model", "world"): _resampled,

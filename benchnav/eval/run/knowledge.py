@@ -148,8 +148,8 @@ class KnowledgeTracker:
         """Return the problem with new maps where they changed enough; None if nowhere."""
         knowledge = self.known
         problem = self._problem
-        free = knowledge.free | self._at_goal
-        risk_map_change = (knowledge.risk_map - problem.risk_map).abs()
+        risk_map, free = self._planner_maps()
+        risk_map_change = (risk_map - problem.risk_map).abs()
         has_changed = (risk_map_change > _MIN_CHANGE) | (free != problem.free)
         is_updated = has_changed.flatten(1).any(1) & running
         if not bool(is_updated.any()):
@@ -171,12 +171,20 @@ class KnowledgeTracker:
                 problem.observation, indices, knowledge.observation
             ),
             distribution=put_if_alike(problem.distribution, indices, distribution),
-            risk_map=torch.where(update_mask, knowledge.risk_map, problem.risk_map),
+            risk_map=torch.where(update_mask, risk_map, problem.risk_map),
             free=torch.where(update_mask, free, problem.free),
             start=robot_state,
             fields=fields,
         )
         return self._problem
+
+    def _planner_maps(self) -> tuple[Tensor, Tensor]:
+        """Return λ̂ and the free mask of the current knowledge as planners get them."""
+        problem = self._problem
+        task = problem.task
+        risk_map = task.inflate(self.known.risk_map, problem.grid)
+        free = task.inflate(self.known.free, problem.grid)
+        return risk_map, free | self._at_goal
 
     def _merged_belief(self, state: Any, indices: Tensor) -> Any:
         """Return `state` with the belief of some episodes replaced by the current one.
@@ -259,6 +267,7 @@ class KnowledgeTracker:
         cells = torch.zeros_like(knowledge.free)
         cells[index] = True
         believed = self._learning.learner.at(knowledge, cells)
+        risk_map, free = self._planner_maps()
 
         def as_array(values: Tensor) -> np.ndarray:
             return values[index].cpu().numpy()
@@ -269,8 +278,8 @@ class KnowledgeTracker:
         footprint = as_array(knowledge.footprint)
         return KnownMap(
             step=step,
-            predicted=as_array(knowledge.risk_map),
-            free=as_array(knowledge.free | self._at_goal),
+            predicted=as_array(risk_map),
+            free=as_array(free),
             mean=as_grid(believed.mean()),
             spread=as_grid(believed.spread()),
             seen=as_array(knowledge.seen),

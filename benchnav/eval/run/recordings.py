@@ -36,7 +36,7 @@ from benchnav.eval.run.unit import (
     simulate,
 )
 from benchnav.metrics.motion import path_length_m
-from benchnav.planning.world.simulation import Simulation
+from benchnav.planning.world.tracks import create_simulation
 
 
 def find_recording(
@@ -251,7 +251,7 @@ def write_ground(folder: Path) -> None:
     maps = [map_keys["map"]]
     block = read_maps(condition.dataset, condition.split, maps)
     noise = noise_key(map_keys["seed"], condition.split, map_keys["realisation"])
-    simulation = Simulation(
+    simulation = create_simulation(
         block.terrain, condition.task, condition.world, block.endpoints, noise, maps
     )
     field = None

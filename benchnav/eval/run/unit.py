@@ -56,6 +56,7 @@ from benchnav.planning.sensing.sensor import Step
 from benchnav.planning.world.lower_bound import BOUNDED_ROBOTS, Motion, lower_bound_s
 from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.simulation import Simulation
+from benchnav.planning.world.tracks import create_simulation
 from benchnav.planning.world.world import Endpoints
 
 
@@ -232,7 +233,7 @@ def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> UnitInputs:
     block = read_block(unit, origin, device)
     task = condition.task
     noise = noise_key(unit.seed, condition.split, unit.realisation)
-    simulation = Simulation(
+    simulation = create_simulation(
         block.terrain, task, condition.world, block.endpoints, noise, unit.maps
     )
     start_m = block.endpoints.start_m
@@ -286,6 +287,10 @@ def _learner(condition: Condition, block: Block) -> Learner:
     dataset = condition.dataset
     world = condition.world
     sensor = call_user_code(Outcome.SENSOR_ERROR, condition.sensor.create)
+    robot = condition.task.robot
+    ground = call_user_code(
+        Outcome.SENSOR_ERROR, lambda: condition.ground.create().mounted(robot)
+    )
     belief = call_user_code(Outcome.BELIEF_ERROR, condition.belief.create)
     model = call_user_code(Outcome.MODEL_ERROR, lambda: condition.model.object)
     correlation_m = world.correlation_m
@@ -301,7 +306,7 @@ def _learner(condition: Condition, block: Block) -> Learner:
     )
     return Learner(
         sensor=sensor,
-        ground=call_user_code(Outcome.SENSOR_ERROR, condition.ground.create),
+        ground=ground,
         belief=belief,
         covariance=covariance,
         measure=call_user_code(Outcome.MODEL_ERROR, condition.risk.create),

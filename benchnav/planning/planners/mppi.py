@@ -242,6 +242,7 @@ class MPPI(LocalPlanner[MPPIState]):
         if option == "expected-time":
             expected_time = risk.ExpectedTime()
             risk_map = expected_time(problem.distribution).to(problem.risk_map)
+            risk_map = problem.task.inflate(risk_map, problem.grid)
             problem = replace(problem, risk_map=risk_map)
         return astar.pad_costs(problem, astar.search(problem))
 

@@ -3,7 +3,7 @@
 A sensor receives the truth and returns a measurement of it: the appearance of cells
 (kind `sensor`) or their λ (kind `ground`). Its noise is a function of episode, cell and
 step, so that all planners and beliefs have common random numbers. By default, a robot
-has the sensor `contact`, which measures λ of the cell under it.
+has the sensor `contact`, which measures λ of the cell or the contacts under it.
 Letters in shapes: B episodes, S state dimensions, H×W cells, N sensed cells.
 """
 
@@ -19,8 +19,11 @@ from torch import Tensor
 from benchnav.core import rng
 from benchnav.core.batch import Batch
 from benchnav.core.errors import expect
+from benchnav.core.grid import Grid
 from benchnav.core.specified import Specified
 from benchnav.core.terrain import Observation, Terrain
+from benchnav.planning.footprint import Footprint
+from benchnav.planning.robots import Robot
 
 MIN_STD = 1e-3
 """Minimum standard deviation of noise in normal scores, for which beliefs are solvable."""
@@ -144,6 +147,10 @@ class Sensor(Specified, ABC):
 
     sees_all: ClassVar[bool] = False
 
+    def mounted(self, robot: Robot) -> "Sensor":
+        """Return the sensor as mounted on a robot; by default, the sensor itself."""
+        return self
+
     @abstractmethod
     def sense(
         self, terrain: Terrain, field: Tensor, robot_state: Tensor, noise_key: NoiseKey
@@ -183,22 +190,46 @@ class Full(Sensor):
 
 @dataclass(frozen=True)
 class Contact(Sensor):
-    """Sensor of λ under the robot, without noise; the default sensor of λ."""
+    """Sensor of λ under the robot, without noise; the default sensor of λ.
+
+    It measures the robot's own cell. On a robot with a footprint, it measures the cells
+    under the contacts instead.
+    """
+
+    def mounted(self, robot: Robot) -> Sensor:
+        """Return the sensor of the robot's contacts, if it has any."""
+        footprint = robot.footprint
+        return self if footprint is None else _Contacts(footprint)
 
     def sense(
         self, terrain: Terrain, field: Tensor, robot_state: Tensor, noise_key: NoiseKey
     ) -> Measurement:
         """Return λ of the robot's own cell."""
-        x = robot_state[:, 0]
-        y = robot_state[:, 1]
-        row, column = terrain.grid.cell_of(x, y)
-        values = torch.full_like(field, torch.nan)
-        on_map = terrain.grid.contains(x, y)
-        episode = torch.arange(len(field), device=field.device)[on_map]
-        row = row[episode]
-        column = column[episode]
-        values[episode, row, column] = field[episode, row, column]
-        return Measurement(traversability=values, std=torch.full_like(field, MIN_STD))
+        return _measure_at(terrain.grid, field, robot_state[:, :1], robot_state[:, 1:2])
+
+
+@dataclass(frozen=True)
+class _Contacts(Contact):
+    """Contact sensor of a robot with a footprint."""
+
+    footprint: Footprint
+
+    def sense(
+        self, terrain: Terrain, field: Tensor, robot_state: Tensor, noise_key: NoiseKey
+    ) -> Measurement:
+        """Return λ of the cells under the robot's contacts."""
+        x, y = self.footprint.contacts(robot_state).flatten(1, 2).unbind(2)
+        return _measure_at(terrain.grid, field, x, y)
+
+
+def _measure_at(grid: Grid, field: Tensor, x: Tensor, y: Tensor) -> Measurement:
+    """Return exact λ of the cells at positions (x, y) in metres, both [B, P]."""
+    row, column = grid.cell_of(x, y)
+    episode, position = grid.contains(x, y).nonzero(as_tuple=True)
+    cells = episode, row[episode, position], column[episode, position]
+    values = torch.full_like(field, torch.nan)
+    values[cells] = field[cells]
+    return Measurement(traversability=values, std=torch.full_like(field, MIN_STD))
 
 
 @dataclass(frozen=True)

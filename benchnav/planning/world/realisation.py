@@ -251,8 +251,11 @@ def draw_frozen(
         pending = pending[~is_feasible]
         if len(pending) == 0:
             return field, attempts
+    clearance = ""
+    if world.clearance_m is not None:
+        clearance = f", with a clearance of {world.clearance_m:.2g} m,"
     raise ConfigError(
-        "Expected a feasible path from start to goal in one of "
+        f"Expected a feasible path from start to goal{clearance} in one of "
         f"{MAX_ATTEMPTS} drawn fields of λ, got none for map {maps[int(pending[0])]}. "
         "Lower `immobile.below`, or use easier maps."
     )

@@ -12,10 +12,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from benchnav.core.errors import expect
 from benchnav.core.terrain import Terrain
 from benchnav.planning.problem import Task
-from benchnav.planning.world.contact_checks import check_contacts
+from benchnav.planning.world.backend import check_backend as check_backend
 from benchnav.planning.world.physics.simulation import PhysicsSimulation
 from benchnav.planning.world.simulation import Simulation, SimulationState
 from benchnav.planning.world.world import Endpoints, World
@@ -50,20 +49,9 @@ class TrackSimulation(Simulation):
             ConfigError: If the robot has no footprint, or one that does not fit the
                 goal's disc or the cells.
         """
+        check_backend(task, world, terrain.grid)
         footprint = task.robot.footprint
-        expect(
-            footprint is not None,
-            "a robot with a footprint, such as skid_steer, for `world.backend` "
-            f"'tracks', got {type(task.robot).__name__}, which is a point.",
-        )
         assert footprint is not None
-        check_contacts(
-            "tracks",
-            terrain.grid,
-            task.rules.goal_radius_m,
-            footprint.radius_m,
-            footprint.track_m,
-        )
         super().__init__(terrain, task, world, places, noise_key, maps)
         self._footprint = footprint
         dt_s = task.robot.dt_s

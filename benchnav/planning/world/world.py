@@ -161,6 +161,18 @@ class World:
                 spec[name] = value
         return spec
 
+    def with_clearance(self, clearance_m: float) -> "World":
+        """Return the world with at least a clearance of accepted draws.
+
+        Args:
+            clearance_m: clearance in metres, such as the radius of a footprint; 0 for
+                none. Worlds whose draws are all accepted do not change.
+        """
+        is_rejecting = self.noise == "frozen" and self.immobile is not None
+        if not is_rejecting or clearance_m <= (self.clearance_m or 0):
+            return self
+        return replace(self, clearance_m=clearance_m)
+
     def budget_s(self, reference_time_s: Tensor, top_speed_mps: float) -> Tensor:
         """Return the time budget of each episode.
 

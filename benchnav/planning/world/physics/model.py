@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from benchnav.core.errors import ConfigError, expect
-from benchnav.planning.robots import STEERING, TURN_RATE, Robot
+from benchnav.planning.robots import SPEED, STEERING, TURN_RATE, Robot
 from benchnav.planning.world.physics.library import import_mujoco, load_library
 from benchnav.planning.world.physics.settings import Body, Entrapment, Physics
 
@@ -88,64 +88,54 @@ class Drive:
     Args:
         is_steered: whether the second action is a steering angle.
         top_speed_mps: largest |v| in m/s.
-        track_m: distance between left and right wheels of the shipped body.
-        wheelbase_m: distance between front and rear wheels.
-        rear_m: distance from the reference point back to the rear wheels.
-        max_steering_rad: largest steering angle.
+        track_m: distance between left and right wheels.
+        front_m: distance of the front wheels ahead of the robot's position.
+        rear_m: distance of the rear wheels ahead of it, ≤ 0 if they are behind.
+        max_steering_rad: largest steering angle; 0 for none.
     """
 
     is_steered: bool
     top_speed_mps: float
     track_m: float
-    wheelbase_m: float
+    front_m: float
     rear_m: float
     max_steering_rad: float
 
+    @property
+    def wheelbase_m(self) -> float:
+        """Distance between front and rear wheels."""
+        return self.front_m - self.rear_m
 
-def drive_of(robot: Robot, body: Body) -> Drive:
-    """Return the dimensions and bounds of a robot that the model needs.
+
+def drive_of(robot: Robot) -> Drive:
+    """Return the dimensions and bounds of a robot with a footprint.
 
     Raises:
-        ConfigError: If the robot's actions are not (v, ω) or (v, δ), or a robot with
-            (v, ω) has no footprint.
+        ConfigError: If the robot's actions are not (v, ω) or (v, δ), or a steered robot
+            does not have its position on the rear axle.
     """
-    second = robot.action_names[1] if len(robot.action_names) == 2 else ""
+    names = robot.action_names
     expect(
-        second in (TURN_RATE, STEERING),
-        "a robot with the actions (speed_mps, turn_rate_radps) or (speed_mps, "
-        f"steering_rad) for `world.backend` 'physics', got {robot.action_names}.",
+        names in ((SPEED, TURN_RATE), (SPEED, STEERING)),
+        f"a robot with the actions ({SPEED}, {TURN_RATE}) or ({SPEED}, {STEERING}) for "
+        f"`world.backend` 'physics', got ({', '.join(names)}).",
     )
     footprint = robot.footprint
-    if second == STEERING:
-        wheelbase_m = getattr(robot, "wheelbase_m", None)
-        expect(
-            isinstance(wheelbase_m, float | int),
-            "a steered robot with `wheelbase_m` for `world.backend` 'physics', got "
-            f"{type(robot).__name__}.",
-        )
-        assert isinstance(wheelbase_m, float | int)
-        track_m = body.track_m if footprint is None else footprint.track_m
-        return Drive(
-            is_steered=True,
-            top_speed_mps=robot.top_speed_mps,
-            track_m=track_m,
-            wheelbase_m=wheelbase_m,
-            rear_m=0.0,  # the reference point is the middle of the rear axle
-            max_steering_rad=robot.action_high[1],
-        )
-    expect(
-        footprint is not None,
-        "a robot with a footprint, such as skid_steer, for `world.backend` 'physics', "
-        f"got {type(robot).__name__}, which is a point.",
-    )
     assert footprint is not None
+    is_steered = names[1] == STEERING
+    rear_m = footprint.ahead_m - footprint.wheelbase_m / 2
+    expect(
+        not is_steered or abs(rear_m) < 1e-6,
+        "a steered robot whose position is the middle of its rear axle for "
+        f"`world.backend` 'physics', got rear contacts {rear_m:g} m ahead of it.",
+    )
     return Drive(
-        is_steered=False,
+        is_steered=is_steered,
         top_speed_mps=robot.top_speed_mps,
         track_m=footprint.track_m,
-        wheelbase_m=footprint.wheelbase_m,
-        rear_m=footprint.wheelbase_m / 2,
-        max_steering_rad=0.0,
+        front_m=footprint.ahead_m + footprint.wheelbase_m / 2,
+        rear_m=rear_m,
+        max_steering_rad=robot.action_high[1] if is_steered else 0.0,
     )
 
 
@@ -153,11 +143,10 @@ def mjcf_of(body: Body, drive: Drive) -> str:
     """Return the MJCF of the shipped body: a box on four wheels."""
     radius_m = body.wheel_radius_m
     half_track_m = drive.track_m / 2
-    front_m = drive.wheelbase_m - drive.rear_m
-    middle_m = front_m - drive.wheelbase_m / 2
+    middle_m = (drive.front_m + drive.rear_m) / 2
     wheel_kg = _WHEEL_MASS_FRACTION * body.mass_kg
     wheels = []
-    for row, x_m in (("front", front_m), ("rear", -drive.rear_m)):
+    for row, x_m in (("front", drive.front_m), ("rear", drive.rear_m)):
         for side, y_m in (("left", half_track_m), ("right", -half_track_m)):
             wheels.append(
                 f'<geom name="wheel_{row}_{side}" type="sphere" size="{radius_m}" '

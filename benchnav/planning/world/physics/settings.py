@@ -56,8 +56,7 @@ class Body:
     """Body of a robot with wheels, and its low-level controller.
 
     By default, the body is a box on four wheels that stand where the robot's footprint
-    has its contacts. A steered robot without a footprint gets `track_m` and its own
-    wheelbase.
+    has its contacts.
 
     Args:
         mjcf: MJCF file of another body; empty for the shipped one. It has one body with
@@ -66,7 +65,6 @@ class Body:
         mass_kg: mass with wheels.
         wheel_radius_m: radius of the wheels.
         wheel_width_m: width of the wheels, which cells must exceed.
-        track_m: distance between left and right wheels of a robot without a footprint.
         lag_s: time constant with which wheels follow the command; 0 for none.
         yaw_rate_loop: whether the controller corrects the difference of the sides, or
             the steering, so that the robot keeps the commanded curvature.
@@ -78,7 +76,6 @@ class Body:
     mass_kg: float = 46.0
     wheel_radius_m: float = 0.165
     wheel_width_m: float = 0.1
-    track_m: float = 0.45
     lag_s: float = 0.1
     yaw_rate_loop: bool = True
     loop_gain: float = 10.0

@@ -17,7 +17,7 @@ from torch import Tensor
 from benchnav.core.errors import expect
 from benchnav.core.terrain import Terrain
 from benchnav.planning.problem import Task
-from benchnav.planning.world.contact_checks import check_contacts
+from benchnav.planning.world.backend import check_backend
 from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.physics.model import (
     BROKEN,
@@ -87,14 +87,16 @@ class PhysicsSimulation(Simulation):
         physics = world.physics
         assert physics is not None
         self._physics: Physics = physics
-        self._drive = drive_of(task.robot, physics.body)
+        check_backend(task, world, terrain.grid)
+        self._drive = drive_of(task.robot)
         self._sub_steps = sub_steps(task.robot.dt_s, physics.substep_s)
-        check_contacts(
-            "physics",
-            terrain.grid,
-            task.rules.goal_radius_m,
-            self._workspace.contact_radius_m,
-            self._drive.track_m,
+        goal_radius_m = task.rules.goal_radius_m
+        contact_radius_m = self._workspace.contact_radius_m
+        expect(
+            contact_radius_m <= goal_radius_m,
+            f"a body within the goal's disc of {goal_radius_m:g} m, got wheels "
+            f"{contact_radius_m:g} m from the robot's position. Increase "
+            "`task.goal_radius_m`.",
         )
         _check_maps(terrain, physics)
         super().__init__(terrain, task, world, places, noise_key, maps)

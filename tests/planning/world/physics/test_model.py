@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from benchnav.core.errors import ConfigError
-from benchnav.planning.robots import Bicycle, SkidSteer
+from benchnav.planning.robots import Ackermann, SkidSteer
 from benchnav.planning.world.physics import library
 from benchnav.planning.world.physics.model import Workspace, drive_of, workspace
 from benchnav.planning.world.physics.settings import Body, Physics
@@ -42,7 +42,7 @@ def test_wheels_stand_on_the_contacts_of_the_robot() -> None:
     expected = robot.footprint.contacts(now.state)[0]  # side, then front and rear
     expected = expected.transpose(0, 1).reshape(4, 2).double()
     torch.testing.assert_close(contacts, expected, atol=1e-5, rtol=0)
-    space = workspace(FIRM, drive_of(robot, FIRM.body))
+    space = workspace(FIRM, drive_of(robot))
     assert space.contact_radius_m == pytest.approx(robot.footprint.radius_m)
     assert float(space.model.body_mass.sum()) == pytest.approx(FIRM.body.mass_kg)
     # The loads carry the weight.
@@ -50,12 +50,12 @@ def test_wheels_stand_on_the_contacts_of_the_robot() -> None:
 
 
 def test_a_steered_robot_has_its_rear_axle_at_its_position() -> None:
-    robot = Bicycle(wheelbase_m=0.6)
+    robot = Ackermann(wheelbase_m=0.6)
     sim = simulation(uniform([0.8]), robot=robot)
     now = sim.init(torch.tensor([[CENTRE, CENTRE, 0.0]]))
     x, y = now.contacts_m[0].view(4, 2).sub(CENTRE).T
     assert x.tolist() == pytest.approx([0.6, 0.6, 0.0, 0.0], abs=1e-5)
-    assert y.tolist() == pytest.approx([0.225, -0.225, 0.225, -0.225], abs=1e-5)
+    assert y.tolist() == pytest.approx([0.2, -0.2, 0.2, -0.2], abs=1e-5)
 
 
 def test_a_body_of_the_user_drives(tmp_path: Path) -> None:
@@ -96,14 +96,14 @@ def test_bodies_that_do_not_stand_are_rejected(
     path.write_text(text)
     physics = Physics(body=Body(mjcf=str(path)))
     with pytest.raises(ConfigError, match=message) as error:
-        Workspace(physics, drive_of(SkidSteer(), physics.body))
+        Workspace(physics, drive_of(SkidSteer()))
     assert "\n" not in str(error.value)
 
 
 def test_a_missing_body_is_one_line() -> None:
     physics = Physics(body=Body(mjcf="missing.xml"))
     with pytest.raises(ConfigError, match=r"got missing\.xml"):
-        Workspace(physics, drive_of(SkidSteer(), physics.body))
+        Workspace(physics, drive_of(SkidSteer()))
 
 
 def test_a_missing_mujoco_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ import torch
 
 from benchnav.core.errors import ConfigError
 from benchnav.planning.free_space import Immobile
-from benchnav.planning.robots import Bicycle, DifferentialDrive, SkidSteer, Unicycle
+from benchnav.planning.robots import Ackermann, DifferentialDrive, SkidSteer, Unicycle
 from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.physics.model import drive_of, workspace
 from benchnav.planning.world.physics.settings import Body, Entrapment, Physics
@@ -71,7 +71,7 @@ def test_above_the_friction_angle_a_robot_slides_as_a_block() -> None:
 
 
 @pytest.mark.parametrize("slope_deg", [0.0, 8.0, 15.0])
-@pytest.mark.parametrize("robot", [ROBOT, Bicycle()])
+@pytest.mark.parametrize("robot", [ROBOT, Ackermann()])
 def test_lambda_is_that_of_the_law_in_each_direction(
     robot: Any, slope_deg: float
 ) -> None:
@@ -121,7 +121,7 @@ def test_turns_have_the_lambda_of_the_terrain(
 
 
 def test_a_steered_robot_follows_its_curve() -> None:
-    robot = Bicycle()
+    robot = Ackermann()
     sim = simulation(uniform([0.2, 0.9]), robot=robot)
     driven = drive(sim, [0.0, 0.0], (0.8, 0.4))
     curvature = math.tan(0.4) / robot.wheelbase_m
@@ -307,10 +307,10 @@ def test_planes_under_wheels_agree_with_a_height_field() -> None:
     smooth = torch.nn.functional.interpolate(noise, size=(SIZE, SIZE), mode="bicubic")
     height = 2.0 * smooth[0]
     sim = simulation(uniform([1.0]), elevation_m=height)
-    space = workspace(FIRM, drive_of(ROBOT, FIRM.body))
+    space = workspace(FIRM, drive_of(ROBOT))
     from benchnav.planning.world.physics.model import mjcf_of
 
-    text = mjcf_of(FIRM.body, drive_of(ROBOT, FIRM.body))
+    text = mjcf_of(FIRM.body, drive_of(ROBOT))
     spec = mujoco.MjSpec.from_string(text)
     low, high = float(height.min()), float(height.max())
     half = (SIZE - 1) * 0.25

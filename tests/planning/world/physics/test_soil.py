@@ -28,7 +28,7 @@ from benchnav.planning.world.world import World, read_world
 
 def workspace(soil: Soil) -> Workspace:
     physics = Physics(soil=soil, entrapment=None)
-    return Workspace(physics, drive_of(SkidSteer(), physics.body))
+    return Workspace(physics, drive_of(SkidSteer()))
 
 
 def random_wheels(count: int) -> np.ndarray:
