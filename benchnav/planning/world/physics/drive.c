@@ -23,7 +23,7 @@
 #define INTEGRAL 2
 #define RUTS 3
 
-/* Fields of `Plant` in model.py, in the same order. */
+/* Fields of `Plant` in workspace.py, in the same order. */
 typedef struct {
   int root;          /* body with the free joint */
   int n_wheels;

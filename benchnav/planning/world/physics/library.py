@@ -110,7 +110,7 @@ def _compile(compiler: list[str], law: Path, include: Path, path: Path) -> None:
             f"written: {error.strerror}. Set BENCHNAV_CACHE to another folder."
         ) from error
     os.close(handle)
-    platform_flags = []
+    platform_flags: list[str] = []
     if sys.platform == "darwin":
         platform_flags = ["-undefined", "dynamic_lookup"]
     command = [*compiler, *_FLAGS, *platform_flags, f"-I{include}", f"-I{FOLDER}"]

@@ -19,15 +19,15 @@ from benchnav.core.terrain import Terrain
 from benchnav.planning.problem import Task
 from benchnav.planning.world.backend import check_backend
 from benchnav.planning.world.outcome import Outcome
-from benchnav.planning.world.physics.model import (
+from benchnav.planning.world.physics.body import drive_of
+from benchnav.planning.world.physics.settings import Physics, sub_steps
+from benchnav.planning.world.physics.workspace import (
     BROKEN,
     ROLLED_OVER,
     Maps,
     Workspace,
-    drive_of,
     workspace,
 )
-from benchnav.planning.world.physics.settings import Physics, sub_steps
 from benchnav.planning.world.simulation import (
     MIN_WHEEL_SPEED_MPS,
     Simulation,
@@ -51,7 +51,7 @@ class PhysicsState(SimulationState):
             loop, then rut depths in metres and loads in N of the wheels, float64,
             shape [B, 3 + 2 W].
         contacts_m: positions (x, y) of the contacts, float64, shape [B, 2 W].
-        status: 0, or what went wrong; see `model.Moved`, int64, shape [B].
+        status: 0, or what went wrong; see `workspace.Moved`, int64, shape [B].
     """
 
     body: Tensor

@@ -13,8 +13,9 @@ from benchnav.core.errors import ConfigError
 from benchnav.planning.free_space import Immobile
 from benchnav.planning.robots import Ackermann, DifferentialDrive, SkidSteer, Unicycle
 from benchnav.planning.world.outcome import Outcome
-from benchnav.planning.world.physics.model import drive_of, workspace
+from benchnav.planning.world.physics.body import drive_of, mjcf_of
 from benchnav.planning.world.physics.settings import Body, Entrapment, Physics
+from benchnav.planning.world.physics.workspace import workspace
 from tests.planning.world.physics.worlds import (
     CENTRE,
     ENTRAPMENT,
@@ -308,8 +309,6 @@ def test_planes_under_wheels_agree_with_a_height_field() -> None:
     height = 2.0 * smooth[0]
     sim = simulation(uniform([1.0]), elevation_m=height)
     space = workspace(FIRM, drive_of(ROBOT))
-    from benchnav.planning.world.physics.model import mjcf_of
-
     text = mjcf_of(FIRM.body, drive_of(ROBOT))
     spec = mujoco.MjSpec.from_string(text)
     low, high = float(height.min()), float(height.max())

@@ -10,7 +10,7 @@ import pytest
 from benchnav.core.errors import ConfigError
 from benchnav.core.settings import read
 from benchnav.planning.robots import SkidSteer
-from benchnav.planning.world.physics.model import Workspace, drive_of
+from benchnav.planning.world.physics.body import drive_of
 from benchnav.planning.world.physics.settings import Entrapment, Physics
 from benchnav.planning.world.physics.soil import (
     Calibrated,
@@ -23,6 +23,7 @@ from benchnav.planning.world.physics.soil import (
     plain_soil,
     read_soil,
 )
+from benchnav.planning.world.physics.workspace import Workspace
 from benchnav.planning.world.world import World, read_world
 
 

@@ -10,8 +10,9 @@ import torch
 from benchnav.core.errors import ConfigError
 from benchnav.planning.robots import Ackermann, SkidSteer
 from benchnav.planning.world.physics import library
-from benchnav.planning.world.physics.model import Workspace, drive_of, workspace
+from benchnav.planning.world.physics.body import drive_of
 from benchnav.planning.world.physics.settings import Body, Physics
+from benchnav.planning.world.physics.workspace import Workspace, workspace
 from tests.planning.world.physics.worlds import CENTRE, FIRM, drive, simulation, uniform
 
 WHEEL = '<geom name="wheel_{0}" type="sphere" size="0.1" pos="{1} {2} -0.1" mass="1"/>'
