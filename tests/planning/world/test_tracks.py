@@ -205,7 +205,7 @@ def test_the_observed_rule_reads_the_contacts_and_the_rule_of_the_cell_the_middl
         centre = (4.5 * resolution_m, 8.5 * resolution_m, 0.0)
         now = sim.init(torch.tensor([centre]))
         for _ in range(20):
-            now, _ = sim.step(now, torch.zeros(1, 2))
+            now, _ = sim.step(now, torch.tensor([[0.1, 0.0]]))
         ends[by] = now.outcome.tolist() == [Outcome.IMMOBILISED]
     assert ends == {"cell": True, "observed": False}
 
