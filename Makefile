@@ -69,6 +69,7 @@ bench: $(STAMP)
 	$(BIN)/python -m benchmarks.engine bench.json
 	$(BIN)/python -m benchmarks.parts
 	$(BIN)/python -m benchmarks.knowledge
+	$(BIN)/python -m benchmarks.physics
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

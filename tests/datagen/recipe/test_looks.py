@@ -347,6 +347,21 @@ def test_a_terrain_tells_what_its_vegetation_hides() -> None:
     torch.testing.assert_close(kept.look_alikes(kept).mean(), seen.mean()[index])
 
 
+def test_a_terrain_has_the_slope_law_of_each_class() -> None:
+    recipe = load_recipe("stakes-v1")
+    terrain = terrain_of(generate(recipe, "test/std", np.arange(1)), recipe)
+    slope_deg = torch.tensor([0.0, 7.5, 30.0, 90.0])
+    assert terrain.slope_law is not None
+    law = terrain.slope_law(slope_deg)
+    for row, item in zip(law, recipe.classes, strict=True):
+        loss = 1e-3 * item.scale * slope_deg.double() ** item.exponent + item.offset
+        torch.testing.assert_close(row, (1 - loss).clamp(0, 1))
+    # The first component of the truth is that law at the cells' slopes.
+    cells = terrain.slope_law(terrain.slope_deg.flatten())
+    own = cells.gather(0, terrain.class_id.flatten()[None])[0]
+    torch.testing.assert_close(terrain.truth.means[:, 0].flatten().double(), own)
+
+
 def test_heights_that_do_not_overlap_tell_what_colour_hides() -> None:
     recipe = overgrown(packed_soil=grass(0.4), crusted_soil=grass(0.4, 0.5))
     terrain = terrain_of(generate(recipe, "train", np.arange(8)), recipe)

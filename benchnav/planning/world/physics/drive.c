@@ -16,12 +16,21 @@
 #define UPRIGHT 0.3  /* least cosine of the robot's tilt */
 #define FRICTIONLESS 1e-5
 
-/* Layout of an episode's memory: three numbers of the controller, then the ruts and the
-   loads of the wheels. */
+#define MIN_SPEED 0.05 /* of a command that means to drive */
+#define STALLED 0.1    /* achieved fraction of the speed of a robot that stands */
+
+/* Layout of an episode's memory: numbers of the controller, then the ruts and the loads
+   of the wheels. Speed and turn are the setpoint of the wheels, which follows the
+   command; their means are those of the last step. Idle is the time for which the robot
+   has stood under a command or, if negative, the time for which it still reverses. */
 #define SPEED 0
 #define TURN 1
 #define INTEGRAL 2
-#define RUTS 3
+#define IDLE 3
+#define MEAN_SPEED 4
+#define MEAN_TURN 5
+#define RUTS 6
+#define MEMORY(n_wheels) (RUTS + 2 * (n_wheels))
 
 /* Fields of `Plant` in workspace.py, in the same order. */
 typedef struct {
@@ -44,6 +53,8 @@ typedef struct {
   double max_steering;
   double loop_gain;
   double max_integral;
+  double reverse_after; /* time of standing after which the robot reverses; 0: never */
+  double reverse_for;
   double sinkage;    /* rut depth per slipped distance at λ = 0 */
   double firm_lambda;
   double healing;    /* distance in which a wheel leaves its rut */
@@ -159,12 +170,29 @@ static void control(const mjModel *m, const mjData *d, const plant_t *plant,
   double along = dot(heading, d->qvel);
   double yaw_rate = d->qvel[5];
   double time_step = m->opt.timestep;
-  memory[SPEED] += plant->response * (command[0] - memory[SPEED]);
-  memory[TURN] += plant->response * (command[1] - memory[TURN]);
+  double wanted_speed = command[0], wanted_turn = command[1];
+  if (plant->reverse_after > 0) {
+    int is_reversing = memory[IDLE] < 0;
+    int is_driven = fabs(wanted_speed) > MIN_SPEED;
+    if (is_reversing) {
+      wanted_speed = -wanted_speed;
+      wanted_turn = 0;
+      memory[IDLE] = fmin(memory[IDLE] + time_step, 0);
+    } else if (is_driven && fabs(along) < STALLED * fabs(wanted_speed)) {
+      memory[IDLE] += time_step;
+      if (memory[IDLE] >= plant->reverse_after) memory[IDLE] = -plant->reverse_for;
+    } else {
+      memory[IDLE] = 0;
+    }
+  }
+  memory[SPEED] += plant->response * (wanted_speed - memory[SPEED]);
+  memory[TURN] += plant->response * (wanted_turn - memory[TURN]);
+  memory[MEAN_SPEED] += memory[SPEED];
+  memory[MEAN_TURN] += memory[TURN];
   double speed = memory[SPEED], turn = memory[TURN];
   double wanted = turn;
   if (plant->is_steered) wanted = speed * tan(turn) / plant->wheelbase;
-  if (plant->has_loop && fabs(speed) > 0.05) {
+  if (plant->has_loop && fabs(speed) > MIN_SPEED) {
     /* Hold the commanded curvature: soft terrain slows the turn as it slows the way. */
     double ratio = fmin(fmax(along / speed, 0.1), 1);
     double error = wanted * ratio - yaw_rate;
@@ -330,7 +358,7 @@ static void write_pose(const mjModel *m, mjData *d, const plant_t *plant,
 /* Advances some of B episodes by `n_sub_steps`, in place.
 
    episodes: indices of the episodes, [n_episodes].
-   state: state of MuJoCo, [B, state_size].  memory: [B, 3 + 2 n_wheels].
+   state: state of MuJoCo, [B, state_size].  memory: [B, MEMORY(n_wheels)].
    command: [B, 2].  cells: [B, n_wheels].  pose: result, [B, 3].
    contacts: result, [B, 2 n_wheels].  status: result, [B]. */
 void advance(mjModel *m, mjData *d, const plant_t *plant, const terrain_t *terrain,
@@ -341,20 +369,23 @@ void advance(mjModel *m, mjData *d, const plant_t *plant, const terrain_t *terra
   for (int e = 0; e < n_episodes; e++) {
     int i = episodes[e];
     double *own_state = state + (long)i * plant->state_size;
-    double *own_memory = memory + (long)i * (3 + 2 * n);
+    double *own_memory = memory + (long)i * MEMORY(n);
     const double *height = terrain->height + (long)i * terrain->rows * terrain->columns;
-    double before[3 + 2 * MAX_WHEELS];
-    memcpy(before, own_memory, (3 + 2 * n) * sizeof(double));
+    double before[MEMORY(MAX_WHEELS)];
+    memcpy(before, own_memory, MEMORY(n) * sizeof(double));
     mj_resetData(m, d);
     mj_setState(m, d, own_state, SAVED);
+    own_memory[MEAN_SPEED] = own_memory[MEAN_TURN] = 0;
     int result = 0;
     for (int s = 0; s < n_sub_steps && !result; s++) {
       result = sub_step(m, d, plant, terrain, height, cells + i * n, command + 2 * i,
                         own_memory);
     }
+    own_memory[MEAN_SPEED] /= n_sub_steps;
+    own_memory[MEAN_TURN] /= n_sub_steps;
     if (result == BROKEN) {
       /* Keep the last state that is sound. */
-      memcpy(own_memory, before, (3 + 2 * n) * sizeof(double));
+      memcpy(own_memory, before, MEMORY(n) * sizeof(double));
       mj_resetData(m, d);
       mj_setState(m, d, own_state, SAVED);
     }
@@ -378,9 +409,9 @@ void place(mjModel *m, mjData *d, const plant_t *plant, const terrain_t *terrain
   double no_command[2] = {0, 0};
   for (int i = 0; i < n_episodes; i++) {
     const double *height = terrain->height + (long)i * terrain->rows * terrain->columns;
-    double *own_memory = memory + (long)i * (3 + 2 * n);
+    double *own_memory = memory + (long)i * MEMORY(n);
     double x = start[3 * i], y = start[3 * i + 1], yaw = start[3 * i + 2];
-    memset(own_memory, 0, (3 + 2 * n) * sizeof(double));
+    memset(own_memory, 0, MEMORY(n) * sizeof(double));
     mj_resetData(m, d);
     double g[2], up[3], left[3], ahead[3] = {cos(yaw), sin(yaw), 0};
     height_at(terrain, height, x, y, g);
@@ -418,7 +449,7 @@ void place(mjModel *m, mjData *d, const plant_t *plant, const terrain_t *terrain
       d->qvel[0] = d->qvel[1] = 0;
     }
     if (!is_free) memset(d->qvel, 0, m->nv * sizeof(mjtNum));
-    own_memory[SPEED] = own_memory[TURN] = own_memory[INTEGRAL] = 0;
+    memset(own_memory, 0, RUTS * sizeof(double));
     d->time = 0;
     mj_getState(m, d, state + (long)i * plant->state_size, SAVED);
     write_pose(m, d, plant, terrain, height, pose + 3 * i, contacts + 2 * i * n);

@@ -78,14 +78,8 @@ def load_library(law: Path) -> ctypes.CDLL:
     # Python, wherever it is installed.
     ctypes.CDLL(str(_library_of(package)), mode=ctypes.RTLD_GLOBAL)
     compiler = _compiler()
-    try:
-        sources = [(FOLDER / name).read_bytes() for name in _SOURCES]
-        sources.append(law.read_bytes())
-    except OSError as error:
-        raise ConfigError(
-            f"Expected a soil law as a C file, got {law}, which cannot be read: "
-            f"{error.strerror}."
-        ) from error
+    sources = [(FOLDER / name).read_bytes() for name in _SOURCES]
+    sources.append(law.read_bytes())
     parts = [*sources, " ".join(compiler).encode(), _version_of(compiler)]
     parts += [mujoco.__version__.encode(), platform.machine().encode()]
     parts += [" ".join(_FLAGS).encode()]

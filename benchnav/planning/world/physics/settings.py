@@ -13,6 +13,8 @@ from benchnav.planning.world.physics.soil import (
     read_soil,
 )
 
+_MAY_BE_ZERO = ("lag_s", "reverse_after_s")
+
 
 @dataclass(frozen=True, kw_only=True)
 class Entrapment:
@@ -70,6 +72,9 @@ class Body:
             the steering, so that the robot keeps the commanded curvature.
         loop_gain: correction of ω in rad/s per second and rad/s of error.
         max_rim_speed: largest speed of a rim as a multiple of the robot's top speed.
+        reverse_after_s: time of standing under a command after which the controller
+            drives straight back, and then tries again; 0 for never.
+        reverse_for_s: time of driving back.
     """
 
     mjcf: str = ""
@@ -80,13 +85,19 @@ class Body:
     yaw_rate_loop: bool = True
     loop_gain: float = 10.0
     max_rim_speed: float = 1.5
+    reverse_after_s: float = 0.0
+    reverse_for_s: float = 1.0
 
     def __post_init__(self) -> None:
         """Validate the numbers."""
         for name, value in vars(self).items():
             if isinstance(value, str | bool):
                 continue
-            is_valid = 0 < value < float("inf") or (name == "lag_s" and value == 0)
+            if name in _MAY_BE_ZERO:
+                is_valid = 0 <= value < float("inf")
+                expect(is_valid, f"`{name}` of a body ≥ 0 and finite, got {value}.")
+                continue
+            is_valid = 0 < value < float("inf")
             expect(is_valid, f"`{name}` of a body > 0 and finite, got {value}.")
 
 

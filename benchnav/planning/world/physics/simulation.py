@@ -23,6 +23,9 @@ from benchnav.planning.world.physics.body import drive_of
 from benchnav.planning.world.physics.settings import Physics, sub_steps
 from benchnav.planning.world.physics.workspace import (
     BROKEN,
+    CONTROLLER_SIZE,
+    MEAN_SPEED,
+    MEAN_TURN,
     ROLLED_OVER,
     Maps,
     Workspace,
@@ -47,9 +50,8 @@ class PhysicsState(SimulationState):
 
     Args:
         body: state of MuJoCo, float64, shape [B, ·].
-        memory: speed and turn that the wheels are commanded, integral of the yaw-rate
-            loop, then rut depths in metres and loads in N of the wheels, float64,
-            shape [B, 3 + 2 W].
+        memory: numbers of the controller, then rut depths in metres and loads in N of
+            the wheels; see drive.c, float64, shape [B, 6 + 2 W].
         contacts_m: positions (x, y) of the contacts, float64, shape [B, 2 W].
         status: 0, or what went wrong; see `workspace.Moved`, int64, shape [B].
     """
@@ -63,7 +65,7 @@ class PhysicsState(SimulationState):
     def ruts_m(self) -> Tensor:
         """Depth of each wheel's rut in metres, shape [B, W]."""
         n_wheels = self.contacts_m.shape[1] // 2
-        return self.memory[:, 3 : 3 + n_wheels]
+        return self.memory[:, CONTROLLER_SIZE : CONTROLLER_SIZE + n_wheels]
 
 
 class PhysicsSimulation(Simulation):
@@ -108,9 +110,6 @@ class PhysicsSimulation(Simulation):
         self._law = None
         if terrain.slope_law is not None:
             self._law = terrain.slope_law(_LAW_SLOPES_DEG).double()
-        # Fraction of the difference to the command that wheels keep in a sub-step.
-        lag_s = physics.body.lag_s
-        self._kept = math.exp(-physics.substep_s / lag_s) if lag_s else 0.0
 
     def init(self, start: Tensor) -> PhysicsState:
         """Return the state of bodies that have settled at the start; see `Simulation`.
@@ -198,7 +197,8 @@ class PhysicsSimulation(Simulation):
         before = now.state[:, :3].double().cpu()
         turns = ((before[:, 2] - pose[:, 2]) / (2 * math.pi)).round()
         pose[:, 2] += 2 * math.pi * turns
-        observed = self._observed(before, pose, now.memory[:, :2], command, met.mean(1))
+        setpoint = memory[:, [MEAN_SPEED, MEAN_TURN]]
+        observed = self._observed(before, pose, setpoint, met.mean(1))
         beyond = self.unhindered(now, action)[:, 3:]
         state = torch.cat((pose.to(now.state), beyond), dim=1)
         contacts_after = torch.from_numpy(moved.contacts_m).flatten(1)
@@ -274,12 +274,7 @@ class PhysicsSimulation(Simulation):
         return self._velocity(now, action)
 
     def _observed(
-        self,
-        before: Tensor,
-        after: Tensor,
-        setpoint: Tensor,
-        command: Tensor,
-        met: Tensor,
+        self, before: Tensor, after: Tensor, setpoint: Tensor, met: Tensor
     ) -> Tensor:
         """Return the achieved fraction of the wheels' motion in a step.
 
@@ -289,13 +284,10 @@ class PhysicsSimulation(Simulation):
         Args:
             before: poses before the step, float64, shape [B, 3].
             after: poses after the step.
-            setpoint: (v, ω) or (v, δ) that the wheels had before the step, [B, 2].
-            command: (v, ω) or (v, δ) of the step.
+            setpoint: mean (v, ω) or (v, δ) of the wheels in the step, shape [B, 2].
             met: mean λ of the cells under the wheels, shape [B].
         """
-        # Mean of the setpoint over the sub-steps, in which it approaches the command.
-        weights = self._kept ** torch.arange(1, self._sub_steps + 1).double()
-        speed, turn = (command + (setpoint - command) * weights.mean()).unbind(1)
+        speed, turn = setpoint.unbind(1)
         if self._drive.is_steered:
             turn = speed * turn.tan() / self._drive.wheelbase_m
         dt_s = self.robot.dt_s

@@ -7,6 +7,7 @@ of wheels.
 """
 
 import csv
+import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -15,7 +16,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from benchnav.core.errors import expect
+from benchnav.core.errors import ConfigError, expect
 from benchnav.core.settings import check_known, plain, read
 from benchnav.planning.world.physics.library import FOLDER
 
@@ -247,12 +248,36 @@ class CustomSoil(Soil):
     Args:
         file: path of the C file.
         numbers: parameters that the law is given.
+        digest: first digits of the file's SHA-256, which tie results to the law; if
+            empty, those of the present file.
     """
 
     name: ClassVar[str] = "custom"
 
     file: str
     numbers: tuple[float, ...] = ()
+    digest: str = ""
+
+    def __post_init__(self) -> None:
+        """Compute or check the digest.
+
+        Raises:
+            ConfigError: If the file cannot be read, or has changed.
+        """
+        try:
+            code = self.path.read_bytes()
+        except OSError as error:
+            raise ConfigError(
+                f"Expected a soil law as a C file, got {self.file}, which cannot be "
+                f"read: {error.strerror}."
+            ) from error
+        digest = hashlib.sha256(code).hexdigest()[:16]
+        expect(
+            self.digest in ("", digest),
+            f"a soil law {self.file} with digest {self.digest}, got {digest}. Restore "
+            "the file, or remove `digest`.",
+        )
+        object.__setattr__(self, "digest", digest)
 
     @property
     def path(self) -> Path:

@@ -21,7 +21,10 @@ from benchnav.planning.world.physics.settings import Entrapment, Physics
 BROKEN = 1
 ROLLED_OVER = 2
 
-CONTROLLER_SIZE = 3  # numbers of the controller in an episode's memory
+# Numbers of the controller in an episode's memory, and the means of speed and turn.
+CONTROLLER_SIZE = 6
+MEAN_SPEED = 4
+MEAN_TURN = 5
 CELL_SIZE = 3  # numbers of a wheel's cell: λ, slope in degrees, index of the class
 
 _MAX_INTEGRAL_RADPS = 4.0
@@ -44,6 +47,8 @@ _FLOAT_FIELDS = (
     "max_steering",
     "loop_gain",
     "max_integral",
+    "reverse_after",
+    "reverse_for",
     "sinkage",
     "firm_lambda",
     "healing",
@@ -328,6 +333,8 @@ def _plant(physics: Physics, drive: Drive, arrays: dict[str, np.ndarray]) -> Pla
         max_steering=drive.max_steering_rad,
         loop_gain=body.loop_gain,
         max_integral=_MAX_INTEGRAL_RADPS,
+        reverse_after=body.reverse_after_s,
+        reverse_for=body.reverse_for_s,
         sinkage=rut.sinkage,
         firm_lambda=rut.firm,
         healing=rut.healing_m,

@@ -15,6 +15,7 @@ from benchnav.planning.robots import Ackermann, DifferentialDrive, SkidSteer, Un
 from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.physics.body import drive_of, mjcf_of
 from benchnav.planning.world.physics.settings import Body, Entrapment, Physics
+from benchnav.planning.world.physics.soil import measured_wheels
 from benchnav.planning.world.physics.workspace import workspace
 from tests.planning.world.physics.worlds import (
     CENTRE,
@@ -105,6 +106,23 @@ def test_soil_that_shears_is_calibrated_uphill_alone() -> None:
     uphill, _, across, downhill = driven.along_mps.tolist()
     assert uphill == pytest.approx(0.3, abs=0.02)
     assert uphill + 0.2 < across < 1 < downhill  # gravity drives it
+
+
+@pytest.mark.parametrize("slope_deg", [0.0, 2.0, 5.0, 8.0])
+def test_a_body_climbs_as_the_measured_wheel_does(slope_deg: float) -> None:
+    # λ = 1 − s at which the drawbar pull per load, m (1 − exp(−s/k)) − r, is tan ψ. The
+    # cells have λ of level soil and claim to be level, so that only gravity acts.
+    numbers = measured_wheels()["grouser"]
+    m, k, r = (numbers[name] for name in ("traction", "shear_slip", "resistance"))
+    level, expected = (
+        1 + k * math.log(1 - (r + math.tan(math.radians(angle))) / m)
+        for angle in (0.0, slope_deg)
+    )
+    physics = Physics(soil="janosi", entrapment=None)
+    sim = simulation(uniform([level]), physics, slope_deg=slope_deg)
+    sim._slope_deg.zero_()
+    driven = drive(sim, [0.0], (1.0, 0.0), steps=60, skipped=40)
+    assert float(driven.along_mps) == pytest.approx(expected, abs=5e-3)
 
 
 @pytest.mark.parametrize("traversability", LAMBDAS)
@@ -208,6 +226,18 @@ def test_ruts_of_half_and_twice_the_depth() -> None:
         held = crossings(physics, soft=0.03)
         assert held[1, True]
         assert not held[2, True]
+
+
+def test_a_robot_that_stands_reverses_and_tries_again() -> None:
+    # Without ruts: λ 0.06 counts as standing. It stands 1 s and drives back 1.5 s.
+    body = Body(reverse_after_s=1.0, reverse_for_s=1.5, lag_s=0.0)
+    sim = simulation(uniform([0.06]), Physics(entrapment=None, body=body))
+    x_m = drive(sim, [0.0], (1.0, 0.0), steps=60).track[:, 0, 0] - CENTRE
+    turns = [10, 25, 35, 50, 60]
+    expected_m = torch.tensor([0.06, -0.03, 0.03, -0.06, 0.0])
+    torch.testing.assert_close(x_m[turns], expected_m, atol=0.015, rtol=0)
+    never = simulation(uniform([0.06]), FIRM)
+    assert float(drive(never, [0.0], (1.0, 0.0), steps=60).track[-1, 0, 0]) > CENTRE
 
 
 def pose_of(count: int) -> torch.Tensor:

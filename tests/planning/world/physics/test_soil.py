@@ -166,7 +166,17 @@ def test_a_custom_law_that_does_not_compile_is_one_line(tmp_path: Path) -> None:
         workspace(CustomSoil(file=str(file)))
     assert "\n" not in str(e.value)
     with pytest.raises(ConfigError, match="which cannot be read"):
-        workspace(CustomSoil(file=str(tmp_path / "missing.c")))
+        CustomSoil(file=str(tmp_path / "missing.c"))
+
+
+def test_a_custom_law_that_has_changed_is_rejected(tmp_path: Path) -> None:
+    file = tmp_path / "law.c"
+    file.write_text("one")
+    stored = plain_soil(CustomSoil(file=str(file)))
+    assert read_soil(stored) == CustomSoil(file=str(file))
+    file.write_text("two")
+    with pytest.raises(ConfigError, match="Restore the file, or remove `digest`"):
+        read_soil(stored)
 
 
 @pytest.mark.parametrize("soil", [Calibrated(friction=0.6), Isotropic(), Janosi()])
