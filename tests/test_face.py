@@ -37,6 +37,7 @@ FACES = {
     "Plan PlanStatus Planner Probe Problem Robot Rules SPEED STEERING Sensor Simulation "
     "SkidSteer Static Step Straight TURN_RATE Task TravelTime Unicycle World "
     "create_simulation distance minimum_over_footprint pose_problem CVaR Chance Prediction "
+    "Body Calibrated CustomSoil Entrapment Isotropic Janosi Physics Soil "
     "ExpectedTime Mean RiskMeasure SingleClass TimeCVaR VaR",
     "benchnav.testing": "check_belief check_metric check_model check_objective check_planner check_risk check_robot "
     "check_sensor",

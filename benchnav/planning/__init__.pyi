@@ -45,6 +45,14 @@ from benchnav.planning.sensing.sensor import (
     Sensor,
     Step,
 )
+from benchnav.planning.world.physics.settings import Body, Entrapment, Physics
+from benchnav.planning.world.physics.soil import (
+    Calibrated,
+    CustomSoil,
+    Isotropic,
+    Janosi,
+    Soil,
+)
 from benchnav.planning.world.simulation import Simulation
 from benchnav.planning.world.tracks import create_simulation
 from benchnav.planning.world.world import Endpoints, World
@@ -61,19 +69,25 @@ __all__ = [
     "Appearance",
     "Belief",
     "Bicycle",
+    "Body",
     "CVaR",
+    "Calibrated",
     "Chance",
     "Classes",
     "Contact",
     "Copula",
     "CovarianceModel",
+    "CustomSoil",
     "DifferentialDrive",
     "Endpoints",
+    "Entrapment",
     "ExpectedTime",
     "Footprint",
     "FreeSpace",
     "Full",
     "GoalDistance",
+    "Isotropic",
+    "Janosi",
     "LocalPlanner",
     "MPPIConfig",
     "Mean",
@@ -83,6 +97,7 @@ __all__ = [
     "NoiseKey",
     "Objective",
     "Optimal",
+    "Physics",
     "Plan",
     "PlanStatus",
     "Planner",
@@ -96,6 +111,7 @@ __all__ = [
     "Simulation",
     "SingleClass",
     "SkidSteer",
+    "Soil",
     "Static",
     "Step",
     "Straight",
