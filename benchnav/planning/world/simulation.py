@@ -207,6 +207,16 @@ class Simulation:
         action = action.clamp(self._low, self._high)
         return self.robot(now.state.clone(), action, ones)
 
+    def faults(self, now: SimulationState) -> list[str]:
+        """Return a message for each episode whose simulation failed; otherwise empty.
+
+        Such an episode has the outcome `MODEL_ERROR`.
+
+        Args:
+            now: current state; not modified.
+        """
+        return [""] * len(now.state)
+
     def exchange_(self, indices: Tensor, replacements: "Simulation") -> None:
         """Replace M episodes by those of another simulation, in place.
 

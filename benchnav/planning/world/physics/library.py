@@ -17,7 +17,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from benchnav.core.errors import ConfigError
+from benchnav.core.errors import ConfigError, expect
 
 FOLDER = Path(__file__).parent
 
@@ -47,6 +47,33 @@ def import_mujoco() -> Any:
             "Install it: pip install 'mujoco>=4,<5'."
         )
     return mujoco
+
+
+def file_digest(what: str, file: str, stored: str) -> str:
+    """Return the first digits of a file's SHA-256.
+
+    Args:
+        what: kind of file, for messages.
+        file: path.
+        stored: digest that the file must have; empty for any.
+
+    Raises:
+        ConfigError: If the file cannot be read, or has another digest than `stored`.
+    """
+    try:
+        content = Path(file).read_bytes()
+    except OSError as error:
+        raise ConfigError(
+            f"Expected {what} as a file, got {file}, which cannot be read: "
+            f"{error.strerror}. Correct the path."
+        ) from error
+    digest = hashlib.sha256(content).hexdigest()[:16]
+    expect(
+        stored in ("", digest),
+        f"{what} {file} with digest {stored}, got {digest}. Restore the file, or "
+        "remove `digest`.",
+    )
+    return digest
 
 
 def cache_folder() -> Path:

@@ -6,6 +6,7 @@ from typing import Any
 
 from benchnav.core.errors import expect
 from benchnav.core.settings import plain
+from benchnav.planning.world.physics.library import file_digest
 from benchnav.planning.world.physics.soil import (
     Calibrated,
     Soil,
@@ -64,6 +65,8 @@ class Body:
         mjcf: MJCF file of another body; empty for the shipped one. It has one body with
             a free joint, at the robot's reference point, and wheels as spheres whose
             names begin with `wheel`. Wheels face the x axis of their bodies.
+        digest: first digits of the SHA-256 of `mjcf`, which tie results to the body;
+            if empty, those of the present file. Files that it includes do not count.
         mass_kg: mass with wheels.
         wheel_radius_m: radius of the wheels.
         wheel_width_m: width of the wheels, which cells must exceed.
@@ -78,6 +81,7 @@ class Body:
     """
 
     mjcf: str = ""
+    digest: str = ""
     mass_kg: float = 46.0
     wheel_radius_m: float = 0.165
     wheel_width_m: float = 0.1
@@ -89,7 +93,15 @@ class Body:
     reverse_for_s: float = 1.0
 
     def __post_init__(self) -> None:
-        """Validate the numbers."""
+        """Compute or check the digest, and validate the numbers.
+
+        Raises:
+            ConfigError: If the file cannot be read or has changed, or a number is out
+                of range.
+        """
+        if self.mjcf:
+            digest = file_digest("a body", self.mjcf, self.digest)
+            object.__setattr__(self, "digest", digest)
         for name, value in vars(self).items():
             if isinstance(value, str | bool):
                 continue

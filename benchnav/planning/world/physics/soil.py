@@ -7,7 +7,6 @@ of wheels.
 """
 
 import csv
-import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -16,9 +15,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from benchnav.core.errors import ConfigError, expect
+from benchnav.core.errors import expect
 from benchnav.core.settings import check_known, plain, read
-from benchnav.planning.world.physics.library import FOLDER
+from benchnav.planning.world.physics.library import FOLDER, file_digest
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -264,19 +263,7 @@ class CustomSoil(Soil):
         Raises:
             ConfigError: If the file cannot be read, or has changed.
         """
-        try:
-            code = self.path.read_bytes()
-        except OSError as error:
-            raise ConfigError(
-                f"Expected a soil law as a C file, got {self.file}, which cannot be "
-                f"read: {error.strerror}."
-            ) from error
-        digest = hashlib.sha256(code).hexdigest()[:16]
-        expect(
-            self.digest in ("", digest),
-            f"a soil law {self.file} with digest {self.digest}, got {digest}. Restore "
-            "the file, or remove `digest`.",
-        )
+        digest = file_digest("a soil law", self.file, self.digest)
         object.__setattr__(self, "digest", digest)
 
     @property

@@ -101,10 +101,15 @@ def test_bodies_that_do_not_stand_are_rejected(
     assert "\n" not in str(error.value)
 
 
-def test_a_missing_body_is_one_line() -> None:
-    physics = Physics(body=Body(mjcf="missing.xml"))
-    with pytest.raises(ConfigError, match=r"got missing\.xml"):
-        Workspace(physics, drive_of(SkidSteer()))
+def test_a_body_that_is_missing_or_has_changed_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"got missing\.xml, which cannot be read"):
+        Body(mjcf="missing.xml")
+    path = tmp_path / "body.xml"
+    path.write_text("<mujoco/>")
+    stored = Body(mjcf=str(path))
+    path.write_text("<mujoco></mujoco>")
+    with pytest.raises(ConfigError, match=r"Restore the file, or remove `digest`"):
+        Body(mjcf=str(path), digest=stored.digest)
 
 
 def test_a_missing_mujoco_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
