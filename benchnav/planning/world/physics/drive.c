@@ -449,7 +449,6 @@ void place(mjModel *m, mjData *d, const plant_t *plant, const terrain_t *terrain
       d->qvel[0] = d->qvel[1] = 0;
     }
     if (!is_free) memset(d->qvel, 0, m->nv * sizeof(mjtNum));
-    memset(own_memory, 0, RUTS * sizeof(double));
     d->time = 0;
     mj_getState(m, d, state + (long)i * plant->state_size, SAVED);
     write_pose(m, d, plant, terrain, height, pose + 3 * i, contacts + 2 * i * n);

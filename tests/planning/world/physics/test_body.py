@@ -46,6 +46,7 @@ def test_wheels_stand_on_the_contacts_of_the_robot() -> None:
     space = workspace(FIRM, drive_of(robot))
     assert space.contact_radius_m == pytest.approx(robot.footprint.radius_m)
     assert float(space.model.body_mass.sum()) == pytest.approx(FIRM.body.mass_kg)
+    assert float(now.body[0, 3]) == pytest.approx(FIRM.body.wheel_radius_m, abs=1e-3)
     # The loads carry the weight.
     assert float(now.memory[0, -4:].sum()) == pytest.approx(46 * 9.81, rel=1e-3)
 

@@ -32,16 +32,16 @@ def simulation(
     field: Tensor,
     physics: Physics = FIRM,
     robot: Robot = ROBOT,
-    slope_deg: float = 0.0,
+    slope_deg: float | Tensor = 0.0,
     world: dict[str, Any] | None = None,
     **terrain: Any,
 ) -> PhysicsSimulation:
-    """Episodes on λ [B, H, W], on planes that rise along x."""
+    """Episodes on λ [B, H, W], on planes that rise along x, or on given maps."""
     x = (torch.arange(field.shape[2]) + 0.5) * 0.5
-    height = math.tan(math.radians(slope_deg)) * (x - CENTRE)
+    slope_map = torch.as_tensor(slope_deg).expand(field.shape).float().contiguous()
     maps: dict[str, Any] = {
-        "elevation_m": height.expand(field.shape).contiguous(),
-        "slope_deg": torch.full_like(field, slope_deg),
+        "elevation_m": slope_map.deg2rad().tan() * (x - CENTRE),
+        "slope_deg": slope_map,
         "slope_law": slope_law,
     }
     goals = torch.tensor([[300.0, 300.0]]).expand(len(field), 2)
