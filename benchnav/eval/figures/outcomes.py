@@ -19,7 +19,7 @@ LOOKS = {
     "timeout": (BLUE, "...."),
     "stalled": (SKY, "|||||"),
     "out_of_bounds": (PINK, "xxxx"),
-    "rollover": ("#F0E442", ""),
+    "rollover": ("#8C510A", "***"),
     "planner_failure": (GREEN, "-----"),
     "planner_error": ("#000000", ""),
     "model_error": ("#7F7F7F", "\\\\\\\\\\"),

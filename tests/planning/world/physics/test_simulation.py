@@ -159,6 +159,24 @@ def test_a_steered_robot_follows_its_curve() -> None:
     torch.testing.assert_close(driven.turn_radps, expected, atol=0.01, rtol=0.01)
 
 
+@pytest.mark.parametrize("lag_s", [0.0, 0.1, 0.5])
+def test_wheels_follow_with_a_first_order_lag(lag_s: float) -> None:
+    physics = Physics(entrapment=None, body=Body(lag_s=lag_s))
+    sim = simulation(uniform([0.7]), physics)
+    now: Any = sim.init(torch.tensor([[CENTRE, CENTRE, 0.0]]))
+    before = 0.0
+    for step in range(1, 5):
+        now, _ = sim.step(now, torch.tensor([[0.8, 0.4]]))
+        time_s = torch.arange(1, 26) * physics.substep_s + (step - 1) * ROBOT.dt_s
+        speeds = 0.8 * (1 - (-time_s / lag_s).exp()) if lag_s else 0.8 + 0 * time_s
+        speed, turn = now.memory[0, :2].tolist()
+        assert speed == pytest.approx(speeds[-1].item(), abs=1e-4)
+        assert turn == pytest.approx(speed / 2, abs=1e-4)
+        assert now.memory[0, 4].item() == pytest.approx(speeds.mean().item(), abs=1e-4)
+        assert speed > before or lag_s == 0
+        before = speed
+
+
 @pytest.mark.parametrize("robot_type", [SkidSteer, Ackermann])
 @pytest.mark.parametrize("speed", [0.6, -0.6])
 def test_the_loop_keeps_a_robot_straight_where_one_side_is_soft(
