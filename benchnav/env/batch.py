@@ -32,6 +32,12 @@ from benchnav.planning.world.world import Endpoints, World, read_world
 SUCCESS_REWARD = 10.0
 LOST_REWARD = -10.0
 TIME_REWARD_PER_S = -0.1
+_LOST = (
+    Outcome.OUT_OF_BOUNDS,
+    Outcome.IMMOBILISED,
+    Outcome.ROLLOVER,
+    Outcome.MODEL_ERROR,
+)
 
 Observations = dict[str, np.ndarray]
 AnyPart = str | Mapping[str, Any] | registry.Part
@@ -346,7 +352,8 @@ def _unbounded(shape: tuple[int, ...]) -> spaces.Box:
 
 
 def _is_lost(outcome: Tensor) -> Tensor:
-    """Return a mask of robots that left the map or are immobilised for good."""
-    is_off_map = outcome == Outcome.OUT_OF_BOUNDS
-    is_immobilised = outcome == Outcome.IMMOBILISED
-    return is_off_map | is_immobilised
+    """Return a mask of robots that cannot drive on, whatever is commanded."""
+    is_lost = torch.zeros_like(outcome, dtype=torch.bool)
+    for end in _LOST:
+        is_lost |= outcome == end
+    return is_lost

@@ -344,7 +344,12 @@ def run_episodes(
             else Outcome.PLANNER_ERROR
         )
         now = end(now, now.running, outcome)
-    return log.episodes(now, traceback_, tracker)
+    episodes = log.episodes(now, traceback_, tracker)
+    faults = simulation.faults(now)
+    errors = [
+        first or second for first, second in zip(episodes.errors, faults, strict=True)
+    ]
+    return replace(episodes, errors=tuple(errors))
 
 
 class _Batch:
