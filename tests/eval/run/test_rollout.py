@@ -12,7 +12,7 @@ from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Unicycle
 from benchnav.planning.sensing.sensor import Step
 from benchnav.planning.world.outcome import Outcome
-from benchnav.planning.world.simulation import Simulation
+from benchnav.planning.world.simulation import Simulation, end
 from benchnav.planning.world.world import World
 from tests import factories
 
@@ -144,6 +144,33 @@ def test_commanded_speed_and_turn_rate_are_those_of_undisturbed_motion() -> None
     episodes = rollout.run_episodes(planner, problem, simulation, torch.Generator())
     torch.testing.assert_close(episodes.speed_mps, torch.full((BATCH, 4), 0.6))
     torch.testing.assert_close(episodes.turn_rate_radps, torch.full((BATCH, 4), 0.2))
+
+
+class Breaking(Simulation):
+    """Fails in the second episode, in the first step."""
+
+    def step(self, now: Any, action: Any) -> Any:
+        after, observed = super().step(now, action)
+        second = torch.tensor([False, True])
+        return end(after, second, Outcome.MODEL_ERROR), observed
+
+    def faults(self, now: Any) -> list[str]:
+        return ["", "the body diverged"]
+
+
+def test_a_simulation_that_fails_ends_its_episode_with_a_message() -> None:
+    ground = torch.full((BATCH, 16, 16), 0.5)
+    problem = factories.problem(ground, time_budget_s=1.0)
+    goals = factories.places(torch.tensor([[6.75, 6.75]] * BATCH))
+    world = World(time_budget_s=1.0)
+    simulation = Breaking(
+        factories.terrain(ground), factories.task(), world, goals, 0, range(BATCH)
+    )
+    planner: Any = Steady()
+    episodes = rollout.run_episodes(planner, problem, simulation, torch.Generator())
+    assert episodes.errors == ("", "the body diverged")
+    assert episodes.outcome[1] == Outcome.MODEL_ERROR
+    assert episodes.steps.tolist() == [10, 1]
 
 
 class Homing(Planner[Problem]):
