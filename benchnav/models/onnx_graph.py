@@ -230,6 +230,8 @@ def _check_graph(graph: Graph, model: TraversabilityModel) -> list[Tensor]:
     expect(
         error < _TOLERANCE,
         "a model whose `predict` uses only its network and `to_distribution`, got "
-        f"{type(model).__name__}, whose graph has an error of {error:.2g}.",
+        f"{type(model).__name__}, whose exported graph differs from `predict` by up to "
+        f"{error:.2g}. Move all other computation into the network or "
+        "`to_distribution`.",
     )
     return layers

@@ -349,7 +349,10 @@ class _BeliefCheck:
         got: Any = type(selected).__name__
         if isinstance(selected, TraversabilityDistribution):
             got = list(selected.shape)
-        breach = f"Expected a distribution of shape {shape} from `at`, got {got}."
+        breach = (
+            f"Expected `at` of the belief to return a distribution of shape {shape}, "
+            f"got {got}."
+        )
         if not self.expect(got == shape, breach):
             return
         belief = self.belief.distribution(state)

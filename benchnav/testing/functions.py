@@ -277,7 +277,8 @@ def _try_measure(
     is_same = selected_map is NOTHING or same(selected_map, expected, tolerance)
     breaches.expect(
         is_same,
-        "Expected the same λ̂ for selected cells as on the map, got a different λ̂.",
+        "Expected λ̂ of selected cells to equal λ̂ of the same cells in the whole map, "
+        "got a different λ̂.",
     )
 
 

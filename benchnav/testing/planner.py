@@ -128,8 +128,9 @@ def check_planner(
             _PlannerCheck(new_planner, problem, tolerance, breaches).check_uses()
     breaches.expect(
         n_robots > 0,
-        "Expected the planner to steer one of the tried robots, got no such robot. Pass "
-        "a robot that `steers` and `robots` of the planner include.",
+        "Expected the planner to steer at least one of the tried robots, got a planner "
+        "that steers none. Pass a robot that the attributes `steers` and `robots` of "
+        "the planner include.",
     )
     breaches.raise_any()
 

@@ -161,12 +161,12 @@ class _SensorCheck:
         self.breaches.expect(
             by_step or not by_key,
             "Expected different noise in different steps, got the same noise. Draw it "
-            "by `NoiseKey.normal`.",
+            "with `NoiseKey.normal`.",
         )
         self.breaches.expect(
             by_key or not by_step,
-            "Expected different noise for different keys of an episode, got noise that "
-            "differs only between steps. Draw it by `NoiseKey.normal`.",
+            "Expected different noise in different episodes, got noise that differs "
+            "only between steps. Draw it with `NoiseKey.normal`.",
         )
 
     def sense(

@@ -233,7 +233,7 @@ def test_what_has_no_graph_is_refused(tmp_path: Path) -> None:
     odd = Odd(MDNConfig(hidden=8, encoder_depth=1)).build(COLOURS).eval()
     refused = (
         (Oracle(), "got Oracle"),
-        (odd, "whose graph has an error of"),
+        (odd, "whose exported graph differs from `predict` by up to"),
         (small("swag"), "got SWAGModel, which draws its weights during prediction"),
         (small("evidential"), "got EvidentialModel, which needs the digamma function"),
         (

@@ -204,7 +204,7 @@ BAD: dict[str, tuple[Any, str]] = {
     "keeps the old prediction": (
         giving("update", lambda new, old, *_: replace(new, prior=old.prior)), "to replace the old one"
     ),
-    "at of all": (giving("at", lambda _, s, __: s.prior), "from `at`, got [4, 6, 8]"),
+    "at of all": (giving("at", lambda _, s, __: s.prior), "distribution of shape [1, 38], got [4, 6, 8]"),
     "at of the prediction": (giving("at", lambda _, s, cells: s.prior.at(cells)), "Expected mean and CVaR of `at`"),
     "too few fields": (giving("sample_fields", lambda f, *_: f[:, 0]), "Expected fields of shape [4, 50, 6, 8]"),
     "fields of no λ": (giving("sample_fields", lambda f, *_: f + 1), "Expected fields of λ in [0, 1]"),

@@ -264,7 +264,7 @@ BAD: dict[str, tuple[Any, str]] = {
     "follows no text": (having(follows=lambda self, task: 3), "Expected `follows` to return a single line"),
     "follows that is text": (having(follows="time"), "from `follows`, got TypeError"),
     "steers by one name": (having(steers=("speed_mps", "turn_rate_radps")), "as a tuple of tuples of action names"),
-    "steers nothing": (having(steers=()), "Expected the planner to steer one of the tried robots, got no such robot"),
+    "steers nothing": (having(steers=()), "steer at least one of the tried robots, got a planner that steers none"),
     "remarks that are no tuple": (having(remarks=lambda self, task: "slow"), "to return a tuple of single lines"),
     "remarks that raise": (having(remarks=lambda self, task: task.wheels), "from `remarks`, got AttributeError"),
 }  # fmt: skip
@@ -367,7 +367,7 @@ def test_a_robot_that_it_does_not_steer_is_left_out() -> None:
 
     check_planner(Names(), shapes=((12, 12),))
     assert set(named) == {("speed_mps", "turn_rate_radps")}
-    with pytest.raises(ConfigError, match="to steer one of the tried robots"):
+    with pytest.raises(ConfigError, match="to steer at least one of the tried robots"):
         check_planner(Names(), robots=["bicycle"])
 
 

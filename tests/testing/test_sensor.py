@@ -379,7 +379,7 @@ BAD: dict[str, tuple[Any, str]] = {
     ),
     "the same in each episode": (
         moved(lambda noise_key: NoiseKey([7] * len(noise_key.keys), noise_key.step)),
-        "Expected different noise for different keys",
+        "Expected different noise in different episodes",
     ),
     "PyTorch's generator": (
         probing(lambda found, *_: found + 0 * torch.rand(1)),

@@ -77,10 +77,9 @@ def check_pace(
     reason = unit or no_unit_text(spans, log.resolution_m)
     low, high = PACE_LIMITS
     raise DatasetError(
-        f"Expected positions to move {low:g} to {high:g} times "
-        "as far as `measured_m_s` implies, got "
-        f"{ratio:.3g} times in {path}, which looks like "
-        f"{reason}. {advice}"
+        f"Expected positions in {path} to move {low:g} to {high:g} times as far as "
+        f"`measured_m_s` implies, got {ratio:.3g} times, which looks like {reason}. "
+        f"{advice}"
     )
 
 

@@ -95,10 +95,10 @@ def check_wheels(log: DriveLog, track: pd.DataFrame) -> None:
         )
     if reasons:
         raise DatasetError(
-            "Expected `measured_m_s` to be the speed over ground in "
-            f"{log.settings.file}, got a speed that {' and '.join(reasons)}, "
-            "as wheel odometry does. Log the speed over ground, or pass --speed "
-            "positions. If the measured speed is right, pass --speed measured."
+            f"Expected `measured_m_s` in {log.settings.file} to be the speed over "
+            f"ground, got a speed that {' and '.join(reasons)}. This suggests wheel "
+            "odometry. Log the speed over ground, or pass --speed positions. If the "
+            "measured speed is right, pass --speed measured."
         )
 
 

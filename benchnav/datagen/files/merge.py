@@ -166,7 +166,8 @@ def _merged_shards(folders: Sequence[Path]) -> Contents:
         if shard.manifest[name] != shards[0].manifest[name]:
             raise DatasetError(
                 f"Expected shards of one dataset, got {shards[0].path} and "
-                f"{shard.path}, whose {name} differ. Pass only shards of one dataset."
+                f"{shard.path}, which differ in `{name}`. Pass only shards of one "
+                "dataset."
             )
     recipe = shards[0].recipe
     files: dict[str, list[Path]] = {}

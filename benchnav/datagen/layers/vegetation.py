@@ -101,9 +101,9 @@ class Vegetation(Layer):
             first = alike[0]
             if shown[first] != shown[class_id]:
                 raise ConfigError(
-                    "Expected the same `colour` and `cover` of `vegetation` on "
-                    f"{names[first]!r} and {names[class_id]!r}, since their terrain "
-                    f"has the same colour, got {shown[first]} and {shown[class_id]}. "
+                    f"Expected classes {names[first]!r} and {names[class_id]!r}, whose "
+                    "terrain has the same colour, to have `vegetation` with the same "
+                    f"`colour` and `cover`, got {shown[first]} and {shown[class_id]}. "
                     "Only `height_m` may differ."
                 )
         for scenario, class_colours in colours.items():

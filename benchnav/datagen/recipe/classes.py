@@ -67,8 +67,9 @@ class TerrainClass:
         in_range = self.scale >= 0 and self.exponent > 0 and self.noise > 0
         expect(
             is_finite and in_range,
-            f"`scale` ≥ 0, `exponent` > 0 and `noise` > 0 of class {self.name!r}, all "
-            f"finite, got {self.scale}, {self.exponent} and {self.noise}.",
+            "finite `scale` ≥ 0, `exponent` > 0, `noise` > 0 and `offset` for class "
+            f"{self.name!r}, got `scale` {self.scale}, `exponent` {self.exponent}, "
+            f"`noise` {self.noise} and `offset` {self.offset}.",
         )
 
 

@@ -205,7 +205,11 @@ class Condition:
         used = call(owner, self.planner.object.uses, {"task": self.task})
         is_valid = isinstance(used, frozenset) and used <= INPUTS
         names = ", ".join(sorted(INPUTS))
-        expect(is_valid, f"{owner} to return a frozenset of {names}, got {used!r}.")
+        expect(
+            is_valid,
+            f"{owner} to return a frozenset with only names from ({names}), got "
+            f"{used!r}.",
+        )
         return used
 
     @property

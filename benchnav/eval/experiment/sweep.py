@@ -140,8 +140,8 @@ def check_count(counts: Iterable[int]) -> None:
     if math.prod(counts) > MAX_CONDITIONS:
         factors = " × ".join(map(str, counts))
         raise ConfigError(
-            f"Expected at most {MAX_CONDITIONS:,} settings, got a product of "
-            f"{factors} values. List fewer."
+            f"Expected at most {MAX_CONDITIONS:,} combinations of values, got "
+            f"{factors}. List fewer values."
         )
 
 

@@ -200,7 +200,8 @@ def check_resumable(run: Run) -> None:
     if parts:
         raise ConfigError(
             f"Expected a run that can be resumed, got {run.folder}, whose {parts[0]} "
-            "was an object of one process. Evaluate the suite into a new folder."
+            "was a Python object that existed only in the process that began the run. "
+            "Evaluate the suite into a new folder."
         )
 
 

@@ -243,9 +243,9 @@ def _check_whole(missing: Sequence[Unit], runs: Sequence[Run]) -> None:
         begun = f" in {folders[index]}" if index in folders else ""
         named.append(f"{count} {noun} of shard {index}/{of}{begun}")
     raise ConfigError(
-        f"Expected all units of the run, but these are missing: {', '.join(named)}. "
-        "Run the run's command with each of these shards as `--shard`, then run this "
-        "command again with all parts."
+        f"Expected all units of the run, got shards without {', '.join(named)}. Repeat "
+        "the command of the run once for each shard named here, with that shard as "
+        "`--shard`. Then repeat this command with the folders of all shards."
     )
 
 

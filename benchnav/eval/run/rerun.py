@@ -68,7 +68,7 @@ def rerun(
     check_resumable(run)
     if folder.resolve() == run_folder.resolve():
         raise ConfigError(
-            "Expected `out` to differ from the folder of the repeated run, got "
+            "Expected `out` to differ from the folder of the original run, got "
             f"{folder}. Choose another `out`."
         )
     if not overwrite and (folder / RUN).exists():

@@ -256,9 +256,9 @@ def build_network(
             if not config.pretrained:
                 raise
             raise out_of_memory_error(error) or ConfigError(
-                f"Expected the ImageNet weights of {config.encoder} to download for "
-                f"`pretrained`, got: {one_line(error).rstrip('.')}. Try again with a "
-                "network connection, or leave out `pretrained` "
+                f"Expected the download of the ImageNet weights of {config.encoder} "
+                f"for `pretrained` to succeed, got: {one_line(error).rstrip('.')}. Try "
+                "again with a network connection, or leave out `pretrained` "
                 "(--classifier.pretrained or --mdn.pretrained)."
             ) from error
         except (ValueError, TypeError) as error:

@@ -164,7 +164,7 @@ def known_splits(dataset: TerrainDataset, splits: Iterable[str] = ()) -> list[st
     if not chosen:
         raise DatasetError(
             f"Expected a test split in {dataset.path}, got {sorted(dataset.splits)}. "
-            "Choose other splits with `splits`."
+            "Choose one or more of these with `splits`."
         )
     for split in chosen:
         dataset.map_count(split)  # raises an error if there is no such split

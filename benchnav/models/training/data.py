@@ -391,9 +391,9 @@ def open_dataset(data: str) -> TerrainDataset:
     dataset = TerrainDataset(find_dataset(data))
     if not {TRAIN, VALID} <= set(dataset.splits):
         raise DatasetError(
-            f"Expected splits train and valid in {dataset.path} to train on, got "
-            f"{sorted(dataset.splits)}. Create a dataset with both splits, for example "
-            "with `benchnav-datagen create paper-v1`."
+            f"Expected {dataset.path} to have the splits `train` and `valid`, got "
+            f"{sorted(dataset.splits)}. Train on a dataset with both splits, for "
+            "example one created with `benchnav-datagen create paper-v1`."
         )
     return dataset
 

@@ -97,9 +97,10 @@ class Target:
                 "pass --overwrite with --resume to resume the training that replaces it"
             )
         raise CheckpointError(
-            f"Expected the {name} in {self.folder} to have the same settings, seed and "
-            f"maps, got a part with seed {part.seed}, trained on {part.data_id}, with "
-            f"{differences}. Use its settings again, or {remedy}."
+            f"Expected the {name} in {self.folder} to have the settings, seed and maps "
+            f"of this command, got a part with seed {part.seed}, trained on "
+            f"{part.data_id}, with {differences}. Use the settings of that part, or "
+            f"{remedy}."
         )
 
     def add(self, name: str, part: Part) -> None:

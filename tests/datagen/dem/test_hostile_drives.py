@@ -229,7 +229,7 @@ CASES: list[Case] = [
     ("one drive in knots", third_in_knots, "disagree by more than 15 %.*--speed positions", "--speed positions"),
     ("one drive in knots, mended", third_in_knots, "In drive-2, .* like knots. Multiply .* by 0.5144 .* there,",
      lambda log, _: log.assign(measured_m_s=log["measured_m_s"] * np.where(log["drive"] == "drive-2", 0.5144, 1))),
-    ("wheel odometry", wheels, "as wheel odometry does", "--speed positions"),
+    ("wheel odometry", wheels, "suggests wheel odometry", "--speed positions"),
     ("measured nothing", scaled(0, "measured_m_s"), "got inf times", "--speed positions"),
     ("no measured speed", lambda log: log.drop(columns="measured_m_s"), "no measured_m_s.*--speed positions",
      "--speed positions"),

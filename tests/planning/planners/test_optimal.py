@@ -653,7 +653,9 @@ def test_other_robots_and_maps_that_change_are_refused(kind: type[Optimal]) -> N
         ):
             kind().init(factories.problem(ground, robot=robot), generator())
     uneven = Unicycle(turn_rate_radps=(-1.0, 0.5))
-    with pytest.raises(ConfigError, match=f"to both sides for planner '{kind.name}'"):
+    with pytest.raises(
+        ConfigError, match=f"left and right turns with planner '{kind.name}'"
+    ):
         kind().init(factories.problem(ground, robot=uneven), generator())
     backward = Unicycle(speed_mps=(-1.0, 1.0))
     with pytest.raises(

@@ -165,8 +165,8 @@ class Optimal(Planner[OptimalState]):
         _, high = robot.action_high
         expect(
             low == -high,
-            "`turn_rate_radps` with the same maximum to both sides for planner "
-            f"{self.name!r}, got {low:g} to {high:g}.",
+            "the same maximum of `turn_rate_radps` for left and right turns with "
+            f"planner {self.name!r}, got a range of {low:g} to {high:g}.",
         )
         expect(
             min_speed == 0,
@@ -354,8 +354,8 @@ class NearOptimal(Optimal):
             is_certain = bool((distribution.stds == 0).all())
         if not is_certain:
             raise ConfigError(
-                f"Expected model 'clairvoyant' for planner {self.name!r}, which needs λ "
-                "itself, got a model that predicts uncertain λ."
+                f"Expected model 'clairvoyant' for planner {self.name!r}, which needs "
+                "the true λ, got a model that predicts uncertain λ."
             )
         field = distribution.mean()
         rate = 1 / field.clamp(min=_MIN_TRAVERSABILITY)
