@@ -57,7 +57,7 @@ class Figure(Specified, ABC):
             for index in range(count)
         ]
 
-    def needs(self, data: Any) -> bool:
+    def is_available(self, data: Any) -> bool:
         """Return whether the data contain what the figure shows."""
         return True
 

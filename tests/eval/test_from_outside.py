@@ -93,7 +93,7 @@ def test_a_figure_whose_needs_are_not_met_is_named(program: Results) -> None:
     class Nothing(Figure):
         name = "nothing"
 
-        def needs(self, data: Any) -> bool:
+        def is_available(self, data: Any) -> bool:
             return False
 
         def draw(self, data: Any) -> Any:

@@ -58,7 +58,7 @@ NOT_USED = "–"
 ANY_RISK = Part(part="mean", label=NOT_USED, kind="risk")
 # Properties of a split that affect results in addition to its maps;
 # `TerrainDataset.about_digest` is their digest.
-MEANING = "class table, λ_stuck, resolution or kind of truth"
+SPLIT_PROPERTIES = "class table, λ_stuck, resolution or kind of truth"
 # If the robot does not learn, a setting affects the planner only by this input.
 _INPUT_OF_SETTING: Mapping[str, str] = {"risk": "risk_map", "belief": "fields"}
 # Order of the rows of tables: the last kind varies fastest.

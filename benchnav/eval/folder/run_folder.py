@@ -32,7 +32,7 @@ from benchnav.eval.folder.provenance import (
     TOUCHED,
     Origin,
     code_digest,
-    touches,
+    inputs_read_by_parts,
 )
 from benchnav.eval.folder.sealed import (
     CONTENT,
@@ -319,7 +319,7 @@ def write_unit(
         "made": secrets.token_hex(8),
         "traceback": traceback,
         "errors": list(errors),
-        TOUCHED: touches(unit.condition, unit.metrics),
+        TOUCHED: inputs_read_by_parts(unit.condition, unit.metrics),
         "steps": steps_metadata.get(CONTENT, ""),
         "recordings": recordings,
     }

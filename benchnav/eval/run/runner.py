@@ -32,7 +32,7 @@ from benchnav.eval.folder.provenance import (
     Origin,
     Origins,
     code_differences,
-    lacks_metrics,
+    missing_metrics,
 )
 from benchnav.eval.folder.run_folder import (
     EPISODES,
@@ -338,7 +338,7 @@ def _why_missing(
         return "new", []
     newest = finished_units[0]
     differences = _differences(newest, origin)
-    columns = lacks_metrics(newest.metadata["code"], origin.code)
+    columns = missing_metrics(newest.metadata["code"], origin.code)
     if columns and not differences:
         return "unmeasured", [", ".join(columns)]
     return "other", differences
@@ -365,7 +365,7 @@ def _valid_file(
     if not reuse_code:
         return None
     for finished_unit in finished_units:
-        has_metrics = not lacks_metrics(finished_unit.metadata["code"], origin.code)
+        has_metrics = not missing_metrics(finished_unit.metadata["code"], origin.code)
         if finished_unit.metadata["digests"] == maps and has_metrics:
             return finished_unit
     return None

@@ -13,8 +13,8 @@ from benchnav.core.settings import check_known
 from benchnav.eval.experiment.condition import (
     KNOWLEDGE,
     LABELS,
-    MEANING,
     NOT_USED,
+    SPLIT_PROPERTIES,
     differences,
 )
 from benchnav.eval.experiment.unit import DRAW
@@ -49,8 +49,8 @@ class Compared:
         maps: digests of the maps, in the order of maps.
         episodes: rows of the condition, with T as `time_budget_s`.
         code: code of the rows by name of the run, as in `Origin.code`.
-        map_properties: digest of the properties `MEANING` of the maps; empty if the run
-            does not contain it.
+        map_properties: digest of the maps' `SPLIT_PROPERTIES`; empty if the run does not
+            contain it.
     """
 
     labels: Mapping[str, str]
@@ -344,7 +344,7 @@ def check_maps(first: Compared, second: Compared, names: str) -> None:
     differing = []
     has_properties = bool(first.map_properties and second.map_properties)
     if has_properties and first.map_properties != second.map_properties:
-        differing.append(MEANING)
+        differing.append(SPLIT_PROPERTIES)
     if not first_groups[common_maps].equals(second_groups[common_maps]):
         differing.append("groups of maps")
     if differing:

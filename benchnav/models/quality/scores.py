@@ -87,7 +87,7 @@ def tail_rate(transformed: Tensor, level: float = LEVEL) -> float:
     return float(is_below.double().mean())
 
 
-def lower_fifth_and_width(
+def pinball_loss_and_width(
     distribution: TraversabilityDistribution, observed: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return the pinball loss of quantiles up to 0.2, and the central interval's width.

@@ -88,7 +88,7 @@ def _score(
 # Neither direction of the width is better: a narrow interval must also cover λ.
 COMPARED = (
     _score("accuracy", "hits", "true", better="higher"),
-    _score("miou", "hits", "true", "found", of=_miou, better="higher"),
+    _score("miou", "hits", "true", "predicted", of=_miou, better="higher"),
     _score("rmse_expected", "expected_squares", "labelled", of=_root),
     _score("rmse_observed", "squares", "cells", of=_root),
     _score("nll", "nll", "cells"),

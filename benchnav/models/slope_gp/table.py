@@ -81,8 +81,10 @@ class SlopeTable:
         mean, std = self._read(slice(None), slope_deg)
         return mean.movedim(0, -3), std.movedim(0, -3)
 
-    def own(self, class_id: Tensor, slope_deg: Tensor) -> TraversabilityMixture:
-        """Return the mixture of each cell's own class at its slope.
+    def predict_by_class(
+        self, class_id: Tensor, slope_deg: Tensor
+    ) -> TraversabilityMixture:
+        """Return the prediction for each cell from its class and slope.
 
         Args:
             class_id: class of each cell, int64, shape [*B, H, W].
