@@ -187,7 +187,7 @@ def _read_first_option(
     options = options_of(kind, find(kind, source).target)
     if not options:
         raise ConfigError(
-            f"Expected {kind} {source!r} without a value, since it has no options, got "
+            f"Expected {kind} {source!r}, which has no options, without a value, got "
             f"{text!r}."
         )
     name, option = next(iter(options.items()))

@@ -151,7 +151,7 @@ def digest_of_path(path: Path) -> str:
             return hashlib.file_digest(stream, "sha256").hexdigest()
     except OSError as error:
         raise ConfigError(
-            f"Expected {path} to be readable, since a setting refers to it, got: "
+            f"Expected {path}, which a setting names, to be readable, got: "
             f"{error.strerror}. Change its permissions, or name another path."
         ) from error
 

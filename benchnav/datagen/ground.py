@@ -79,7 +79,8 @@ def fit_ground(dataset: TerrainDataset) -> GroundStatistics:
     if not inner.sum() + ends.sum():
         raise DatasetError(
             f"Expected cells with traversability in split {TRAIN} of {dataset.path}, "
-            "for terrain statistics, got only NaN. Use a dataset with traversability."
+            "got only NaN. Terrain statistics need λ. Use a dataset with "
+            "traversability."
         )
     weights, means, stds = fit_mixture(inner, ends)
     potts_strength = 0.0

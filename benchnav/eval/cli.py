@@ -250,8 +250,8 @@ def _check_workers(jobs: int, backend: str, scheduler: str) -> None:
     check_workers(jobs, backend, scheduler)
     if scheduler and jobs > 1:
         raise ConfigError(
-            f"Expected no `jobs` with `backend` dask, whose cluster has its own "
-            f"workers, got {jobs}. Leave `jobs` out."
+            f"Expected no `jobs` with `backend` dask, got {jobs}. A Dask cluster has "
+            "its own workers. Leave `jobs` out."
         )
 
 

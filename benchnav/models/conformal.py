@@ -78,9 +78,9 @@ class ConformalTable:
         ascends = all(low <= high for low, high in pairwise((0.0, *values, 1.0)))
         if len(levels) != len(values) or not ascends:
             raise CheckpointError(
-                "Expected the table `conformal` of the checkpoint to have one value per "
-                "level, in [0, 1] and never descending, got one that does not. Train "
-                "the model again."
+                "Expected the table `conformal` of the checkpoint to have one value in "
+                "[0, 1] per level, without a descent, got other values. Train the "
+                "model again."
             )
         return table
 

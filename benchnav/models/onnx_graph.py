@@ -141,13 +141,13 @@ def export_onnx(
         import onnxscript  # noqa: F401  torch.onnx needs it
     except ImportError as error:
         raise ConfigError(
-            "Expected the packages of the extra `onnx`, got none. Install them: pip "
-            "install 'benchnav[onnx]'."
+            "Expected the packages of the extra `onnx` to be installed, got none. Run: "
+            "pip install 'benchnav[onnx]'."
         ) from error
     newest = onnx.defs.onnx_opset_version()
     expect(
         18 <= opset <= newest,
-        f"`opset` in 18–{newest}, the versions that torch.onnx writes, got {opset}.",
+        f"`opset` from 18 to {newest}, which torch.onnx can write, got {opset}.",
     )
     graph = Graph(model, level)
     layers = _check_graph(graph, model)

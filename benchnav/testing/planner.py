@@ -199,8 +199,8 @@ class _PlannerCheck:
             selected = self.breaches.watch("select", select, plan_state=second_state)
         if selected is not NotImplemented:
             breach = (
-                "Expected the same actions for episodes that `select` returns as in "
-                "the batch, got different actions."
+                "Expected `select` to leave the actions of the selected episodes "
+                "unchanged, got different actions."
             )
             self.expect_action(breach, planned[1], selected, problem, last_two_episodes)
         different = invert_prediction(problem.select(last_two_episodes))
@@ -221,7 +221,10 @@ class _PlannerCheck:
             return
         are_inputs = isinstance(used, frozenset) and used <= INPUTS
         listed = ", ".join(sorted(INPUTS))
-        breach = f"Expected `uses` to return a frozenset of {listed}, got {used!r}."
+        breach = (
+            f"Expected `uses` to return a frozenset with only names from ({listed}), "
+            f"got {used!r}."
+        )
         if not expect(are_inputs, breach):
             return
         is_consistent = not self.planner.blind or not used
@@ -232,8 +235,8 @@ class _PlannerCheck:
         for name in sorted(INPUTS - used):
             changed = change_input(problem, name)
             breach = (
-                f"Expected the same action for any value of `{name}`, which is not in "
-                "`uses`, got a different action."
+                f"Expected the same action for any value of `{name}`, got a different "
+                f"action. Add {name!r} to `uses`, or do not read it."
             )
             step = first_step(problem)
             plan_state = self.begin(problem)

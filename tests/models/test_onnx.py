@@ -146,7 +146,7 @@ def test_the_command_writes_what_its_flags_say(
     for words, said in (
         (given, "which exists. Pass --overwrite"),
         ((*given, "--overwrite", "--level", 1), "`level` in [0, 1), got 1"),
-        ((*given, "--overwrite", "--opset", 9), "`opset` in 18–"),
+        ((*given, "--overwrite", "--opset", 9), "`opset` from 18 to "),
         ((*given, "--onnx", tmp_path / "model.pt"), "`onnx` to end in .onnx"),
     ):
         assert call("train", *words) == 2

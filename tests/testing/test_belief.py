@@ -180,11 +180,11 @@ BAD: dict[str, tuple[Any, str]] = {
     "forgets over time": (giving("update", blurred), "an update without measurements to change nothing"),
     "what the batch has": (
         giving("update", lambda new, *_: replace(new, std=new.std * (0.99 if len(new.std) == 4 else 0.8))),
-        "Expected the same results for single episodes",
+        "do not depend on the other episodes of the batch",
     ),
     "evolves on self": (OnSelf(), "Expected the same result from `update` when called again"),
     "what was begun on self": (LastBegun(), "Expected the same belief after `init` on other maps"),
-    "tells episodes of each other": (giving("update", shared), "that `select` returns as in the batch"),
+    "tells episodes of each other": (giving("update", shared), "`select` to return episodes with unchanged beliefs"),
     "changed no map": (giving("changed", lambda c, *_: c[0]), "Expected a bool map of shape [4, 6, 8] from `changed`"),
     "changed too little": (giving("changed", lambda c, *_: c & False), "Expected `changed` to mark all cells"),
     "changed by scores alone": (

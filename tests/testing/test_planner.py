@@ -241,7 +241,7 @@ BAD: dict[str, tuple[Any, str]] = {
     "drives otherwise when drawn": (action_of(lambda a, step: 0.9 * a if step.draw else a), "for any `Step.draw`"),
     "an action of the batch": (action_of(lambda a, _: a - 0.1 * a.mean(0)), "same action for a single episode"),
     "noise of the batch": (NoiseOfBatch(), "same action for a single episode"),
-    "blind that is not": (having(blind=True), "the same action for any value of `risk_map`, which is not in `uses`"),
+    "blind that is not": (having(blind=True), "value of `risk_map`, got a different action. Add 'risk_map' to `uses`"),
     "uses λ̂ later on and does not say so": (
         using({"distribution"}, lambda step, p: p.traversability_at(step.state) * (step.time_s > 0)),
         "for any value of `risk_map`",

@@ -48,10 +48,9 @@ def check_pace(
         times = log.rows.groupby("drive")["time_s"]
         longest_s = (times.max() - times.min()).max()
         raise DatasetError(
-            f"Expected motion under a command in {path}, to compare positions with "
-            "`measured_m_s`, got no such motion in "
-            f"drives of up to {longest_s:.3g} s. Log `time_s` "
-            "in seconds, or pass --speed measured."
+            f"Expected motion under a command in {path}, got none in drives of up to "
+            f"{longest_s:.3g} s. Positions and `measured_m_s` are compared during such "
+            "motion. Log `time_s` in seconds, or pass --speed measured."
         )
     if speed == "positions" and spans["measured"].isna().all():
         _check_command(log, rows, spans)

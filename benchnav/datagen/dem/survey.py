@@ -281,7 +281,7 @@ def _class_names(rasters: Rasters, recipe: Recipe) -> dict[int, str | None]:
     unknown = sorted(map(str, {*class_ids.values()} - {*names, None}))
     expect(
         not unknown,
-        f"`class_ids` to name classes of the recipe, {names}, got {unknown}.",
+        f"`class_ids` to name classes of the recipe, among {names}, got {unknown}.",
     )
     return class_ids
 
@@ -293,8 +293,8 @@ def _stride(cut: Cut, recipe: Recipe) -> Shape:
     n_cells = cut.stride_m / recipe.resolution_m
     expect(
         n_cells > 0.5 and abs(n_cells - round(n_cells)) < 1e-6,
-        f"`stride` as a multiple of the maps' resolution, {recipe.resolution_m:g} m, "
-        f"got {cut.stride_m:g} m.",
+        f"`stride` as a multiple of {recipe.resolution_m:g} m, which is the resolution "
+        f"of the maps, got {cut.stride_m:g} m.",
     )
     return round(n_cells), round(n_cells)
 
@@ -371,8 +371,8 @@ def _check_covers(
         expected = " ".join(f"{value:.10g}" for value in area)
         covered = " ".join(f"{value:.10g}" for value in bounds)
         raise DatasetError(
-            f"Expected `{raster.argument}` to cover all of the terrain, WEST SOUTH "
-            f"EAST NORTH {expected} in {crs.to_string()[:80]}, got {raster.name}, "
+            f"Expected `{raster.argument}` to cover all of the terrain (WEST SOUTH "
+            f"EAST NORTH {expected} in {crs.to_string()[:80]}), got {raster.name}, "
             f"which covers {covered}. Use a raster that covers the terrain, with a "
             "declared value for missing cells, or cut a part out of `dem`: rio clip "
             "DEM part.tif --bounds 'WEST SOUTH EAST NORTH'"

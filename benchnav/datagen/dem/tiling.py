@@ -162,8 +162,8 @@ def cut(
     if usable < n_splits:
         raise DatasetError(
             f"Expected terrain for {n_splits} splits with a map's width between "
-            f"them, got {n_lines} maps along its longer side. Use fewer splits, "
-            "smaller maps or larger terrain."
+            f"splits, got {n_lines} maps along the longer side of the terrain. Use "
+            "fewer splits, smaller maps or larger terrain."
         )
     ends = [0]
     for count, total in enumerate(accumulate(shares.values()), start=1):

@@ -87,8 +87,8 @@ class Vegetation(Layer):
         min_m = 2 * grid.resolution_m
         expect(
             min_m <= self.period_m < np.inf,
-            f"`vegetation_period_m` to be finite and at least two cells, {min_m:g} m, "
-            f"if a class has `vegetation`, got {self.period_m:g} m.",
+            f"finite `vegetation_period_m` of at least {min_m:g} m (two cells) if a "
+            f"class has `vegetation`, got {self.period_m:g} m.",
         )
         names = [item.name for item in classes]
         for name in self.classes:

@@ -88,8 +88,8 @@ def read_metrics(
         metric: Metric = part.object
         if type(metric) in map(type, SHIPPED):
             raise ConfigError(
-                "Expected `metrics` other than the built-in ones, which every run has, "
-                f"got {part.part!r}. Leave it out."
+                f"Expected `metrics` other than the built-in ones, got {part.part!r}. "
+                "Every run has the built-in metrics. Leave it out."
             )
         faults = attribute_faults(metric)
         if faults:

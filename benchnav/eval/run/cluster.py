@@ -78,9 +78,9 @@ def check_worker(worker: Any, settings: Settings) -> None:
         )
     if settings.planner_limit_s and multiprocessing.current_process().daemon:
         raise ConfigError(
-            "Expected workers that may start processes, which `planner_limit_s` "
-            f"needs, got {worker.address}, which may not. Start workers by `dask "
-            "worker … --no-nanny`, or set DASK_DISTRIBUTED__WORKER__DAEMON=False."
+            "Expected workers that may start processes for `planner_limit_s`, got "
+            f"{worker.address}, which may not. Start workers by `dask worker … "
+            "--no-nanny`, or set DASK_DISTRIBUTED__WORKER__DAEMON=False."
         )
     if settings.device == "cuda" and not torch.cuda.is_available():
         raise ConfigError(

@@ -142,8 +142,8 @@ def _open_shard(part: Path) -> Run:
     run = open_run(part)
     if run.shard is None:
         raise ConfigError(
-            "Expected folders of shards, created by `benchnav-eval run … --shard "
-            f"I/N`, got {part}, which is not a shard. Leave it out."
+            f"Expected folders of shards, got {part}, which is not a shard. "
+            "`benchnav-eval run … --shard I/N` creates shards. Leave this folder out."
         )
     return run
 
@@ -151,7 +151,9 @@ def _open_shard(part: Path) -> Run:
 def _check_alike(runs: Sequence[Run]) -> None:
     """Reject shards of different runs, listing all differences."""
     if not runs:
-        raise ConfigError("Expected one or more `parts`, folders of shards, got none.")
+        raise ConfigError(
+            "Expected one or more folders of shards as `parts`, got none."
+        )
     reasons = []
     for run in runs[1:]:
         differing = _unlike(runs[0], run)
@@ -213,8 +215,8 @@ def _find(unit: Unit, runs: Sequence[Run]) -> Finished | None:
         damage = finished_unit.damage()
         if damage:
             raise ConfigError(
-                f"{finished_unit.folder} is damaged: {damage[0]}. Run the shard's command "
-                "again: it runs the damaged unit again."
+                f"{finished_unit.folder} is damaged: {damage[0]}. Repeat the command "
+                "of the shard, which runs the damaged unit again."
             )
     if not newest:
         return None

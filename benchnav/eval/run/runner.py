@@ -403,8 +403,8 @@ def _check_unchanged(finished: list[Finished], is_local: bool) -> None:
     if changed:
         raise ConfigError(
             "Expected files, packages and variables that parts read not to change "
-            f"during the run, got changes: {'; '.join(changed)}. Run the run's command "
-            "again: it runs the units with other contents again."
+            f"during the run, got changes: {'; '.join(changed)}. Repeat the command of "
+            "the run, which runs the units with other contents again."
         )
 
 
@@ -425,8 +425,8 @@ def _finished(
         if finished_unit is None:
             raise ConfigError(
                 f"Expected unit {unit.name} of condition {unit.condition.id} in "
-                f"{folder}, got none, since it was removed. Run its `benchnav-eval "
-                "run` command again."
+                f"{folder}, got none, because the unit was removed. Repeat the "
+                "`benchnav-eval run` command of this folder."
             )
         counted.append((unit, finished_unit))
         changed = []

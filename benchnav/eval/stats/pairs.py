@@ -49,8 +49,8 @@ class Compared:
         maps: digests of the maps, in the order of maps.
         episodes: rows of the condition, with T as `time_budget_s`.
         code: code of the rows by name of the run, as in `Origin.code`.
-        map_properties: digest of the maps' `SPLIT_PROPERTIES`; empty if the run does not
-            contain it.
+        map_properties: digest of the `SPLIT_PROPERTIES` of the maps; empty if the run
+            does not contain it.
     """
 
     labels: Mapping[str, str]
@@ -171,8 +171,9 @@ def by_what(conditions: Sequence[Compared], by: str = "", against: str = "") -> 
     columns = list(columns_of[against])
     if len(columns) > 1:
         raise ConfigError(
-            f"Expected `against` to be a label of one column, got {against!r}, a label "
-            f"of {' and of '.join(columns)}. Pass --by {' or --by '.join(columns)}."
+            f"Expected `against` to be a label of one column, got {against!r}, which "
+            f"is a label of {' and of '.join(columns)}. Pass --by "
+            f"{' or --by '.join(columns)}."
         )
     return columns[0]
 

@@ -287,8 +287,9 @@ def _network_sizes(config: ClassifierConfig) -> dict[str, Any]:
     has_channels = isinstance(default_channels, tuple)
     expect(
         has_channels or not config.decoder_channels,
-        f"no `decoder_channels` for the architecture {config.architecture}, which has "
-        f"no such setting, got {list(config.decoder_channels)}. Leave it out.",
+        f"no `decoder_channels` for the architecture {config.architecture}, got "
+        f"{list(config.decoder_channels)}. The architecture has no such setting. Leave "
+        "it out.",
     )
     sizes: dict[str, Any] = {}
     if config.decoder_channels:

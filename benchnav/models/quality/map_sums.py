@@ -77,7 +77,7 @@ class MapTally:
         """Add the scores of `count` maps.
 
         Args:
-            cells: observed cells of these maps; None if there are none.
+            cells: observed cells of these maps; None if no cell was observed.
             count: number of maps.
         """
         sums = {name: torch.zeros(count, dtype=torch.float64) for name in self.names}

@@ -64,8 +64,9 @@ class SlopeTable:
         n_nodes = len(table_slopes())
         expect(
             is_positive and self.mean.shape[1:] == (n_nodes,),
-            f"finite tables of the GPs over {n_nodes} slopes, with `std` > 0, got tables "
-            f"of shape {list(self.mean.shape)} or with other values. Train the GPs again.",
+            f"finite tables of the GPs over {n_nodes} slopes with `std` > 0, got "
+            f"tables of shape {list(self.mean.shape)} or with other values. Train the "
+            "GPs again.",
         )
 
     def lookup(self, slope_deg: Tensor) -> tuple[Tensor, Tensor]:

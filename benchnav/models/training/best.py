@@ -158,8 +158,9 @@ class WeightGuard(Checkpoint):
         if self.digest and _digest_of_weights(module) != self.digest:
             raise ConfigError(
                 "Expected trained weights to stay unchanged, got weights that "
-                f"`on_train_end` of {type(module).__name__} changed; restoring the best "
-                "epoch would replace them. Change them in `on_fit_end` of the model."
+                f"`on_train_end` of {type(module).__name__} changed. Restoring the "
+                "best epoch would undo this change. Change the weights in `on_fit_end` "
+                "of the model."
             )
 
 

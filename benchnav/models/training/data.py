@@ -414,7 +414,7 @@ def check_maps(dataset: TerrainDataset, field: str, crop: int = 0) -> None:
     shape = dataset.grid.shape
     expect(
         crop == 0 or 8 <= crop <= min(shape),
-        f"`crop` of 8 cells to {min(shape)}, the shorter side of the maps, or of 0 for "
+        f"`crop` from 8 to {min(shape)} cells (the shorter side of the maps), or 0 for "
         f"whole maps, got {crop}.",
     )
     values_to_learn = {

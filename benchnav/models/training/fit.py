@@ -337,8 +337,8 @@ def _prepare(folder: Path, resume: bool, settings: Mapping[str, Any]) -> Path | 
         if differences:
             raise CheckpointError(
                 f"Expected the settings of the interrupted training in {folder} for "
-                f"--resume, got {differences}. Use the same settings again, or pass "
-                "--overwrite to restart the training."
+                f"--resume, got {differences}. Use the settings of that training, or "
+                "pass --overwrite to restart the training."
             )
         return state
     if is_first_process():

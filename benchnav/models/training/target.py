@@ -223,7 +223,8 @@ def _check_family(folder: Path, checkpoint: Checkpoint, fresh: Checkpoint) -> No
     if checkpoint.code != fresh.code and checkpoint.model == fresh.model:
         raise CheckpointError(
             f"Expected checkpoint {folder} to be trained with the current code of "
-            f"{fresh.model}, got one of other code. Pass --overwrite to replace it."
+            f"{fresh.model}, got a checkpoint of other code. Pass --overwrite to "
+            "replace the checkpoint."
         )
     if (checkpoint.model, checkpoint.class_names) != (fresh.model, fresh.class_names):
         expected, got = (

@@ -77,9 +77,9 @@ class Learner:
         """
         expect(
             self.covariance.statistics is not None,
-            "`CovarianceModel.statistics`, which a sensor that does not observe the "
-            "whole map needs, got None. Use a model that has terrain statistics, or "
-            "the sensor 'full'.",
+            "`CovarianceModel.statistics` for a sensor that does not observe the whole "
+            "map, got None. Use a model that has terrain statistics, or the sensor "
+            "'full'.",
         )
         assert self.covariance.statistics is not None
         return self.covariance.statistics
@@ -268,8 +268,8 @@ class Learner:
             shape = getattr(believed, "shape", type(believed).__name__)
             expect(
                 shape == expected_shape,
-                f"a distribution of shape {list(expected_shape)} from `distribution`, "
-                f"got {shape}.",
+                "`distribution` of the belief to return a distribution of shape "
+                f"{list(expected_shape)}, got {shape}.",
             )
             return believed
 

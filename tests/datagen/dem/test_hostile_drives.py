@@ -219,7 +219,7 @@ CASES: list[Case] = [
      lambda log, line: scaled(named_factor(line), "time_s")(log)),
     ("hours", scaled(1 / 3600, "time_s"), "looks like hours",
      lambda log, line: scaled(named_factor(line), "time_s")(log)),
-    ("one time", lambda log: log.assign(time_s=5.0), "got no such motion in drives of up to 0 s", "--speed measured"),
+    ("one time", lambda log: log.assign(time_s=5.0), "got none in drives of up to 0 s", "--speed measured"),
     ("knots", scaled(1 / 0.5144, "measured_m_s"), "looks like knots", "--speed positions"),
     ("knots, mended", scaled(1 / 0.5144, "measured_m_s"), "looks like knots",
      lambda log, line: scaled(named_factor(line), "measured_m_s")(log)),

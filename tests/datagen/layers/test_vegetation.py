@@ -234,10 +234,10 @@ def test_what_does_not_grow_is_refused_in_one_line(
     [
         (
             0.9,
-            "to be finite and at least two cells, 1 m, if a class has `vegetation`, got 0.9",
+            "finite `vegetation_period_m` of at least 1 m (two cells) if a class has `vegetation`, got 0.9",
         ),
-        (0.0, "to be finite and at least two cells"),
-        (float("inf"), "to be finite and at least two cells"),
+        (0.0, "finite `vegetation_period_m` of at least 1 m"),
+        (float("inf"), "finite `vegetation_period_m` of at least 1 m"),
         ("wide", "Expected `vegetation_period_m` as a number, got 'wide'"),
     ],
 )

@@ -389,7 +389,7 @@ def test_episodes_are_kept_and_take_the_places_of_others() -> None:
 def test_without_statistics_nothing_is_known_of_unseen_ground() -> None:
     with pytest.raises(
         ConfigError,
-        match=r"`CovarianceModel\.statistics`, which a sensor that does not observe the whole map needs, got None",
+        match=r"`CovarianceModel\.statistics` for a sensor that does not observe the whole map, got None",
     ):
         begin(learner(covariance=made.covariance(SIZE, SIZE)))
 

@@ -162,8 +162,8 @@ def _cost_per_m(problem: Problem, traversability: Tensor, grade: Tensor) -> Tens
     shape = list(cost.shape) if isinstance(cost, Tensor) else type(cost).__name__
     expect(
         shape == list(grade.shape),
-        f"{name} to return a tensor of the same shape as λ̂ and grade, "
-        f"{list(grade.shape)}, got {shape}. Return a cost for each segment of a path.",
+        f"{name} to return a tensor of shape {list(grade.shape)}, as λ̂ and grade, got "
+        f"{shape}. Return a cost for each segment of a path.",
     )
     min_cost, max_cost = torch.stack(cost.aminmax())
     if not 0 < min_cost <= max_cost < torch.inf:

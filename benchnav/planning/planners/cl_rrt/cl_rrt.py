@@ -174,8 +174,8 @@ class CLRRT(Planner[CLRRTState]):
         follower = PathFollower(config.follower, problem.robot)
         expect(
             config.turning_radius_m >= follower.tightest_m,
-            f"`turning_radius_m` ≥ {follower.tightest_m:g}, the radius of the robot's "
-            f"tightest turn, for CL-RRT, got {config.turning_radius_m}.",
+            f"`turning_radius_m` ≥ {follower.tightest_m:g} (the radius of the robot's "
+            f"tightest turn) for CL-RRT, got {config.turning_radius_m}.",
         )
         zero_m = torch.zeros_like(problem.start[:, 0])
         zero = torch.zeros_like(zero_m, dtype=torch.int64)

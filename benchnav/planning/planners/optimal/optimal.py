@@ -143,8 +143,9 @@ class Optimal(Planner[OptimalState]):
         radius = problem.goal_radius_m
         expect(
             radius >= min_radius,
-            f"`goal_radius_m` of at least {min_radius:.2f}, half of a cell's diagonal, for "
-            f"planner {self.name!r}, got {radius:g}. Raise it, or raise `refine`.",
+            f"`goal_radius_m` of at least {min_radius:.2f} m (half of a cell's "
+            f"diagonal) for planner {self.name!r}, got {radius:g} m. Raise "
+            "`goal_radius_m` or `refine`.",
         )
         costs = self.costs_of(problem, grid)
         moves = Moves.of(robot, grid.resolution_m, headings)
