@@ -210,7 +210,7 @@ def test_a_layer_of_this_process_only_is_not_made_in_two(
     registry.register("layer", "mine", Plain)
     recipe = recipe_from_dict(small_stakes().to_dict() | {"layers": ["mine"]}, "test")
     with pytest.raises(
-        ConfigError, match="a single process, got several. The class of layer 'plain'"
+        ConfigError, match=r"a single process, got several\. The class of layer 'plain'"
     ):
         next(create_dataset(recipe, tmp_path / "d.h5", jobs=2))
     assert generate(recipe, "train", np.arange(1))["plain"].shape == (1, 32, 32)
