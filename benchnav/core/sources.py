@@ -369,7 +369,7 @@ def _read_source(path: Path) -> bytes:
 
     If the file has changed since this process first read it, the first content followed
     by the present one is returned. The process may have imported the first content, so
-    the digest must differ from those of both contents.
+    the digest must differ from the digests of both contents.
     """
     content = path.read_bytes()
     first_content = _FIRST_CONTENTS.setdefault(path, content)

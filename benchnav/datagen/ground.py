@@ -270,7 +270,7 @@ def find_ground(dataset: TerrainDataset) -> GroundStatistics | None:
     """Return terrain statistics for a dataset; None if no file fits.
 
     The statistics are read from the file next to the dataset. If this file does not
-    exist, those of a shipped recipe with the same terrain are used.
+    exist, the statistics of a shipped recipe with the same terrain are used.
 
     Args:
         dataset: dataset with any splits; it need not have `train`.

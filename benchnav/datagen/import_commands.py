@@ -282,7 +282,7 @@ def _import(
 ) -> "datagen.TerrainDataset":
     """Import maps, and return the dataset.
 
-    Its id is the requested one, or the name of the output.
+    Its id is the requested id, or the name of the output.
     """
     from benchnav.datagen.dem.importer import import_dem as import_maps
     from benchnav.datagen.dem.recipe_fit import GroundError

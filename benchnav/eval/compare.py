@@ -415,7 +415,7 @@ def _relevant_manifest(
 def _unpaired(
     conditions: Sequence[Compared], pairs: Sequence[Pair], by: str
 ) -> list[str]:
-    """Return a line that names the conditions without a pair; empty if all have one."""
+    """Return a line that names conditions without a pair; empty if all are paired."""
     paired = {condition for pair in pairs for condition in pair.members}
     unpaired = [condition for condition in conditions if condition not in paired]
     varying = []

@@ -39,7 +39,7 @@ def reading_name(column: str, label: str) -> str:
 
 
 def reading_names(labels: str) -> str:
-    """Return comma-separated labels, as in a hypothesis, as papers write them."""
+    """Rewrite the comma-separated labels of a hypothesis as papers write them."""
     return ", ".join(planner_name(risk_name(label)) for label in labels.split(", "))
 
 

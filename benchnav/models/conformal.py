@@ -123,7 +123,7 @@ def fit_table(
 def recalibrated(
     distribution: TraversabilityDistribution, table: ConformalTable
 ) -> QuantileDistribution:
-    """Return the distribution whose u-quantile is the t(u)-quantile of another.
+    """Return the distribution whose u-quantile is the t(u)-quantile of a prediction.
 
     Args:
         distribution: prediction of a model, shape [*B, H, W].

@@ -34,7 +34,7 @@ def check_pace(
 
     Args:
         log: log of the drives.
-        rows: rows of the log without faulty ones.
+        rows: rows of the log, without faulty rows.
         spans: spans of these rows.
         is_jumpy: whether positions jump often; the log is then rejected here only if a
             unit explains the ratio.

@@ -12,8 +12,8 @@ _MIN_LAMBDA = 0.05  # minimum median λ of a log
 _MAX_LAMBDA = 1.3  # maximum median λ of a log
 # A larger ratio of distance by positions to commanded distance indicates a wrong unit.
 _MAX_COMMAND_RATIO = 5.0
-# Quantile of λ over spans that counts as the maximum. The median may be that of an
-# immobilised robot.
+# Quantile of λ over spans that counts as the maximum. In most spans, the robot may be
+# immobilised.
 _FAST_QUANTILE = 0.95
 # If the ratio of measured to commanded speed is lower, measured speed is the speed over
 # ground, not that of wheels.

@@ -1,4 +1,4 @@
-"""Detection of measured speeds that are those of wheels instead of speeds over ground.
+"""Detection of logs whose measured speed is wheel speed, not the speed over ground.
 
 Wheels follow the command on any terrain, so their speed hides slip.
 """
@@ -56,7 +56,7 @@ def _ratio_quantiles(spans: pd.DataFrame) -> list[float]:
 
 
 def check_wheels(log: DriveLog, track: pd.DataFrame) -> None:
-    """Reject a log whose measured speed is that of wheels, everywhere or in stretches.
+    """Reject a log whose measured speed is wheel speed, everywhere or in stretches.
 
     Spans of two durations are compared, and the one with longer distances by positions
     counts: short spans follow alternating curves better, and noise can only increase
@@ -67,7 +67,7 @@ def check_wheels(log: DriveLog, track: pd.DataFrame) -> None:
         track: track of the log, with elevation `z` in metres.
 
     Raises:
-        DatasetError: If measured speed is that of wheels.
+        DatasetError: If measured speed is wheel speed.
     """
     least_speed = log.settings.least_speed
     spans = spans_of(track, least_speed, WINDOW_S)

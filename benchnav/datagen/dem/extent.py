@@ -246,7 +246,7 @@ class Extent:
         )
 
     def frame(self, layout: Layout, step: float) -> dict[str, Any]:
-        """Return the cells of all maps, padded by one, for `Raster.resampled`.
+        """Return the cells of all maps, padded by one cell, for `Raster.resampled`.
 
         Args:
             layout: Layout of the maps.

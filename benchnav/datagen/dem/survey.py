@@ -68,7 +68,7 @@ class Survey:
         fields: stored fields of layers, by name.
         layers_with_value: names of layers with at least one value so far.
         is_inside: two masks, of the rows and of the columns that lie completely on the
-            elevation model, padded by one.
+            elevation model, padded by one cell.
         indices: class index by raster value; NaN for values without a label.
         cliff_m: difference in height between neighbouring cells that natural terrain
             does not exceed, in metres.
@@ -327,7 +327,7 @@ def _resampled_layers(
 
 
 def _inside_masks(extent: Extent, layout: Layout, step: float) -> list[ndarray]:
-    """Return masks of rows and columns, padded by one, inside the elevation model."""
+    """Return masks of rows and columns inside the elevation model, padded by one."""
     slack = SLACK * step
     masks = []
     sides = zip(layout.offset_m, layout.tiling.cells, extent.size_m, strict=True)

@@ -160,7 +160,7 @@ def make_shard(
         The shard, and the bytes of its file.
 
     Raises:
-        DatasetError: If the running version of this package is another one.
+        DatasetError: If another version of this package is running.
         ConfigError: If the recipe yields no valid maps.
     """
     if benchnav.__version__ != version:

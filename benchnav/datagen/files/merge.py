@@ -55,8 +55,8 @@ def merge(
     Iterate to the end.
 
     Args:
-        paths: paths of two or more datasets, the first of which determines the order of
-            splits; or of folders with the shards of one dataset.
+        paths: paths of two or more datasets, where the first dataset determines the
+            order of splits; or of folders with the shards of one dataset.
         out: path of the file to write, if its suffix is `.h5` or `.hdf5`; else path of
             the folder to write.
         dataset_id: id of the new dataset; if empty, the name of `out`. Not used for

@@ -114,7 +114,7 @@ def _parts(metrics: Iterable[NamedMetric]) -> tuple[Part, ...]:
 
 
 def _merged(new: Conditions, earlier: Conditions) -> tuple[Conditions, Conditions]:
-    """Merge new conditions into those of a run.
+    """Merge new conditions into the conditions of a run.
 
     A new condition that differs from an earlier one only in unused settings is merged
     into the earlier one.

@@ -189,7 +189,7 @@ def check_split(condition: Condition, maps: int) -> int:
 
 
 def _remedy(dataset: TerrainDataset, split: str, maps: int) -> str:
-    """Return a sentence with the command that creates missing maps; empty without one."""
+    """Return a sentence with the command that creates missing maps; may be empty."""
     if dataset.id not in shipped_recipes():
         return ""
     if shipped_sizes(dataset.id).get(split, 0) < maps:
@@ -247,7 +247,7 @@ def build_each(conditions: Sequence[Condition], maps: int) -> list[str]:
 
 
 def _distinct(conditions: Sequence[Condition], *names: str) -> list[Condition]:
-    """Return the first condition of each combination of values of some fields."""
+    """Return the first of all conditions that agree in the named fields."""
     first: dict[str, Condition] = {}
     for condition in conditions:
         value = {**condition.value, "scenario": condition.scenario}

@@ -60,7 +60,7 @@ def run_on_worker(
 
 
 def check_worker(worker: Any, settings: Settings) -> None:
-    """Reject a worker whose rows would differ from those of the command's process.
+    """Reject a worker whose rows would differ from rows of the command's process.
 
     Args:
         worker: Dask worker.

@@ -233,7 +233,7 @@ class KnowledgeTracker:
         return is_near & (turn.abs() <= math.radians(AHEAD_DEG))
 
     def maps_of(self, step: int, episode_indices: Iterable[int]) -> dict[int, KnownMap]:
-        """Return the known maps of those of the given episodes that still remain.
+        """Return the known maps of the given episodes that still run.
 
         Args:
             step: index of the step.

@@ -120,9 +120,10 @@ def pinball_loss_and_width(
 def sparsification(error: Tensor, uncertainty: Tensor) -> Tensor:
     """Return the mean error of the remaining cells as uncertain cells are removed.
 
-    Cells whose uncertainties differ by less than 0.1 % are tied: each has the mean error of
-    the tied cells. The mean of the first row minus that of the second is the area under the
-    sparsification error curve (AUSE). It is 0 if uncertainties rank cells as errors do.
+    Cells whose uncertainties differ by less than 0.1 % are tied: each has the mean
+    error of the tied cells. The mean of the first row minus the mean of the second row
+    is the area under the sparsification error curve (AUSE). It is 0 if uncertainties
+    rank cells as errors do.
 
     Args:
         error: error of each cell, ≥ 0, shape [N].

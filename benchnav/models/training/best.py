@@ -15,7 +15,7 @@ _TRUSTED = ("lightning.", "benchnav.models.training.")
 
 
 class KeepBest(Callback):
-    """A callback that keeps and restores the weights of the best epoch, or of the last.
+    """A callback that keeps and restores the weights of the best or last epoch.
 
     The best epoch has the lowest validation loss. The weights and metrics are stored in the
     state from which training resumes. Lightning's `ModelCheckpoint` would write the weights

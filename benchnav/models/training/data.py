@@ -94,7 +94,7 @@ class MapDataset(TerrainMaps):
 
     def __getitem__(self, key: MapKey) -> Batch:  # type: ignore[override]
         """Return all fields of the maps in `key`, shape [b, *, H, W]."""
-        # A map of which several squares are cut is read once.
+        # A map from which several squares are cut is read once.
         map_ids, positions = key.maps.unique(return_inverse=True)
         maps = self.read(map_ids.tolist())
         squares = list(

@@ -46,7 +46,7 @@ def map_order(shards: Sequence[int], seed: int, epoch: int) -> np.ndarray:
 
 
 class MapKey(NamedTuple):
-    """Indices of the maps of a batch, and the augmentation of each.
+    """Indices of the maps of a batch, and the augmentation of each map.
 
     Args:
         maps: indices of the maps, int64, shape [b].

@@ -79,7 +79,8 @@ class Classes(Belief[ClassesState]):
     """Belief that updates the class of look-alike cells, and λ within the class.
 
     Two approximations are made. If an observation is a number under one class and an
-    interval under the other, labels are weighted with the noise of the first class.
+    interval under the other class, labels are weighted with the noise of the first
+    class.
     Drawn fields have no skewness under the less probable class.
 
     Args:

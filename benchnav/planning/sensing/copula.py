@@ -193,7 +193,7 @@ class Copula(Belief[CopulaState]):
         """Condition one episode on its observations, in place.
 
         Episodes are conditioned one by one, since their numbers of observations differ
-        and no episode may depend on another.
+        and no episode may depend on another episode.
 
         Args:
             state: state of all episodes, on the CPU; it is changed.

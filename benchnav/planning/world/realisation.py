@@ -124,8 +124,8 @@ class Realisation:
         distribution transforms it to λ.
 
         Args:
-            step: index of the step, counted from 0; a larger index than that of the
-                last step means the last step.
+            step: index of the step, counted from 0; an index after the last step means
+                the last step.
         """
         index = min(step, self._noise.shape[1] - 1)
         noise = self._noise[:, index, None, None]

@@ -42,7 +42,7 @@ class Endpoints(Batch):
 
 @dataclass(frozen=True, kw_only=True)
 class World:
-    """Model of λ; by default that of the paper, in which low λ only slows a robot.
+    """Model of λ; by default the paper's model, in which low λ only slows a robot.
 
     Args:
         noise: source of λ. `resampled`: λ is drawn at each step. `stored`: λ is the

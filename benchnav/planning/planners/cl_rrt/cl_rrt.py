@@ -43,8 +43,8 @@ any
 - Edges are added in rounds: all edges of a round, in all episodes, are simulated at
   once. Samples are a pure function of the plan state's seed and step, and the same for
   all episodes of a batch.
-- A path has at most one edge per round, so its maximum length is that of `rounds` edges
-  (100 m by default). A goal farther away is approached along partial paths.
+- A path has at most one edge per round, so its maximum length is the length of `rounds`
+  edges (100 m by default). A goal farther away is approached along partial paths.
 
 Letters in shapes: B episodes, M episodes that plan, D edges of a path, K segments of a
 path, N cells of a padded map, R edges of a round, S state dimensions.
@@ -256,7 +256,7 @@ class CLRRT(Planner[CLRRTState]):
         chosen_cost = self._cost(plan_state, chosen_ground, length_m)
         dearer = cost > (1 + _RISE) * chosen_cost
         leads = route.status == PlanStatus.OK
-        # A robot at the end of its path searches for another.
+        # A robot at the end of its path searches for another path.
         is_left = closed | (dearer & ~leads)
         edge = torch.where(is_left, route.depth, plan_state.edge)
         doubted = plan_state.doubted | (dearer & leads)

@@ -314,7 +314,7 @@ class NearOptimal(Optimal):
     def plan(
         self, step: Step, plan_state: OptimalState
     ) -> tuple[Tensor, OptimalState, Plan]:
-        """Return the drive's actions, or those of value iteration off the drive."""
+        """Return the drive's actions; off the drive, those of value iteration."""
         drive = plan_state.drive
         n_steps = plan_state.n_steps
         assert drive is not None
