@@ -17,7 +17,7 @@ _FAILURES = [outcome.name.lower() for outcome in FAILURES]
 FAILURE_COUNTS = {f"{name}_count": name.replace("_", " ") for name in _FAILURES}
 # Functions from a stored label to the label as papers write it, by column.
 _NAME_OF_LABEL = {"planner": planner_name, "risk": risk_name}
-NOT_YET = "not yet a test"  # in place of p-values while the run is not finished
+NOT_YET = "not yet a test"  # instead of p-values while the run is not finished
 # Columns whose labels distinguish conditions on one map.
 NAMING = ("planner", "risk", "model", *KNOWLEDGE, "robot", "objective", "world")
 
@@ -44,7 +44,7 @@ def reading_names(labels: str) -> str:
 
 
 def naming_labels(summary: pd.DataFrame) -> list[str]:
-    """Return the columns that differ and name a condition next to planner and risk."""
+    """Return the columns that name a condition in addition to planner and risk."""
     return [name for name in ("model", *KNOWLEDGE) if differ(summary[name])]
 
 

@@ -41,7 +41,7 @@ from benchnav.core.quantiles import LEVELS, QuantileDistribution, quantiles_at
 from benchnav.core.terrain import Observation
 from benchnav.models.base import TraversabilityModel
 
-_ROUNDING = 1e-9  # of sums of weights
+_ROUNDING = 1e-9  # tolerance of sums of weights
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -77,7 +77,7 @@ def check_fit(
 
     Raises:
         GroundError: If the terrain yields such maps. The error contains settings that
-            do not.
+            avoid this.
     """
     step = recipe.resolution_m
     cell_m = float(max(extent.cell_m))

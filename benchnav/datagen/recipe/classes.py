@@ -77,7 +77,7 @@ ClassTable = tuple[TerrainClass, ...]
 
 
 def look_alike_classes(classes: ClassTable) -> list[tuple[int, ...]]:
-    """Return for each class the indices of all classes of its colour, with its own."""
+    """Return, for each class, the indices of all classes of its colour, itself too."""
     by_colour: dict[tuple[int, int, int], tuple[int, ...]] = {}
     for class_id, item in enumerate(classes):
         by_colour[item.colour] = (*by_colour.get(item.colour, ()), class_id)

@@ -76,8 +76,8 @@ def read_metrics(
         robots: robots of the suite.
 
     Raises:
-        ConfigError: If a metric does not exist or breaks its contract, or two share a
-            name or a column.
+        ConfigError: If a metric does not exist or breaks its contract, or two metrics
+            share a name or a column.
     """
     parts = [part for spec in specs for part in read_parts("metric", spec)]
     episodes = []

@@ -35,8 +35,8 @@ def run_on_worker(
         settings: settings of the run.
 
     Raises:
-        ConfigError: If `check_worker` rejects the worker, or its code or maps differ;
-            the message names the worker.
+        ConfigError: If `check_worker` rejects the worker, or the worker has other code
+            or maps; the message names the worker.
     """
     from distributed import get_worker
 

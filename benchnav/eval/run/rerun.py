@@ -132,7 +132,7 @@ def compare(run_folder: Path, folder: Path) -> tuple[bool, list[str]]:
 
 
 def _open(folder: Path) -> Run:
-    """Open a finished run; reject one without a table."""
+    """Open a finished run; reject a run without a table."""
     run = open_run(folder)
     read_table(folder, EPISODES)
     return run

@@ -175,7 +175,7 @@ def episode_rows(
         of the unit's additional metrics.
 
     Raises:
-        MetricError: If a metric raises, or returns an infinite value or no number.
+        MetricError: If a metric raises, or returns an infinite or non-numeric value.
     """
     further = [part.create() for part in unit.metrics]
     rows = []

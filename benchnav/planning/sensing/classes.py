@@ -70,7 +70,7 @@ from benchnav.planning.sensing.sensor import Measurement
 _MAX_STRENGTH = 0.88  # below the critical strength ln(1 + √2) of a Potts field
 _FIRST_SWEEPS = 40  # at the start, over whole maps
 _MORE_SWEEPS = 10  # over cells that are assigned to a pair later
-_MIN_STD = 1e-9  # of a score, as a divisor
+_MIN_STD = 1e-9  # minimum standard deviation of a score, as a divisor
 _SAME_LOG_ODDS = 0.01  # smaller differences of predicted log odds are ignored
 
 
