@@ -234,7 +234,7 @@ def quantiles_at(
     probabilities: Sequence[float],
     levels: tuple[float, ...] = LEVELS,
 ) -> QuantileDistribution:
-    """Return a distribution with the quantiles of another at changed levels.
+    """Return the quantiles of a distribution at changed levels, as a distribution.
 
     Its quantile at `levels[i]` is the quantile of `distribution` at `probabilities[i]`.
 

@@ -363,7 +363,7 @@ class _SplitWriter:
 
 
 def _missing_masks(inputs: Maps) -> dict[str, ndarray]:
-    """Return masks of maps without a required input, by its name, bool, shape [B]."""
+    """Return masks of maps that lack a required input, by input, bool, shape [B]."""
     masks: dict[str, Any] = {}
     for name, values in inputs.items():
         masks[name] = np.isnan(values).any(axis=(1, 2, 3))

@@ -271,7 +271,7 @@ def _units_to_run(
     say: Say,
     is_local: bool,
 ) -> list[tuple[Unit, Origin]]:
-    """Return the units to run: unfinished, damaged, changed or unrecorded ones.
+    """Return the units to run: unfinished, damaged, changed or unrecorded units.
 
     Args:
         shard_units: requested units.

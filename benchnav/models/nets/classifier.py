@@ -197,7 +197,7 @@ class WithFullResolution(nn.Module):
     """A network whose last layers also receive features of the full-resolution image.
 
     Args:
-        network: returns features [B, 32, H, W] from images [B, N, H, W].
+        network: network that returns features [B, 32, H, W] from images [B, N, H, W].
         channels: N, number of channels of the images.
         class_count: C, number of classes.
     """

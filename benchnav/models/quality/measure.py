@@ -58,7 +58,7 @@ class ClassQuality:
         mutual_information: mean mutual information of class and member, in nats; NaN for a
             model with fewer than two members.
         entropy_auroc: probability that a misclassified cell has a higher entropy than a
-            correct one; NaN if all cells or no cells are misclassified.
+            correct cell; NaN if all cells or no cells are misclassified.
         mutual_information_auroc: the same probability for mutual information.
         confusion: number of cells by true class (row) and most likely class (column),
             [C][C].

@@ -119,8 +119,8 @@ def sweep_bits(
         column: columns of the cells, int64, shape [B, H, W].
         degree: number of coupled neighbours of each cell, int64, shape [B, H, W].
         strength: β, ≥ 0.
-        size: number of rows and of columns of stored random numbers, at least that of a
-            map.
+        size: number of rows and of columns of stored random numbers, at least those of
+            a map.
     """
     bank = _bank(strength, size).to(row.device)
     uses = sweep[:, None, None] // _SWEEPS

@@ -19,15 +19,13 @@ loop of the source, algorithm 2, which decides when to plan, and from which stat
 - References are Dubins paths; the source draws straight lines and uses Dubins lengths
   only in its heuristics.
 - λ̂ may decrease along a path to the goal. If the remaining path then costs over a
-tenth
-  more than on the map on which it was chosen, the path is doubted: a new tree is grown,
-  and the robot drives the cheaper of the old and the new path. Both costs are times
-  along the predicted positions under the new λ̂. If no new path is found, the next
-  steps try again, up to `most_failures` times. A partial path is left at once. Hence a
-  constant map needs no further tree, and a slowly changing map only a few.
+  tenth more than on the map on which it was chosen, the path is doubted: a new tree is
+  grown, and the robot drives the cheaper of the old and the new path. Both costs are
+  times along the predicted positions under the new λ̂. If no new path is found, the
+  next steps try again, up to `most_failures` times. A partial path is left at once.
+  Hence a constant map needs no further tree, and a slowly changing map only a few.
 - Sampled points have no heading, so a reference is the shortest path to a point with
-any
-  final heading. Hence no random heading causes a detour.
+  any final heading. Hence no random heading causes a detour.
 - After a plan without a path to the goal, the robot follows the best partial path. The
   next steps plan again. Each plan halves the radius of the references, down to the
   robot's tightest turn or the spacing of their points. With the full radius, a robot

@@ -49,7 +49,7 @@ _PARTIAL_GAIN_M = 0.5  # minimum gain of a partial path toward the goal, in metr
 # A partial path is left at this distance from its end in metres, since the end may be
 # close to non-free cells.
 _MARGIN_M = 0.3
-_FAR_M = 1e4  # length in metres that exceeds that of any path on a map
+_FAR_M = 1e4  # length in metres; every path on a map is shorter
 
 
 @dataclass(frozen=True, kw_only=True)
