@@ -349,10 +349,7 @@ class _BeliefCheck:
         got: Any = type(selected).__name__
         if isinstance(selected, TraversabilityDistribution):
             got = list(selected.shape)
-        breach = (
-            f"Expected `at` of the belief to return a distribution of shape {shape}, "
-            f"got {got}."
-        )
+        breach = f"Expected `at` to return a distribution of shape {shape}, got {got}."
         if not self.expect(got == shape, breach):
             return
         belief = self.belief.distribution(state)

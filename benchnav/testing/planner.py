@@ -222,8 +222,8 @@ class _PlannerCheck:
         are_inputs = isinstance(used, frozenset) and used <= INPUTS
         listed = ", ".join(sorted(INPUTS))
         breach = (
-            f"Expected `uses` to return a frozenset with only names from ({listed}), "
-            f"got {used!r}."
+            f"Expected `uses` to return a frozenset of names from ({listed}), got "
+            f"{used!r}."
         )
         if not expect(are_inputs, breach):
             return

@@ -207,8 +207,7 @@ class Condition:
         names = ", ".join(sorted(INPUTS))
         expect(
             is_valid,
-            f"{owner} to return a frozenset with only names from ({names}), got "
-            f"{used!r}.",
+            f"{owner} to return a frozenset of names from ({names}), got {used!r}.",
         )
         return used
 
@@ -222,9 +221,8 @@ class Condition:
         if self.blind or self.learns:
             return ()
         used = self.planner_uses
-        return tuple(
-            kind for kind, name in _INPUT_OF_SETTING.items() if name not in used
-        )
+        inputs = _INPUT_OF_SETTING.items()
+        return tuple(kind for kind, name in inputs if name not in used)
 
     @property
     def rows_id(self) -> str:
@@ -316,8 +314,7 @@ def merge(representative: Condition, conditions: Sequence[Condition]) -> Conditi
         conditions: all conditions, including `representative`.
 
     Returns:
-        `representative`, with `NOT_USED` as the label of parts in which the conditions
-        differ.
+        `representative`, in which parts that differ have the label `NOT_USED`.
     """
     stands_for: dict[str, tuple[str, ...]] = {}
     parts: dict[str, Any] = {}

@@ -666,7 +666,7 @@ def test_other_robots_and_maps_that_change_are_refused(kind: type[Optimal]) -> N
     posed = factories.problem(ground, rules=replace(RULES, goal_radius_m=0.35))
     with pytest.raises(
         ConfigError,
-        match=r"`goal_radius_m` of at least 0\.35 m .half of a cell's diagonal",
+        match=r"`goal_radius_m` ≥ 0\.35 m .half a cell's diagonal",
     ):
         kind().init(posed, generator())
     posed = factories.problem(ground)

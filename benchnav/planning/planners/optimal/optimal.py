@@ -143,9 +143,8 @@ class Optimal(Planner[OptimalState]):
         radius = problem.goal_radius_m
         expect(
             radius >= min_radius,
-            f"`goal_radius_m` of at least {min_radius:.2f} m (half of a cell's "
-            f"diagonal) for planner {self.name!r}, got {radius:g} m. Raise "
-            "`goal_radius_m` or `refine`.",
+            f"`goal_radius_m` ≥ {min_radius:.2f} m (half a cell's diagonal) for planner "
+            f"{self.name!r}, got {radius:g} m. Raise the radius or `refine`.",
         )
         costs = self.costs_of(problem, grid)
         moves = Moves.of(robot, grid.resolution_m, headings)
