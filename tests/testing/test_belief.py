@@ -211,7 +211,7 @@ BAD: dict[str, tuple[Any, str]] = {
     "fields without keys": (giving("sample_fields", unkeyed), "Expected different fields from different keys"),
     "fields by place": (giving("sample_fields", in_turn), "fields to depend only on its state and key"),
     "fields of the prediction": (giving("sample_fields", of_the_prior), "the belief's distribution"),
-    "selects others": (having(select=lambda _, s, m: s.select(m.sort().values)), "episodes that `select` returns"),
+    "selects others": (having(select=lambda _, s, m: s.select(m.sort().values)), "`select` to return episodes"),
     "puts nothing": (having(put=lambda _, s, m, o: s), "`put` to insert"),
     "puts elsewhere": (having(put=lambda b, s, m, o: s.put(m.flip(0), o)), "`put` to insert"),
     "selects nothing": (having(select=lambda _, s, m: s), "shape [2, 6, 8] for episodes that `select` returns"),

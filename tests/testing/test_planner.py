@@ -256,7 +256,7 @@ BAD: dict[str, tuple[Any, str]] = {
         using({"risk_map"}, lambda step, p: p.sample_fields(1, 7)[:, 0, 8, 8]), "for any value of `fields`",
     ),
     "uses what is no input": (
-        using({"free"}, lambda step, p: p.goal_m[:, 0]), "frozenset of distribution, fields, risk_map, got frozenset",
+        using({"free"}, lambda step, p: p.goal_m[:, 0]), "names from (distribution, fields, risk_map), got frozenset",
     ),
     "blind that uses something": (
         type("Bad", (Straight,), {"uses": lambda self, task: INPUTS})(), "`uses` of a `blind` planner",
@@ -484,5 +484,5 @@ def test_what_select_keeps_has_to_be_those_that_were_asked_for(order: str) -> No
     if order == "kept":
         check_planner(Leaving(), robots=[Unicycle()])
         return
-    with pytest.raises(ConfigError, match="for episodes that `select` returns"):
+    with pytest.raises(ConfigError, match="Expected `select` to leave the actions"):
         check_planner(Leaving(), robots=[Unicycle()])

@@ -409,7 +409,9 @@ def test_a_belief_whose_distribution_is_none_is_to_blame(said: str | None) -> No
 
     how = learner(belief=Odd())
     known = begin(how)
-    with pytest.raises(KnowledgeError, match="from `distribution`, got") as error:
+    with pytest.raises(
+        KnowledgeError, match="Expected `distribution` of the belief to return"
+    ) as error:
         how.distribution(known)
     assert error.value.outcome == Outcome.BELIEF_ERROR
 
