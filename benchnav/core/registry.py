@@ -187,8 +187,8 @@ def _read_first_option(
     options = options_of(kind, find(kind, source).target)
     if not options:
         raise ConfigError(
-            f"Expected {kind} {source!r}, which has no options, without a value, got "
-            f"{text!r}."
+            f"Expected {kind} {source!r} without a value, got {text!r}. This {kind} "
+            "has no options."
         )
     name, option = next(iter(options.items()))
     data = load_yaml(value) if option.kind is Any else value

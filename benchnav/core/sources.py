@@ -151,8 +151,8 @@ def digest_of_path(path: Path) -> str:
             return hashlib.file_digest(stream, "sha256").hexdigest()
     except OSError as error:
         raise ConfigError(
-            f"Expected {path}, which a setting names, to be readable, got: "
-            f"{error.strerror}. Change its permissions, or name another path."
+            f"Expected the file {path} of a setting to be readable, got: "
+            f"{error.strerror}. Change the file's permissions, or name another path."
         ) from error
 
 

@@ -296,9 +296,9 @@ def _split_by_drive(log: DriveLog, splits: Sequence[str]) -> ndarray:
     empty = [splits[split] for split in assigned[is_empty]]
     if empty:
         raise DatasetError(
-            "Expected at least one drive on the terrain of each split, which no other "
-            f"split uses, got none for {', '.join(empty)} in {log.settings.file}. Use "
-            "fewer --splits, other fractions, smaller maps, or drives over more "
-            "terrain."
+            "Expected at least one drive on the terrain of each split, got none for "
+            f"{', '.join(empty)} in {log.settings.file}. A drive belongs to only one "
+            "split. Use fewer --splits, other fractions, smaller maps, or drives over "
+            "more terrain."
         )
     return split_by_drive

@@ -115,8 +115,8 @@ class LayerSpec:
             files = registry.option_files(part) if self.source else {}
         except BenchnavError as error:
             raise ConfigError(
-                f"Expected the code of layer {self.name!r}, which generates maps and "
-                f"predicts λ from colours, to be available, got: {error}"
+                f"Expected the code of layer {self.name!r} to be available for "
+                f"generating maps and predicting λ from colours, got: {error}"
             ) from error
         expected = self.digest[:12] or "none"
         got = digest[:12] or "none"

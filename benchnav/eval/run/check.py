@@ -175,7 +175,7 @@ def check_split(condition: Condition, maps: int) -> int:
     if condition.scenario not in scenarios:
         suggestion = hint(condition.scenario, scenarios)
         raise ConfigError(
-            f"Expected `scenarios` among those of {dataset.path}, {scenarios}, got "
+            f"Expected `scenarios` among {scenarios} for {dataset.path}, got "
             f"{condition.scenario!r}.{suggestion}{_remedy(dataset, condition.split, 1)}"
         )
     count = dataset.map_count(condition.split)

@@ -28,8 +28,8 @@ def statistics_of(covariance: CovarianceModel) -> GroundStatistics:
     """
     expect(
         covariance.statistics is not None,
-        "`CovarianceModel.statistics`, which list the look-alike classes, got None. Use "
-        "a model that has terrain statistics, or the belief 'copula'.",
+        "`CovarianceModel.statistics` with the look-alike classes, got None. Use a "
+        "model that has terrain statistics, or the belief 'copula'.",
     )
     return cast(GroundStatistics, covariance.statistics)
 

@@ -744,7 +744,7 @@ def test_a_drive_on_the_ground_of_each_split_is_needed(dem: Path) -> None:
     rows = rows[(rows["x"] < 30) | (rows["drive"] == "drive-11")]
     path = log_of(rows, dem.parent / "log.csv")
     with pytest.raises(
-        DatasetError, match="which no other split uses, got none for valid in"
+        DatasetError, match="on the terrain of each split, got none for valid in"
     ):
         imported(dem, path)
 

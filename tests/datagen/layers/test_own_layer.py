@@ -120,7 +120,7 @@ def test_a_dataset_is_read_and_driven_on_without_the_code(
     with pytest.raises(ConfigError) as caught:
         generate(dataset.recipe, "train", np.arange(1))
     assert str(caught.value).startswith(
-        "Expected the code of layer 'wetness', which generates maps"
+        "Expected the code of layer 'wetness' to be available for"
     )
     assert "\n" not in str(caught.value)
 

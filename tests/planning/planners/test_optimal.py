@@ -670,7 +670,7 @@ def test_other_robots_and_maps_that_change_are_refused(kind: type[Optimal]) -> N
     ):
         kind().init(posed, generator())
     posed = factories.problem(ground)
-    with pytest.raises(ConfigError, match="which plans once"):
+    with pytest.raises(ConfigError, match="plans only once"):
         kind().revise(kind().init(posed, generator()), posed)
 
 

@@ -221,8 +221,8 @@ class Optimal(Planner[OptimalState]):
             ConfigError: Always.
         """
         raise ConfigError(
-            f"Expected a constant map for planner {self.name!r}, which plans once, got "
-            "an updated map. Use belief 'static' and sensor 'full'."
+            f"Expected a constant map for planner {self.name!r}, got an updated map. "
+            "It plans only once. Use belief 'static' and sensor 'full'."
         )
 
     def no_path_cost(self, costs: Costs) -> Tensor:
@@ -354,8 +354,8 @@ class NearOptimal(Optimal):
             is_certain = bool((distribution.stds == 0).all())
         if not is_certain:
             raise ConfigError(
-                f"Expected model 'clairvoyant' for planner {self.name!r}, which needs "
-                "the true λ, got a model that predicts uncertain λ."
+                f"Expected model 'clairvoyant' for planner {self.name!r}, got a model "
+                "that predicts uncertain λ. This planner needs the true λ."
             )
         field = distribution.mean()
         rate = 1 / field.clamp(min=_MIN_TRAVERSABILITY)
