@@ -183,7 +183,10 @@ def inputs_read_by_parts(condition: Condition, metrics: Iterable[Part] = ()) -> 
 
 
 def describe_datasets(conditions: Conditions) -> dict[str, Any]:
-    """Return each dataset's id, and digests of its maps and properties by split."""
+    """Return each dataset's id, and digests by split: of its maps and its properties.
+
+    The digest of the properties has the key `about`, as in the dataset's reader.
+    """
     described: dict[str, Any] = {}
     for condition, extent in conditions.values():
         dataset = condition.dataset
