@@ -48,8 +48,8 @@ class ConditionedDistribution(TraversabilityDistribution):
         shapes = (self.score_std.shape, skew.shape, self.base.shape)
         if any(shape != self.score_mean.shape for shape in shapes):
             raise ConfigError(
-                "Expected `score_mean` and `score_std` of shape "
-                f"{list(self.base.shape)}, as `base`, got "
+                "Expected `score_mean` and `score_std` of the shape of `base` "
+                f"({list(self.base.shape)}), got "
                 f"{list(self.score_mean.shape)} and {list(self.score_std.shape)}."
             )
 

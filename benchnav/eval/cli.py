@@ -267,7 +267,7 @@ def _finish(folder: Path) -> int:
 
 
 def _repeats(suite: Suite, planner_limit_s: float, device: str) -> bool:
-    """Return whether all conditions give the same rows twice; print any exceptions."""
+    """Return whether each condition gives the same rows twice; print which do not."""
     from benchnav.eval.run.determinism import check_determinism
 
     count, lines = check_determinism(suite, _say, planner_limit_s, device)

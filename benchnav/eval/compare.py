@@ -49,7 +49,7 @@ from benchnav.eval.words import reading_name
 _CAPTION = "Differences between conditions on the same maps with the same draws of λ."
 _MAX_LISTED = 8  # maximum number of lines of a note
 _MAX_NAMED = 3  # maximum number of draws or maps in a line
-_MIN_DIFFERENCE = 1e-5  # minimum difference in success rate
+_MIN_DIFFERENCE = 1e-5  # minimum in success rate; a run has at most 10⁸ episodes
 # For at least _MANY pairs, the time is estimated from the time of _TIMED pairs.
 _MANY = 5_000
 _TIMED = 5

@@ -71,9 +71,9 @@ def in_unit(dem: Raster, unit: str) -> tuple[Raster, str]:
         )
     if crs.is_projected and crs.linear_units_factor[1] != 1:
         raise DatasetError(
-            "Expected `dem` to declare the unit of its elevations, got no unit. It may "
-            f"not be the metre, because the CRS of {dem.name} is in "
-            f"{crs.linear_units_factor[0]}. Pass the unit: --dem-unit us-ft, "
+            "Expected `dem` to declare the unit of its elevations, got no unit. The "
+            f"CRS of {dem.name} is in {crs.linear_units_factor[0]}, so the unit of "
+            "elevations may not be the metre. Pass the unit: --dem-unit us-ft, "
             "--dem-unit ft or --dem-unit m."
         )
     return dem, "metres (the raster declares no unit; `dem_unit` sets another)"

@@ -67,9 +67,7 @@ from benchnav.planning.sensing.pairs import split_by_class, statistics_of
 from benchnav.planning.sensing.score_table import TabulatedDistribution
 from benchnav.planning.sensing.sensor import Measurement
 
-_MAX_STRENGTH = (
-    0.88  # maximum β, below the critical strength ln(1 + √2) of a Potts field
-)
+_MAX_STRENGTH = 0.88  # below the critical β of a Potts field, ln(1 + √2)
 _FIRST_SWEEPS = 40  # number of sweeps over whole maps at the start
 _MORE_SWEEPS = 10  # number of sweeps over cells that are assigned to a pair later
 _MIN_STD = 1e-9  # minimum standard deviation of a score, as a divisor

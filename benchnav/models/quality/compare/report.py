@@ -198,8 +198,8 @@ def difference_table(comparison: Comparison) -> Table:
         Column(
             "difference",
             lambda row: signed(row["difference"], 4),
-            "measure of the model minus that of the best model; for coverage “in 90 "
-            "%”, the model's distance from 0.9 minus that of the best model.",
+            "measure of the model minus that of the best model; for “in 90 %” "
+            "(coverage), the model's distance from 0.9 minus that of the best model.",
         ),
         Column(
             "95 % interval",

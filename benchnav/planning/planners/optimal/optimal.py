@@ -222,7 +222,7 @@ class Optimal(Planner[OptimalState]):
         """
         raise ConfigError(
             f"Expected a constant map for planner {self.name!r}, got an updated map. "
-            "It plans only once. Use belief 'static' and sensor 'full'."
+            "This planner plans only once. Use belief 'static' and sensor 'full'."
         )
 
     def no_path_cost(self, costs: Costs) -> Tensor:
