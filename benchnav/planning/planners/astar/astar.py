@@ -162,7 +162,7 @@ def _cost_per_m(problem: Problem, traversability: Tensor, grade: Tensor) -> Tens
     shape = list(cost.shape) if isinstance(cost, Tensor) else type(cost).__name__
     expect(
         shape == list(grade.shape),
-        f"{name} to return a tensor of shape {list(grade.shape)} (the shape of λ̂), got "
+        f"{name} to return a tensor of shape {list(grade.shape)} (like λ̂), got "
         f"{shape}. Return a cost for each segment of a path.",
     )
     min_cost, max_cost = torch.stack(cost.aminmax())
