@@ -79,7 +79,8 @@ def fit_ground(dataset: TerrainDataset) -> GroundStatistics:
     if not inner.sum() + ends.sum():
         raise DatasetError(
             f"Expected cells with traversability in split {TRAIN} of {dataset.path}, "
-            "for terrain statistics, got only NaN. Use a dataset with traversability."
+            "got only NaN. Terrain statistics need λ. Use a dataset with "
+            "traversability."
         )
     weights, means, stds = fit_mixture(inner, ends)
     potts_strength = 0.0
@@ -269,7 +270,7 @@ def find_ground(dataset: TerrainDataset) -> GroundStatistics | None:
     """Return terrain statistics for a dataset; None if no file fits.
 
     The statistics are read from the file next to the dataset. If this file does not
-    exist, those of a shipped recipe with the same terrain are used.
+    exist, the statistics of a shipped recipe with the same terrain are used.
 
     Args:
         dataset: dataset with any splits; it need not have `train`.

@@ -227,7 +227,7 @@ def test_objects_of_one_process_are_marked_and_not_resumed(
         "Not reproducible: planner mine is an object of one process" in page.read_text()
     )
     with pytest.raises(
-        ConfigError, match="whose planner mine was an object of one process"
+        ConfigError, match="whose planner mine was a Python object that existed only in"
     ):
         evaluate(**given, folder=tmp_path / "run")
     with pytest.raises(ConfigError, match="which exists only in this process"):

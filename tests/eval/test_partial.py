@@ -239,7 +239,7 @@ def test_episodes_of_finished_units_are_replayed_while_the_run_goes_on(
     assert not (running / "playback").exists()
     lacking = next(risk for risk, one in known.items() if one is None)
     ((unit, member),) = find_episodes(running, {"risk": [lacking]}, 1, 0, 1)
-    with pytest.raises(ConfigError, match="does not have yet"):
+    with pytest.raises(ConfigError, match="does not contain yet"):
         find_recording(running, unit, member, tmp_path / "out")
 
 

@@ -60,8 +60,9 @@ def load_recipe(source: str | Path, overrides: Sequence[str] = ()) -> Recipe:
     has_new_id = not overrides or recipe.id != data.get("id")
     expect(
         has_new_id,
-        f"a new id for a recipe with overrides, got {recipe.id!r}, the id of the "
-        "recipe without them. Add `id=NAME` to the overrides, with another name.",
+        f"a new id for a recipe with overrides, got {recipe.id!r}, which is the id of "
+        "the recipe without overrides. Add `id=NAME` to the overrides, with another "
+        "name.",
     )
     is_shipped = path == RECIPES / f"{recipe.id}.yaml" and not overrides
     if recipe.id in shipped and not is_shipped:

@@ -488,7 +488,7 @@ def test_a_sensor_under_the_key_of_the_other_kind_is_refused() -> None:
     given = drives()
     truth = given.learning.truth
     with pytest.raises(
-        KnowledgeError, match="List traversability sensors under `grounds`"
+        KnowledgeError, match="measures traversability, list it under `grounds`"
     ):
         learning(given.problem, truth, sensor=Probe(1.0), covariance=ALIKE)
     # What senses both may stand under either.

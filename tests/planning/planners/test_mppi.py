@@ -389,7 +389,7 @@ def test_noise_for_another_number_of_actions_is_asked_for_by_name() -> None:
 
     problem = factories.problem(torch.full((1, 16, 16), 0.85), robot=Three())
     with pytest.raises(
-        ConfigError, match=r"`noise` of MPPI with 3 values, one for each of .*crab_mps"
+        ConfigError, match=r"`noise` of MPPI with 3 values .one for each of .*crab_mps"
     ):
         MPPI(replace(SMALL, noise=(0.5, 0.5))).init(problem, generator())
     MPPI(replace(SMALL, noise=(0.5, 0.5, 0.2))).init(problem, generator())

@@ -653,7 +653,9 @@ def test_other_robots_and_maps_that_change_are_refused(kind: type[Optimal]) -> N
         ):
             kind().init(factories.problem(ground, robot=robot), generator())
     uneven = Unicycle(turn_rate_radps=(-1.0, 0.5))
-    with pytest.raises(ConfigError, match=f"to both sides for planner '{kind.name}'"):
+    with pytest.raises(
+        ConfigError, match=f"left and right turns with planner '{kind.name}'"
+    ):
         kind().init(factories.problem(ground, robot=uneven), generator())
     backward = Unicycle(speed_mps=(-1.0, 1.0))
     with pytest.raises(
@@ -664,11 +666,11 @@ def test_other_robots_and_maps_that_change_are_refused(kind: type[Optimal]) -> N
     posed = factories.problem(ground, rules=replace(RULES, goal_radius_m=0.35))
     with pytest.raises(
         ConfigError,
-        match=r"`goal_radius_m` of at least 0\.35, half of a cell's diagonal",
+        match=r"`goal_radius_m` ≥ 0\.35 m .half a cell's diagonal",
     ):
         kind().init(posed, generator())
     posed = factories.problem(ground)
-    with pytest.raises(ConfigError, match="which plans once"):
+    with pytest.raises(ConfigError, match="plans only once"):
         kind().revise(kind().init(posed, generator()), posed)
 
 
