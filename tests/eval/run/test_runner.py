@@ -773,7 +773,7 @@ def test_suites_are_checked_before_anything_is_run_or_dropped(
         ({"maps": 9}, "Use 0 for all maps"),
         (
             {"world": {"time_budget_s": 0.01}},
-            "time budget of at least 0.1 s (one time step)",
+            "time budget of at least 0.1 s .one time step",
         ),
         ({"planners": ("astar_dwa",), "robots": ("bicycle",)}, "steering_rad"),
         ({"planners": ("cl_rrt",), "robots": ("bicycle",)}, "steering_rad"),
