@@ -35,6 +35,8 @@ def test_a_model_of_ones_own_is_trained_calibrated_measured_and_driven_with(
         0.02,
         "--trainer.precision",
         "32-true",
+        "--trainer.max_epochs",
+        10,
     )
     fit = (
         "fit",

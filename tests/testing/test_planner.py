@@ -21,7 +21,12 @@ from benchnav.testing import check_planner
 from tests.testing.refusal import refusal
 
 FEW = {"samples": 128, "horizon_s": 2.0}
-SMALL = {"mppi": FEW, "astar_mppi": {"mppi": FEW}, "cl_rrt": {"expansions": 50}}
+SMALL = {
+    "mppi": FEW,
+    "astar_mppi": {"mppi": FEW},
+    "cl_rrt": {"expansions": 50},
+    "near_optimal": {"headings": 16, "levels": 1},
+}
 
 
 @dataclass
