@@ -417,7 +417,7 @@ def test_every_registered_planner_keeps_the_contract(planner: str, robot: str) -
     except ConfigError:
         pytest.skip("it does not steer this robot")
     # It simulates whole episodes, which take fewer steps of a longer time.
-    options = {"dt_s": 0.4} if planner == "near_optimal" else {}
+    options = {"dt_s": 1.0} if planner == "near_optimal" else {}
     check_planner(made, robots=[{"part": robot, "options": options}])
 
 
