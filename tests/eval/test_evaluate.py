@@ -12,8 +12,8 @@ import pytest
 
 import benchnav
 from benchnav.core.errors import ConfigError
-from benchnav.eval import cli as eval_cli
 from benchnav.eval import Suite, evaluate, open_run, run_suite
+from benchnav.eval import cli as eval_cli
 from benchnav.eval.results import Results
 from benchnav.models import load_model
 from benchnav.planning import (

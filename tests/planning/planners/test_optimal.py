@@ -326,9 +326,7 @@ def solved_wide_bar(for_s: float) -> Solved:
     return Solved(NearOptimal(), wide_bar(for_s))
 
 
-@pytest.mark.parametrize(
-    ("for_s", "crosses"), [(15.0, False), (16.5, True)]
-)
+@pytest.mark.parametrize(("for_s", "crosses"), [(15.0, False), (16.5, True)])
 def test_over_several_cells_dwell_time_adds_up(for_s: float, crosses: bool) -> None:
     solved = solved_wide_bar(for_s)
     posed = solved.state.problem
