@@ -23,7 +23,7 @@ from benchnav.core.grid import is_azimuth
 from benchnav.core.ground import GroundStatistics
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.classes import look_alike_classes
-from benchnav.datagen.recipe.load import load_recipe
+from benchnav.datagen.recipe.load import shipped_recipe
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.datagen.recipe.scenario import RECIPES
 from benchnav.datagen.schema import Maps
@@ -280,7 +280,7 @@ def find_ground(dataset: TerrainDataset) -> GroundStatistics | None:
         return GroundStatistics.from_json(path.read_text())
     shipped_paths = sorted((RECIPES / "ground").glob("*.json"))
     for path in shipped_paths:
-        shipped = load_recipe(path.stem)
+        shipped = shipped_recipe(path.stem)
         if _has_same_terrain(shipped, dataset.recipe):
             return GroundStatistics.from_json(path.read_text())
     return None

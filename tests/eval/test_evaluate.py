@@ -13,6 +13,7 @@ import pytest
 import benchnav
 from benchnav.core.errors import ConfigError
 from benchnav.eval import Suite, evaluate, open_run, run_suite
+from benchnav.eval import cli as eval_cli
 from benchnav.eval.results import Results
 from benchnav.models import load_model
 from benchnav.planning import (
@@ -200,6 +201,8 @@ def test_a_planner_of_a_file_gives_equal_rows_from_a_program_and_from_two_proces
     planners = (
         '[{part: "slower.py:Slower", label: "Slower:0.25", options: {factor: 0.25}}]'
     )
+    # A report takes longer than a run.
+    monkeypatch.setattr(eval_cli, "_finish", eval_cli._failed)
     assert call("eval", "run", *words, "--planners", planners, "--out", "command") == 0
     pd.testing.assert_frame_equal(
         results_of(ours.episodes), results_of(open_run("command").episodes)

@@ -197,7 +197,7 @@ def test_a_run_that_was_read_goes_on_as_if_nobody_had(
     folder = tmp_path / "run"
     steps = run_suite(suite, folder)
     for step in steps:
-        if 0 < step.done < step.total:
+        if step.done in (1, step.total - 1):
             write_report(folder, partial=True)
     results = [pd.read_parquet(place / EPISODES) for place in (folder, whole)]
     same = [

@@ -567,7 +567,7 @@ def test_how_maps_are_read_reaches_the_training(
 
     monkeypatch.setattr(networks, "MapData", opened)
     quick = QUICK_GP if kind == "all" else []
-    for number, how in enumerate(([], ["--workers", 2], ["--in_memory", "true"])):
-        where = ["--data", dataset.path, "--out", tmp_path / str(number)]
+    where = ["--data", dataset.path, "--out", tmp_path / "m", "--resume"]
+    for how in ([], ["--workers", 2], ["--in_memory", "true"]):
         assert call("train", kind, *where, *quick, *how) == 130
     assert seen == [(False, 0), (False, 2), (True, 0)]

@@ -21,7 +21,12 @@ from benchnav.testing import check_planner
 from tests.testing.refusal import refusal
 
 FEW = {"samples": 128, "horizon_s": 2.0}
-SMALL = {"mppi": FEW, "astar_mppi": {"mppi": FEW}, "cl_rrt": {"expansions": 50}}
+SMALL = {
+    "mppi": FEW,
+    "astar_mppi": {"mppi": FEW},
+    "cl_rrt": {"expansions": 50},
+    "near_optimal": {"headings": 16, "levels": 1},
+}
 
 
 @dataclass
@@ -412,7 +417,7 @@ def test_every_registered_planner_keeps_the_contract(planner: str, robot: str) -
     except ConfigError:
         pytest.skip("it does not steer this robot")
     # It simulates whole episodes, which take fewer steps of a longer time.
-    options = {"dt_s": 0.4} if planner == "near_optimal" else {}
+    options = {"dt_s": 1.0} if planner == "near_optimal" else {}
     check_planner(made, robots=[{"part": robot, "options": options}])
 
 
