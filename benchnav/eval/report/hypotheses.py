@@ -116,7 +116,7 @@ def hypothesis_table(
 def _claim(row: Mapping[Any, Any], quantities_by_name: Mapping[str, Quantity]) -> str:
     """Return the claim of a hypothesis, with names of conditions as in tables.
 
-    Names with commas are in brackets, so that a reader sees where they end.
+    Names with commas are in brackets, which show where a name ends.
     """
     names = [field.name for field in fields(Hypothesis)]
     test = Hypothesis(**{name: row[name] for name in names})
