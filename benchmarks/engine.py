@@ -101,7 +101,7 @@ def planners() -> list[dict[str, Any]]:
     peer = milliseconds(lambda: plain_mppi(single, mean, generator))
     on_cost = MPPIConfig(samples=1024, risk_on="cost", level=0.8, fields=64)
     on_map = MPPIConfig(samples=1024 * 64)
-    again = "the same, an episode of 20"
+    again = "the same, per episode of a batch of 20"
     rows = [
         row(
             "MPPI 5 000 × 50, one episode",

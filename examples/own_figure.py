@@ -18,7 +18,7 @@ class WhenFailed(Figure):
 
     name = "when-failed"
 
-    def needs(self, data: RunData) -> bool:
+    def is_available(self, data: RunData) -> bool:
         return not data.failures.empty
 
     def caption(self, data: RunData) -> str:

@@ -38,8 +38,8 @@ def read(path: Path, odometry: str, command: str) -> pd.DataFrame:
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         sys.exit(
-            f"Expected the package rosbags, which reads bags, got: {error}. Install "
-            "it: pip install rosbags"
+            f"Expected rosbags to be installed for reading bags, got: {error}. Run: pip "
+            "install rosbags"
         )
     odometry_rows, commanded = [], []
     # Message definitions are read from the bag. Old bags of ROS 2 contain no

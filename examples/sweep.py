@@ -15,7 +15,9 @@ from benchnav.models import TrainOptions, fit_model, load_checkpoint
 try:
     import optuna
 except ImportError:
-    sys.exit("Expected the package optuna, got None. Install it: pip install optuna")
+    sys.exit(
+        "Expected optuna to be installed, got no such package. Run: pip install optuna"
+    )
 
 MODEL = Path(__file__).with_name("own_model.py")
 

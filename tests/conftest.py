@@ -2,11 +2,16 @@
 
 import atexit
 import gc
+from collections.abc import Iterable
+from functools import cache
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
 import torch
 
+from benchnav.core import part_lookup, sources
+from benchnav.eval.folder import provenance
 from benchnav.viz import style as figures
 from tests import factories
 
@@ -18,6 +23,23 @@ torch.set_num_threads(1)
 # To embed a font as publishers ask takes half a second a file.
 _SAVED = figures._SAVE_STYLE.copy()
 figures._SAVE_STYLE["pdf.fonttype"] = 3
+
+
+@cache
+def _digest_of_test_modules(names: tuple[str, ...]) -> str:
+    return sources.digest_of_modules(names)
+
+
+def _digest_of_modules(names: Iterable[str]) -> str:
+    """Read the package `tests` once per process, since each digest reads all of it."""
+    if all(name.startswith("tests.") for name in names):
+        return _digest_of_test_modules(tuple(sorted(names)))
+    return sources.digest_of_modules(names)
+
+
+part_lookup.digest_of_modules = _digest_of_modules
+# Each new run asks for the versions of installed packages, which do not change here.
+provenance.version = cache(version)
 
 
 def pytest_collection_finish() -> None:

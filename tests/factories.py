@@ -9,7 +9,7 @@ from benchnav.core.grid import Grid
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Observation, Terrain
 from benchnav.datagen.files.create import create
-from benchnav.datagen.recipe.load import load_recipe
+from benchnav.datagen.recipe.load import shipped_recipe
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.planning.free_space import Rules
 from benchnav.planning.objective import GoalDistance, Objective
@@ -128,7 +128,7 @@ def tiny_recipe(**maps: int) -> Recipe:
     """The shipped `tiny-v1` with fewer maps; keyword names have `_` for `/` in split
     names.
     """
-    recipe = load_recipe("tiny-v1")
+    recipe = shipped_recipe("tiny-v1")
     sizes = {"train": 8, "valid": 3, "test_std": 2, "test_hg": 2, "test_hs": 2} | maps
     splits = {
         name: replace(split, maps=sizes[name.replace("/", "_")])

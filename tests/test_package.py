@@ -173,7 +173,8 @@ except benchnav.ConfigError as error:
             str(inside / "checkpoints" / "stakes-v1"),
             "FusedModel",
         ),
-        "Expected_the_checkpoint_paper-v1_in_checkpoints/,_which_the_wheel_leaves_out_for_its_size,_got_no_such_folder.",
+        "Expected_the_checkpoint_paper-v1_in_checkpoints/,_got_no_such_folder."
+        "_The_wheel_leaves_it_out_for_its_size.",
     ]
 
 

@@ -74,7 +74,7 @@ def test_a_model_is_trained_and_measured_on_ground_that_is_labelled_in_part(
     )
     assert call("eval", "run", "--data", "real.h5", *suite, "--out", "run") == 2
     (line,) = capfd.readouterr().err.strip().splitlines()
-    assert "Expected maps with a class in each cell, since episodes" in line
+    assert "Expected maps with a class in each cell, got maps with unlabelled" in line
     assert not (tmp_path / "run").exists()
     with pytest.raises(ConfigError, match="a class in each cell"):
         gymnasium.make(

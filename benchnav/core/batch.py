@@ -20,7 +20,7 @@ class Batch:
     """Base class of dataclasses whose tensors and nested batches have B elements."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Set `__repr__` to a short one, which the dataclass decorator keeps."""
+        """Set a short `__repr__`, which the dataclass decorator keeps."""
         super().__init_subclass__(**kwargs)
         cls.__repr__ = short_repr  # type: ignore[method-assign]
 
@@ -123,7 +123,7 @@ def put_if_alike(value: Value, members: Tensor, others: Value) -> Value:
     Args:
         value: batch of B elements.
         members: indices of the elements to replace, int64, shape [M].
-        others: batch of B elements that contains the new ones.
+        others: batch of B elements that contains the new elements.
 
     Returns:
         A new batch. If `others` has a different type or different shapes, `others`.

@@ -48,8 +48,8 @@ class ConditionedDistribution(TraversabilityDistribution):
         shapes = (self.score_std.shape, skew.shape, self.base.shape)
         if any(shape != self.score_mean.shape for shape in shapes):
             raise ConfigError(
-                "Expected `score_mean` and `score_std` of the shape of `base`, "
-                f"{list(self.base.shape)}, got "
+                "Expected `score_mean` and `score_std` of the shape of `base` "
+                f"({list(self.base.shape)}), got "
                 f"{list(self.score_mean.shape)} and {list(self.score_std.shape)}."
             )
 
@@ -107,8 +107,8 @@ class ConditionedDistribution(TraversabilityDistribution):
         lower, upper = self._scores(value)
         base = self.base._in_float64()
         prior = base.to_normal(value)[1]
-        # The density of λ follows from that of `base` by a change of the score from the
-        # prior's to the posterior's.
+        # The density of λ follows from the density under `base`, if the prior's score
+        # is replaced by the posterior's score.
         log_ratio = (prior.square() - upper.square()) / 2
         inside = base.log_prob(value).double() + log_ratio - std.log()
         if self.score_skew is not None:
@@ -138,7 +138,7 @@ def skewed(normal: Tensor, skew: Tensor) -> Tensor:
 
     Args:
         normal: values of any shape.
-        skew: skewness of the result, of a shape that broadcasts to that of `normal`.
+        skew: skewness of the result; its shape broadcasts to the shape of `normal`.
 
     Returns:
         Values of mean 0 and variance 1, float64.
@@ -168,7 +168,7 @@ def _slope(normal: Tensor, skew: Tensor) -> Tensor:
 def _log_normal(skew: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return the sign of a skewness, and mean, standard deviation and σ of exp(σ z).
 
-    The skewness of exp(σ z) is the absolute value of the given one.
+    The skewness of exp(σ z) is the absolute value of `skew`.
     """
     abs_skew = skew.double().abs().clamp(min=MIN_SKEW)
     # Solve skew² = (w + 2)² (w − 1) for w = exp(σ²).

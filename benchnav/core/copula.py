@@ -41,7 +41,7 @@ def correlated_normal(
             exp(−d²/2ℓ²); if ℓ is 0, they are independent.
         kernel: one of `KERNELS`. The correlation of `matern32` is
             (1 + a d/ℓ) exp(−a d/ℓ) with a = 1.358, so that it is exp(−1/2) at distance
-            ℓ, like that of the Gaussian.
+            ℓ, as for the Gaussian kernel.
 
     Returns:
         Standard normals, float64, shape [B, H, W].

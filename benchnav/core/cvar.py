@@ -177,7 +177,7 @@ def _replaced(
     cells: Cells,
     *columns: Tensor,
 ) -> Tensor:
-    """Return values, shape [N], in which those of masked cells are computed again."""
+    """Return values, shape [N], after computing those of masked cells again."""
     if not _may_wait(values):
         return torch.where(mask, compute(cells, *columns), values)
     indices = mask.nonzero().squeeze(1)

@@ -31,8 +31,8 @@ def describe(kind: str, instance: Any) -> Part:
             text or mapping that `registry.read_part` reads.
 
     Returns:
-        The part that creates the object again. If no part can, a part that names the
-        object in this process only; see `registry.is_object`.
+        The part that creates the object again. If no part can do this, a part that
+        names the object in this process only; see `registry.is_object`.
 
     Raises:
         ConfigError: If the object is not of that kind.

@@ -59,8 +59,8 @@ def device_of_run(run: Mapping[str, Any]) -> torch.device:
     """
     expect(
         run["device"] != "cuda" or torch.cuda.is_available(),
-        "a GPU that PyTorch can use, since this run was computed on one, got none. Run "
-        "the command on a machine with a GPU.",
+        "a GPU that PyTorch can use, got none. This run was computed on a GPU. Run the "
+        "command on a machine with a GPU.",
     )
     return find_device(run["device"])
 

@@ -160,7 +160,7 @@ class TraversabilityDistribution(Batch, ABC):
         return self._in_chunks(compute)
 
     def expected_time(self, floor: float) -> Tensor:
-        """Return E[1 / max(λ, floor)], the expected time relative to that at λ = 1.
+        """Return E[1 / max(λ, floor)], the expected time relative to time at λ = 1.
 
         Args:
             floor: minimum speed ε, in (0, 1].

@@ -111,7 +111,7 @@ class GroundStatistics:
             required = {"rgb": 3, "elevation_m": 1, "slope_deg": 1}
             expect(
                 required.items() <= channels.items(),
-                f"`layer_means` with these numbers of channels, {required}, got "
+                f"`layer_means` with the numbers of channels {required}, got "
                 f"{channels}. Create the ground statistics again.",
             )
             return statistics

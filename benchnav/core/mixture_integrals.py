@@ -16,8 +16,8 @@ MIN_STD = 1e-9
 _MAX_Z = 7.0  # standard deviations beyond which Φ is 0 or 1 to within 1e-11
 
 _CRPS_NODES = 48
-# Minimum standard deviation that these nodes resolve. A component with a smaller one is
-# narrow, and is integrated with nodes of its own.
+# Minimum standard deviation that these nodes resolve. A narrower component
+# is integrated with nodes of its own.
 _NARROW_STD = 0.03
 _NARROW_NODES = 32
 

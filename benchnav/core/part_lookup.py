@@ -216,8 +216,8 @@ def find(kind: str, source: str) -> Found:
     if len(points) > 1:
         values = ", ".join(point.value for point in points)
         raise ConfigError(
-            f"Expected one {kind} named {source!r}, got several: {values}. Write one of "
-            "these in place of the name."
+            f"Expected one {kind} named {source!r}, got several: {values}. Write one "
+            "of these instead of the name."
         )
     if points:
         location, colon, name = points[0].value.partition(":")
@@ -349,7 +349,7 @@ def _listed_files(target: Any) -> Iterator[str]:
         if not digest:
             raise ConfigError(
                 f"Expected `files` of {target.__qualname__} to exist in {folder}, got "
-                f"{name!r}, which does not."
+                f"{name!r}, which does not exist there."
             )
         yield name
         yield digest

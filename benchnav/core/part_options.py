@@ -41,7 +41,7 @@ def given_parameters(kind: str) -> tuple[str, ...]:
 
 
 def added_options(kind: str, target: Any) -> tuple[str, ...]:
-    """Return the options that a part lists in `added`, as newer than its first release."""
+    """Return the options that a part lists in `added`: newer than its first release."""
     owner = config_class_of(kind, target) or target
     added: tuple[str, ...] = getattr(owner, "added", ())
     return added

@@ -20,7 +20,7 @@ from torch import Tensor
 N_INTERVALS = 16  # number of initial intervals of a cell
 _N_LANES = 4  # intervals of a cell that are bisected together in a round
 _ROUNDS = 24
-_ROUNDS_FACTOR = 3  # for cells whose error estimate exceeds `_MAX_ERROR`
+_ROUNDS_FACTOR = 3  # factor for cells with an estimate above `_MAX_ERROR`
 _MAX_ERROR = 3e-5
 # An error bound includes the correction by the parabola and, since the function may
 # jump within an interval, this fraction of the change over the interval.

@@ -65,8 +65,8 @@ class QuantileDistribution(TraversabilityDistribution):
         max_step = max(steps[:n_tail_steps])
         expect(
             max_step <= _TAIL_STEP + 1e-9,
-            f"`levels` at most {_TAIL_STEP} apart up to {_TAIL}, the tail that risk "
-            f"depends on, got a step of {max_step:.3g}. Add levels there.",
+            f"`levels` at most {_TAIL_STEP} apart in the tail up to {_TAIL}, got a "
+            f"step of {max_step:.3g}. Risk depends on this tail. Add levels to it.",
         )
         shape = self.values.shape
         if len(shape) < 3 or shape[-3] != len(levels):
@@ -234,7 +234,7 @@ def quantiles_at(
     probabilities: Sequence[float],
     levels: tuple[float, ...] = LEVELS,
 ) -> QuantileDistribution:
-    """Return a distribution with the quantiles of another at changed levels.
+    """Return the quantiles of a distribution at changed levels, as a distribution.
 
     Its quantile at `levels[i]` is the quantile of `distribution` at `probabilities[i]`.
 

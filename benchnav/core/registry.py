@@ -187,8 +187,8 @@ def _read_first_option(
     options = options_of(kind, find(kind, source).target)
     if not options:
         raise ConfigError(
-            f"Expected {kind} {source!r} without a value, since it has no options, got "
-            f"{text!r}."
+            f"Expected {kind} {source!r} without a value, got {text!r}. This {kind} "
+            "has no options."
         )
     name, option = next(iter(options.items()))
     data = load_yaml(value) if option.kind is Any else value
@@ -325,9 +325,10 @@ def option_files(part: Part) -> dict[str, str]:
         exists = os.path.exists(path)
         if exists and path.is_dir() and Path.cwd().is_relative_to(path.resolve()):
             raise ConfigError(
-                f"Expected no option of {part.kind} {part.part!r} to name a folder that "
-                f"contains the working folder, got {text!r}. Name the folder that the "
-                "part reads, or list the option in `writes`."
+                f"Expected {part.kind} {part.part!r} to have no option that names a "
+                f"folder around the working folder, got {text!r}. Name only the folder "
+                "that the part reads, or list the option in the attribute `writes` of "
+                "its class."
             )
         looks_like_path = os.sep in text or re.search(r"\.[A-Za-z]\w*$", text)
         if exists or looks_like_path:

@@ -77,7 +77,7 @@ def list_options(
 
 
 def config_class(target: Callable[..., Any], skipped: Iterable[str] = ()) -> Any:
-    """Return the dataclass of the parameter `config` if it is the only one, else None."""
+    """Return the dataclass of `config` if that is the only parameter, else None."""
     if set(parameters(target)) - set(skipped) != {"config"}:
         return None
     return dataclass_in(_types(target).get("config"))

@@ -151,8 +151,8 @@ def digest_of_path(path: Path) -> str:
             return hashlib.file_digest(stream, "sha256").hexdigest()
     except OSError as error:
         raise ConfigError(
-            f"Expected {path} to be readable, since a setting refers to it, got: "
-            f"{error.strerror}. Change its permissions, or name another path."
+            f"Expected the file {path} of a setting to be readable, got: "
+            f"{error.strerror}. Change the file's permissions, or name another path."
         ) from error
 
 
@@ -369,7 +369,7 @@ def _read_source(path: Path) -> bytes:
 
     If the file has changed since this process first read it, the first content followed
     by the present one is returned. The process may have imported the first content, so
-    the digest must differ from those of both contents.
+    the digest must differ from the digests of both contents.
     """
     content = path.read_bytes()
     first_content = _FIRST_CONTENTS.setdefault(path, content)

@@ -62,7 +62,7 @@ def watch(part_folder: Path | None = None) -> None:
 
     Args:
         part_folder: folder of an installed package that contains a part. From now on,
-            code in this folder counts as the user's, unlike that of other packages.
+            code in this folder counts as the user's, unlike code of other packages.
     """
     global _watching
     if part_folder is not None:

@@ -70,8 +70,8 @@ def end_with(parent: int) -> None:
     Further calls in the same process have no effect.
 
     Args:
-        parent: ID of the process that started this one. `os.getppid` may return another
-            ID here, if the parent was killed during the start-up of this process.
+        parent: ID of the process that started this process. `os.getppid` may return
+            another ID here, if the parent was killed during the start-up.
     """
 
     def watch() -> None:

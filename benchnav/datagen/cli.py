@@ -295,9 +295,10 @@ def export(
     has_origin = bool(license and creator) or is_ours(dataset, chosen)
     expect(
         has_origin,
-        f"both `license` and `creator` for {dataset.id}, whose maps are not of a "
-        f"shipped recipe, got {license!r} and {creator!r}. Pass your own. For imported "
-        "maps, pass those of the elevation model, classes and photo.",
+        f"both `license` and `creator` for {dataset.id}, whose maps do not come from a "
+        f"shipped recipe, got {license!r} and {creator!r}. Pass your licence and name. "
+        "For imported maps, pass the licence and creator of the elevation model, "
+        "classes and photo.",
     )
     license = license or "MIT"
     creator = creator or AUTHORS

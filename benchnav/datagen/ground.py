@@ -23,7 +23,7 @@ from benchnav.core.grid import is_azimuth
 from benchnav.core.ground import GroundStatistics
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.classes import look_alike_classes
-from benchnav.datagen.recipe.load import load_recipe
+from benchnav.datagen.recipe.load import shipped_recipe
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.datagen.recipe.scenario import RECIPES
 from benchnav.datagen.schema import Maps
@@ -79,7 +79,8 @@ def fit_ground(dataset: TerrainDataset) -> GroundStatistics:
     if not inner.sum() + ends.sum():
         raise DatasetError(
             f"Expected cells with traversability in split {TRAIN} of {dataset.path}, "
-            "for terrain statistics, got only NaN. Use a dataset with traversability."
+            "got only NaN. Terrain statistics need λ. Use a dataset with "
+            "traversability."
         )
     weights, means, stds = fit_mixture(inner, ends)
     potts_strength = 0.0
@@ -269,7 +270,7 @@ def find_ground(dataset: TerrainDataset) -> GroundStatistics | None:
     """Return terrain statistics for a dataset; None if no file fits.
 
     The statistics are read from the file next to the dataset. If this file does not
-    exist, those of a shipped recipe with the same terrain are used.
+    exist, the statistics of a shipped recipe with the same terrain are used.
 
     Args:
         dataset: dataset with any splits; it need not have `train`.
@@ -279,7 +280,7 @@ def find_ground(dataset: TerrainDataset) -> GroundStatistics | None:
         return GroundStatistics.from_json(path.read_text())
     shipped_paths = sorted((RECIPES / "ground").glob("*.json"))
     for path in shipped_paths:
-        shipped = load_recipe(path.stem)
+        shipped = shipped_recipe(path.stem)
         if _has_same_terrain(shipped, dataset.recipe):
             return GroundStatistics.from_json(path.read_text())
     return None

@@ -18,7 +18,7 @@ from benchnav.datagen.dem.options import Cut, GroundOptions, Rasters
 if TYPE_CHECKING:
     from benchnav.datagen.dem.recipe_fit import GroundError
 
-# Thresholds that are a choice of this package are marked (choice).
+# Thresholds that this package chooses without a source are marked "(choice)".
 # Maximum fraction of rows in which a robot slides back (choice).
 _MAX_BACKWARD = 0.1
 # Maximum fraction of rows in which noise reverses positions (choice).
@@ -282,7 +282,7 @@ def _import(
 ) -> "datagen.TerrainDataset":
     """Import maps, and return the dataset.
 
-    Its id is the requested one, or the name of the output.
+    Its id is the requested id, or the name of the output.
     """
     from benchnav.datagen.dem.importer import import_dem as import_maps
     from benchnav.datagen.dem.recipe_fit import GroundError

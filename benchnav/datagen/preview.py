@@ -126,12 +126,12 @@ def preview_figure(
         marks,
     )
     panels = {str(panel.get_label()): panel for panel in figure.axes}
-    veils = _hillshade(elevation_m, slope_deg, resolution_m)
+    hillshade_overlays = _hillshade(elevation_m, slope_deg, resolution_m)
     lines = {"colors": "black", "linewidths": 0.35, "alpha": 0.7}
     y, x = ((np.arange(cells) + 0.5) * resolution_m for cells in grid.shape)
     for row in range(len(indices)):
         panel = panels[f"elevation_m {row}"]
-        show_map(panel, veils[row], grid.extent_m)
+        show_map(panel, hillshade_overlays[row], grid.extent_m)
         heights = elevation_m[row]
         is_crossed = (levels > heights.min()) & (levels < heights.max())
         if is_crossed.any():

@@ -56,8 +56,8 @@ class EnvBatch:
         robot: name or mapping of a registered robot, or a robot.
         objective: name or mapping of an objective, or an objective. If empty, the
             shaped reward.
-        world: name of a preset, a mapping of changes to one, or a world. If empty, the
-            preset `paper`, with a warning.
+        world: name of a preset, a mapping of changes to a preset, or a world. If
+            empty, the preset `paper`, with a warning.
         goal_radius_m: distance within which the goal is reached, in metres.
     """
 
@@ -144,7 +144,7 @@ class EnvBatch:
             generators: random generators of the sub-environments, length B.
             chosen: mask of sub-environments that start, bool, shape [B].
             map_index: index of the map of all these sub-environments; if None, a map is
-                drawn for each.
+                drawn for each sub-environment.
         """
         guard.limit_threads()
         members = np.flatnonzero(chosen)

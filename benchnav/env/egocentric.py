@@ -51,8 +51,8 @@ class EgocentricEnv(OffRoadEnv):
     A `Dict` of two keys, float32. `crop`, shape (4, N, N), is the terrain around the
     robot, turned with it. The centre of its cell [i, j] is (j + ½)·res −
     `crop_behind`·N·res ahead of the robot and (i + ½)·res − ½·N·res to its left, where
-    res is the edge length of the map's cells. Its value is that of the map's cell in
-    which this centre lies; all channels are 0 off the map.
+    res is the edge length of the map's cells. It has the value of the map's cell that
+    contains this centre; all channels are 0 off the map.
 
     | channel | range    | meaning                                                                            |
     |---------|----------|------------------------------------------------------------------------------------|

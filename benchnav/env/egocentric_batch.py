@@ -118,8 +118,8 @@ class EgocentricBatch(EnvBatch):
         has_fixed_field = self._world.noise != "resampled"
         expect(
             has_fixed_field or not needs_fixed_field,
-            "a world of fixed λ, which the model 'clairvoyant' and beliefs that learn "
-            "need, got `noise` 'resampled'. Pass world='stakes'.",
+            "a world of fixed λ for the model 'clairvoyant' or a belief that learns, "
+            "got `noise` 'resampled'. Pass world='stakes'.",
         )
         statistics = None
         if not sensor.sees_all or belief.needs_statistics:

@@ -242,7 +242,7 @@ class OffRoadVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
 def _only(
     observations: Observations, info: Observations
 ) -> tuple[Observations, dict[str, Any]]:
-    """Return observation and info of a batch of one, with the outcome's name."""
+    """Return observation and info of the only episode, with the outcome's name."""
     observation = {name: values[0] for name, values in observations.items()}
     diagnostics = {name: values[0].item() for name, values in info.items()}
     outcome = Outcome(diagnostics["outcome"])

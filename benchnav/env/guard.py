@@ -57,8 +57,8 @@ def check_render_mode(render_mode: str | None, modes: Collection[str]) -> None:
         expected = " or ".join(map(repr, modes))
         raise ConfigError(f"Expected `render_mode` {expected}, got {render_mode!r}.")
     raise ConfigError(
-        "Expected no `render_mode` for benchnav/OffRoad-v0, which draws nothing, got "
-        f"{render_mode!r}. Use benchnav/OffRoad-v1."
+        f"Expected no `render_mode` for benchnav/OffRoad-v0, got {render_mode!r}. This "
+        "environment draws nothing. Use benchnav/OffRoad-v1."
     )
 
 

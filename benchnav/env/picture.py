@@ -178,7 +178,7 @@ class Window:
         self._image = panel.imshow(blank)
 
     def show(self, image: np.ndarray) -> None:
-        """Show an image, uint8, shape [480, 640, 3], instead of the last one."""
+        """Show an image, uint8, shape [480, 640, 3], instead of the last image."""
         self._image.set_data(image)
         if self._pyplot.get_backend().lower() != "agg":
             self._figure.show()

@@ -199,7 +199,7 @@ def _to_map(state: Tensor, ahead: Tensor, to_left: Tensor) -> tuple[Tensor, Tens
     Args:
         state: states of the robots, shape [B, …, S].
         ahead: distance ahead of the robot in metres, of a shape that broadcasts to [B, …].
-        to_left: distance to the left of the robot in metres, of such a shape.
+        to_left: distance to the left of the robot in metres, of the same shape.
     """
     x = state[..., 0, None]
     y = state[..., 1, None]

@@ -250,8 +250,8 @@ def _check_workers(jobs: int, backend: str, scheduler: str) -> None:
     check_workers(jobs, backend, scheduler)
     if scheduler and jobs > 1:
         raise ConfigError(
-            f"Expected no `jobs` with `backend` dask, whose cluster has its own "
-            f"workers, got {jobs}. Leave `jobs` out."
+            f"Expected no `jobs` with `backend` dask, got {jobs}. A Dask cluster has "
+            "its own workers. Leave `jobs` out."
         )
 
 
@@ -267,7 +267,7 @@ def _finish(folder: Path) -> int:
 
 
 def _repeats(suite: Suite, planner_limit_s: float, device: str) -> bool:
-    """Return whether all conditions give the same rows twice; print those that do not."""
+    """Return whether each condition gives the same rows twice; print which do not."""
     from benchnav.eval.run.determinism import check_determinism
 
     count, lines = check_determinism(suite, _say, planner_limit_s, device)

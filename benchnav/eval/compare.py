@@ -47,10 +47,10 @@ from benchnav.eval.stats.summary import time_budgets
 from benchnav.eval.words import reading_name
 
 _CAPTION = "Differences between conditions on the same maps with the same draws of λ."
-_MAX_LISTED = 8  # lines of a note
-_MAX_NAMED = 3  # draws or maps in a line
-_MIN_DIFFERENCE = 1e-5  # in success rate; a run has at most 10⁸ episodes
-# For at least _MANY pairs, the time is estimated from that of _TIMED pairs.
+_MAX_LISTED = 8  # maximum number of lines of a note
+_MAX_NAMED = 3  # maximum number of draws or maps in a line
+_MIN_DIFFERENCE = 1e-5  # minimum in success rate; a run has at most 10⁸ episodes
+# For at least _MANY pairs, the time is estimated from the time of _TIMED pairs.
 _MANY = 5_000
 _TIMED = 5
 
@@ -415,7 +415,7 @@ def _relevant_manifest(
 def _unpaired(
     conditions: Sequence[Compared], pairs: Sequence[Pair], by: str
 ) -> list[str]:
-    """Return a line that names the conditions without a pair; empty if all have one."""
+    """Return a line that names conditions without a pair; empty if all are paired."""
     paired = {condition for pair in pairs for condition in pair.members}
     unpaired = [condition for condition in conditions if condition not in paired]
     varying = []

@@ -80,8 +80,9 @@ def find_episodes(
         maps[f"{unit.condition.data} {unit.condition.scenario}"] = None
     if len(maps) > 1:
         raise ConfigError(
-            "Expected conditions on the same map, which can be shown together, got "
-            f"{', '.join(maps)}. Select one dataset and one scenario."
+            f"Expected conditions on the same map, got {', '.join(maps)}. Only "
+            "episodes on the same map can be shown together. Select one dataset and "
+            "one scenario."
         )
     return episodes
 

@@ -175,7 +175,7 @@ def _cut(values: Any, sizes: np.ndarray) -> list[Any]:
 def pack_known(known_maps: Sequence[KnownMap]) -> dict[str, np.ndarray]:
     """Pack known maps into few arrays, which `unpack_known` reads.
 
-    Each map is stored as its difference from the previous one, which compresses well:
+    Each map is stored as its difference from the previous map, which compresses well:
     most cells do not change.
 
     Returns:

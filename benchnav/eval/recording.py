@@ -195,7 +195,7 @@ class Recording(RecordedMap):
 
     @property
     def now(self) -> int:
-        """The step that figures show: that of `plan`; the last step without a plan."""
+        """The step that figures show: the step of `plan`, else the last step."""
         last = len(self.traversability)
         return min(self.plan.step, last) if self.own_plans else last
 

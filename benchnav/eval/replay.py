@@ -69,8 +69,9 @@ def replay(
     worlds = dict.fromkeys(unit.condition.labels["world"] for unit, _ in episodes)
     if len({repr(unit.condition.world) for unit, _ in episodes}) > 1:
         raise ConfigError(
-            "Expected conditions with the same world, since the viewer shows one map, "
-            f"got {', '.join(worlds)}. Pass --video FILE.mp4 to show them side by side."
+            f"Expected conditions with the same world, got {', '.join(worlds)}. The "
+            "viewer shows one map. Pass --video FILE.mp4 to show the worlds side by "
+            "side."
         )
     path = _viewer_file(run, episodes, out_folder)
     print(f"recording: {path}")

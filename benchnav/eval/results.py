@@ -254,7 +254,7 @@ class Plots:
         if not variants:
             raise ConfigError(
                 f"Expected a run with the data that figure {figure.name!r} needs, got "
-                f"{self._results.folder}, which lacks them."
+                f"{self._results.folder} without these data."
             )
         return self._draw_all(variants)
 

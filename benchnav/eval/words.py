@@ -17,7 +17,7 @@ _FAILURES = [outcome.name.lower() for outcome in FAILURES]
 FAILURE_COUNTS = {f"{name}_count": name.replace("_", " ") for name in _FAILURES}
 # Functions from a stored label to the label as papers write it, by column.
 _NAME_OF_LABEL = {"planner": planner_name, "risk": risk_name}
-NOT_YET = "not yet a test"  # in place of p-values while the run is not finished
+NOT_YET = "not yet a test"  # instead of p-values while the run is not finished
 # Columns whose labels distinguish conditions on one map.
 NAMING = ("planner", "risk", "model", *KNOWLEDGE, "robot", "objective", "world")
 
@@ -39,12 +39,12 @@ def reading_name(column: str, label: str) -> str:
 
 
 def reading_names(labels: str) -> str:
-    """Return comma-separated labels, as in a hypothesis, as papers write them."""
+    """Rewrite the comma-separated labels of a hypothesis as papers write them."""
     return ", ".join(planner_name(risk_name(label)) for label in labels.split(", "))
 
 
 def naming_labels(summary: pd.DataFrame) -> list[str]:
-    """Return the columns that differ and name a condition next to planner and risk."""
+    """Return the columns that name a condition in addition to planner and risk."""
     return [name for name in ("model", *KNOWLEDGE) if differ(summary[name])]
 
 

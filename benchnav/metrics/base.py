@@ -48,9 +48,10 @@ class Episode:
         states: states of the robot from the start to the end, shape [N + 1, S].
         actions: commanded action of each step, shape [N, A].
         action_names: names of the A action dimensions, such as `speed_mps`.
-        speed_mps: speed at each action on terrain with λ = 1, in m/s, shape [N].
-        turn_rate_radps: turn rate at each action on terrain with λ = 1, in rad/s, shape
-            [N].
+        speed_mps: speed that each action would give on terrain with λ = 1, in m/s,
+            shape [N].
+        turn_rate_radps: turn rate that each action would give on terrain with λ = 1, in
+            rad/s, shape [N].
         traversability: observed λ of each step, in [0, 1], shape [N].
         outcome: name of the outcome, such as `success` or `immobilised`.
         dt_s: time step in seconds.

@@ -4,7 +4,7 @@ from benchnav.metrics.base import Recorded
 
 
 class RejectedDraws(Recorded):
-    """Number of λ fields that were rejected before that of the episode was drawn."""
+    """Number of λ fields that were rejected before the episode's field was drawn."""
 
     name = column = "rejected_draws"
     meaning = (

@@ -118,8 +118,9 @@ def layers_of(observation: Observation, names: Collection[str]) -> dict[str, Ten
     missing = [name for name in names if name not in layers]
     expect(
         not missing,
-        f"maps with the layers {' and '.join(missing)}, on which the model was trained, "
-        f"got maps with {', '.join(layers)}. Use a dataset with all these layers.",
+        f"maps with the layers {' and '.join(missing)}, got maps with "
+        f"{', '.join(layers)}. The model was trained on the missing layers. Use a "
+        "dataset that has them.",
     )
     return {name: layers[name] for name in names}
 

@@ -165,7 +165,7 @@ def digests_of(folder: Path) -> dict[str, str]:
 
 
 def member_names(checkpoint: Checkpoint, stem: str) -> list[str]:
-    """Return the names of the members that exist; if none exists, the first's name."""
+    """Return the names of existing members; without any, the first member's name."""
     names = [member_name(index, stem) for index in range(len(checkpoint.parts))]
     return [name for name in names if name in checkpoint.parts] or [stem]
 

@@ -42,8 +42,8 @@ def find_checkpoint(source: str | Path) -> Path:
         return hub.download(str(source), "model", CheckpointError)
     if str(source) == _ONLY_IN_REPOSITORY:
         raise ConfigError(
-            f"Expected the checkpoint {source} in checkpoints/, which the wheel leaves "
-            f"out for its size, got no such folder. Copy checkpoints/{source} from the "
+            f"Expected the checkpoint {source} in checkpoints/, got no such folder. "
+            f"The wheel leaves it out for its size. Copy checkpoints/{source} from the "
             "repository to checkpoints/, or use another model, such as stakes-v1."
         )
     names = [folder.name for folder in list_checkpoints()]

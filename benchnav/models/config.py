@@ -31,7 +31,7 @@ class TrainOptions:
         crop: Side in cells of the square cut from each training map, at a new random
             position each epoch; 0 for whole maps.
         resume: Resume an interrupted training from its finished parts and epochs.
-        overwrite: Replace an existing checkpoint in `out`, or those of its parts that are
+        overwrite: Replace an existing checkpoint in `out`, or its parts that are
             trained again.
         conformal: Recalibrate the model on every second map of valid; early stopping and
             temperature then use only the other maps. The lower quantiles then have

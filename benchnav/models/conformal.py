@@ -41,7 +41,7 @@ from benchnav.core.quantiles import LEVELS, QuantileDistribution, quantiles_at
 from benchnav.core.terrain import Observation
 from benchnav.models.base import TraversabilityModel
 
-_ROUNDING = 1e-9  # of sums of weights
+_ROUNDING = 1e-9  # tolerance of sums of weights
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,9 +78,9 @@ class ConformalTable:
         ascends = all(low <= high for low, high in pairwise((0.0, *values, 1.0)))
         if len(levels) != len(values) or not ascends:
             raise CheckpointError(
-                "Expected the table `conformal` of the checkpoint to have one value per "
-                "level, in [0, 1] and never descending, got one that does not. Train "
-                "the model again."
+                "Expected the table `conformal` of the checkpoint to have one value in "
+                "[0, 1] per level, without a descent, got other values. Train the "
+                "model again."
             )
         return table
 
@@ -123,7 +123,7 @@ def fit_table(
 def recalibrated(
     distribution: TraversabilityDistribution, table: ConformalTable
 ) -> QuantileDistribution:
-    """Return the distribution whose u-quantile is the t(u)-quantile of another.
+    """Return the distribution whose u-quantile is the t(u)-quantile of a prediction.
 
     Args:
         distribution: prediction of a model, shape [*B, H, W].

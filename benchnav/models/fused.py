@@ -78,25 +78,25 @@ class FusedModel(ModelFamily):
     def fuse_at(
         self, member_probabilities: Tensor, slope_deg: Tensor
     ) -> TraversabilityMixture:
-        """Return the prediction as `fuse` does, from slopes in degrees, [B, H, W]."""
+        """Like `fuse`, but take slopes in degrees, [B, H, W], not an observation."""
         mean_probability = member_probabilities.sum(0) / len(self.classifiers)
         weights = sharpen(mean_probability, self.pool_temperature)
         means, stds = self.table.lookup(slope_deg.float())
         group = tuple(range(len(self.class_names)))
         if self.table.soft:
-            owners = list(self.soft_class_ids)
+            soft_ids = list(self.soft_class_ids)
             group += self.soft_class_ids
             weight, mean, std = (v.to(weights).view(-1, 1, 1) for v in self.table.soft)
-            soft_weights = (weights * weight)[:, owners]
-            soft_means = mean.expand_as(weights)[:, owners]
-            soft_stds = std.expand_as(weights)[:, owners]
+            soft_weights = (weights * weight)[:, soft_ids]
+            soft_means = mean.expand_as(weights)[:, soft_ids]
+            soft_stds = std.expand_as(weights)[:, soft_ids]
             weights = torch.cat([weights * (1 - weight), soft_weights], 1)
             means = torch.cat([means, soft_means], 1)
             stds = torch.cat([stds, soft_stds], 1)
         return TraversabilityMixture(weights, means, stds, group)
 
     def member_probabilities(self, observation: Observation) -> Tensor:
-        """Return class probabilities of each member, without the pool temperature.
+        """Return class probabilities of each member, before the temperature is applied.
 
         Args:
             observation: B maps of any size.

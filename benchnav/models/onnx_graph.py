@@ -141,13 +141,13 @@ def export_onnx(
         import onnxscript  # noqa: F401  torch.onnx needs it
     except ImportError as error:
         raise ConfigError(
-            "Expected the packages of the extra `onnx`, got none. Install them: pip "
-            "install 'benchnav[onnx]'."
+            "Expected the packages of the extra `onnx` to be installed, got none. Run: "
+            "pip install 'benchnav[onnx]'."
         ) from error
     newest = onnx.defs.onnx_opset_version()
     expect(
         18 <= opset <= newest,
-        f"`opset` in 18–{newest}, the versions that torch.onnx writes, got {opset}.",
+        f"`opset` from 18 to {newest}, which torch.onnx can write, got {opset}.",
     )
     graph = Graph(model, level)
     layers = _check_graph(graph, model)
@@ -230,6 +230,8 @@ def _check_graph(graph: Graph, model: TraversabilityModel) -> list[Tensor]:
     expect(
         error < _TOLERANCE,
         "a model whose `predict` uses only its network and `to_distribution`, got "
-        f"{type(model).__name__}, whose graph has an error of {error:.2g}.",
+        f"{type(model).__name__}, whose exported graph differs from `predict` by up to "
+        f"{error:.2g}. Move all other computation into the network or "
+        "`to_distribution`.",
     )
     return layers

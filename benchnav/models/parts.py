@@ -12,12 +12,12 @@ GP = "gp"
 
 
 def member_name(index: int, stem: str) -> str:
-    """Return the part name of a member, counted from 0; that of the first is `stem`."""
+    """Return the part name of the member with an index from 0; the first is `stem`."""
     return f"{stem}-{index + 1}" if index else stem
 
 
 def is_member(name: str, stem: str) -> bool:
-    """Return whether a part name is that of a member with this stem."""
+    """Return whether a part name belongs to a member with this stem."""
     number = name.removeprefix(f"{stem}-")
     return name == stem or (number != name and number.isdigit())
 

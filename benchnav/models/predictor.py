@@ -273,8 +273,8 @@ def _checked_checkpoint(part: ModelPart, folder: Path, family: Found) -> Checkpo
     if class_and_checkpoint and not is_family(family.target):
         raise ConfigError(
             f"Expected {class_and_checkpoint[0]} to be a subclass of "
-            "benchnav.models.TrainableModel or ModelFamily, since only these have "
-            "checkpoints, got another class or a function."
+            "benchnav.models.TrainableModel or ModelFamily, got another class or a "
+            "function. Only such subclasses have checkpoints."
         )
     checkpoint = load_checkpoint(folder)
     if class_and_checkpoint:

@@ -116,8 +116,8 @@ def write_risk_maps(
     paths = {name: Path(folder) / f"{name.replace(':', '-')}.npy" for name in measures}
     expect(
         len(set(paths.values())) == len(paths),
-        f"`measures` with different file names, got {list(measures)}, in which `:` "
-        "becomes `-`. Rename one of them.",
+        f"`measures` with different file names, got {list(measures)}. In file names, "
+        "`:` becomes `-`. Rename one of the measures.",
     )
     tiles = predict_tiles(model, observation, tile, margin)
     shape = (len(observation.rgb), *observation.grid.shape)
@@ -180,8 +180,9 @@ def measure_margin(model: TraversabilityModel, observation: Observation) -> int:
     raise ConfigError(
         "Expected a model whose receptive field extends at most "
         f"{_PROBES[-1] - 2 * _STRIDE} cells around a cell and that pools by at most "
-        f"{_STRIDE}, got {type(model).__name__}, whose predictions of tiles differ from "
-        "that of the whole map. Predict the whole map at once, or give `margin`."
+        f"{_STRIDE}, got {type(model).__name__}, whose predictions of tiles differ "
+        "from the prediction of the whole map. Predict the whole map at once, or give "
+        "`margin`."
     )
 
 

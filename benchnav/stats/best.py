@@ -62,8 +62,9 @@ def best_set_p(
         Two float64 arrays by condition, each of shape [K]. The first is p, corrected
         for the number of conditions. It is 1 for the best condition, and for all
         conditions if there are fewer than `FEWEST_MAPS` maps. The second is the minimum
-        detectable difference to the condition with the most successes, with 80 % power
-        at the level of the first step; infinite if no result would be significant.
+        detectable difference from the condition with the most successes, with 80 %
+        power at the level of the first step; infinite if no result would be
+        significant.
     """
     n_maps, n_conditions = wins.shape
     if n_maps < FEWEST_MAPS or n_conditions < 2:

@@ -21,13 +21,17 @@ _MAX_EXACT_MAPS = 13
 # Number of random assignments for a larger number of maps.
 _N_RANDOM = 9_999
 # Tolerance relative to the largest difference. If the difference of an assignment is
-# within it of the observed difference, the two are tied, and the assignment counts.
+# within the tolerance of the observed difference, the two are tied, and the assignment
+# counts.
 _ROUNDING = 1e-9
 
 
 @lru_cache(maxsize=2)
 def _signs(maps: int) -> np.ndarray:
-    """Return signs ±1 of all assignments or, for many maps, of random ones, [R, M]."""
+    """Return signs ±1 of all assignments; of random assignments if maps are many.
+
+    The shape is [R, M].
+    """
     if maps <= _MAX_EXACT_MAPS:
         assignments = np.arange(2**maps)[:, None]
         bits = assignments >> np.arange(maps) & 1
@@ -45,7 +49,7 @@ def exchange_p(
 ) -> float:
     """Return the p-value of H₀: a function of sums over maps does not differ.
 
-    p is the fraction of assignments whose difference is at least the observed one.
+    p is the fraction of assignments whose difference is at least the observed value.
 
     Args:
         first: parts of the first contestant by map, shape [M, P].
@@ -148,8 +152,8 @@ def signed_rank_p(differences: np.ndarray) -> float:
     for each assignment of signs.
 
     Args:
-        differences: difference on each map, where tied values must be exactly equal, as
-            those from `by_map.sums_by_map` are, shape [M].
+        differences: difference on each map, where tied values must be exactly equal,
+            such as differences from `by_map.sums_by_map`, shape [M].
     """
     differing = differences[differences != 0]
     if len(differing) > _MAX_EXACT_MAPS:

@@ -205,9 +205,9 @@ def total_time_interval(
 
     Args:
         time_s: mean T_total of each map in seconds, where a failure counts as T; or
-            the difference of two conditions in it; shape [..., M].
-        failed: failure rate of each map, or the difference of two conditions in it,
-            shape [..., M].
+            the difference of two conditions in this mean; shape [..., M].
+        failed: failure rate of each map, or the difference of two conditions in this
+            rate, shape [..., M].
         failed_interval: lower and upper end of an interval of the mean of `failed`,
             each of shape [...].
         penalty_s: additional time of a failure compared with a success, in seconds,

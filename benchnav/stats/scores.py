@@ -41,8 +41,8 @@ class Score:
             shape [...].
         better: better direction; empty if no direction is better.
         target: ideal value of the score. Contestants are then compared by the distance
-            of their scores to it, and a lower distance is better. If None, they are
-            compared by the scores themselves.
+            of their scores to this value, and a lower distance is better. If None, they
+            are compared by the scores themselves.
         heading: heading of the score's column in tables, in two lines.
         meaning: definition of the column's values.
     """
@@ -223,10 +223,10 @@ def against_best(
 
     Returns:
         One row per contestant and score: `measure`, the score's name; `best`, the best
-        contestant; `difference` to the best contestant, with `low`, `high` and `p_holm`
-        as in `compare_pairs`, all NaN in the row of the best contestant; `alike`, true
-        if the contestant is not significantly worse; and `marked`, true if it is
-        `alike` and another contestant is not.
+        contestant; `difference` from the best contestant, with `low`, `high` and
+        `p_holm` as in `compare_pairs`, all NaN in the row of the best contestant;
+        `alike`, true if the contestant is not significantly worse; and `marked`, true
+        if it is `alike` and another contestant is not.
     """
     swapped = pairs.assign(
         one=pairs["other"],

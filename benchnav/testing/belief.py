@@ -349,7 +349,7 @@ class _BeliefCheck:
         got: Any = type(selected).__name__
         if isinstance(selected, TraversabilityDistribution):
             got = list(selected.shape)
-        breach = f"Expected a distribution of shape {shape} from `at`, got {got}."
+        breach = f"Expected `at` to return a distribution of shape {shape}, got {got}."
         if not self.expect(got == shape, breach):
             return
         belief = self.belief.distribution(state)
@@ -387,13 +387,13 @@ class _BeliefCheck:
                 return
             self.expect(
                 self.are_equal(separate, last, self.tolerance, members),
-                "Expected the same results for single episodes and in another order as "
-                "in the batch, got different results.",
+                "Expected results of an episode that do not depend on the other "
+                "episodes of the batch or on their order, got different results.",
             )
             self.expect(
                 self.are_equal(selected, last, self.tolerance, members),
-                "Expected the same beliefs for episodes that `select` returns as in the "
-                "batch, got different beliefs.",
+                "Expected `select` to return episodes with unchanged beliefs, got "
+                "different beliefs.",
             )
 
     def try_put(self, state: Any) -> None:

@@ -1,4 +1,4 @@
-"""The check of the functions of a distribution of traversability.
+"""The check of the functions of a traversability distribution.
 
 Letters in shapes: B maps, H×W cells.
 """

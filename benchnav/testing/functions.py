@@ -224,8 +224,8 @@ def check_risk(
     - λ̂ is in [0, 1], of shape [B, H, W], floating-point, and on the distribution's
       device;
     - λ̂ is the same when repeated, and for a single map as in a batch;
-    - λ̂ is the same for selected cells as on the map, since a robot that learns updates
-      only the cells whose belief changed;
+    - λ̂ of selected cells equals λ̂ of the same cells in the whole map, since a robot
+      that learns updates only the cells whose belief changed;
     - the distribution and the global generators are unchanged.
 
     A measure that requires a mixture, or classes, rejects other distributions with a
@@ -284,7 +284,8 @@ def _try_measure(
     is_same = selected_map is NOTHING or same(selected_map, expected, tolerance)
     breaches.expect(
         is_same,
-        "Expected the same λ̂ for selected cells as on the map, got a different λ̂.",
+        "Expected λ̂ of selected cells to equal λ̂ of the same cells in the whole map, "
+        "got a different λ̂.",
     )
 
 

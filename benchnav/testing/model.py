@@ -201,7 +201,7 @@ def _fit_names(n_names: int, predicted: TraversabilityDistribution) -> str:
         )
     if group is not None and n_names <= max(group):
         return (
-            f"Expected classes in `group` below {n_names}, the number of "
+            f"Expected classes in `group` below {n_names}, which is the number of "
             f"`class_names`, got {max(group)}."
         )
     return ""
@@ -230,7 +230,8 @@ def _check_classes(
         return
     expect(
         n_names > 0,
-        "Expected `class_names`, since `member_probabilities` is not None, got no names.",
+        "Expected `class_names` with `member_probabilities`, got no names. Name the "
+        "classes, or return None from `member_probabilities`.",
     )
     if n_names:
         weights = predicted.class_probabilities(n_names)

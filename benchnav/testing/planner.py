@@ -128,8 +128,9 @@ def check_planner(
             _PlannerCheck(new_planner, problem, tolerance, breaches).check_uses()
     breaches.expect(
         n_robots > 0,
-        "Expected the planner to steer one of the tried robots, got no such robot. Pass "
-        "a robot that `steers` and `robots` of the planner include.",
+        "Expected the planner to steer at least one of the tried robots, got a planner "
+        "that steers none. Pass a robot that the attributes `steers` and `robots` of "
+        "the planner include.",
     )
     breaches.raise_any()
 
@@ -198,8 +199,8 @@ class _PlannerCheck:
             selected = self.breaches.watch("select", select, plan_state=second_state)
         if selected is not NotImplemented:
             breach = (
-                "Expected the same actions for episodes that `select` returns as in "
-                "the batch, got different actions."
+                "Expected `select` to leave the actions of the selected episodes "
+                "unchanged, got different actions."
             )
             self.expect_action(breach, planned[1], selected, problem, last_two_episodes)
         different = invert_prediction(problem.select(last_two_episodes))
@@ -220,7 +221,10 @@ class _PlannerCheck:
             return
         are_inputs = isinstance(used, frozenset) and used <= INPUTS
         listed = ", ".join(sorted(INPUTS))
-        breach = f"Expected `uses` to return a frozenset of {listed}, got {used!r}."
+        breach = (
+            f"Expected `uses` to return a frozenset of names from ({listed}), got "
+            f"{used!r}."
+        )
         if not expect(are_inputs, breach):
             return
         is_consistent = not self.planner.blind or not used
@@ -231,8 +235,8 @@ class _PlannerCheck:
         for name in sorted(INPUTS - used):
             changed = change_input(problem, name)
             breach = (
-                f"Expected the same action for any value of `{name}`, which is not in "
-                "`uses`, got a different action."
+                f"Expected the same action for any value of `{name}`, got a different "
+                f"action. Add {name!r} to `uses`, or do not read it."
             )
             step = first_step(problem)
             plan_state = self.begin(problem)

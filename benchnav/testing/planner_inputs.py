@@ -33,12 +33,13 @@ def change_input(problem: Problem, name: str) -> Problem:
         name: name of the input, one of `INPUTS`.
     """
     mixture = problem.distribution
-    assert isinstance(mixture, TraversabilityMixture)  # as `create_problem` sets
+    # `create_problem` always sets a mixture.
+    assert isinstance(mixture, TraversabilityMixture)
     inverted = replace(mixture, means=1 - mixture.means)
     others: dict[str, Any] = {
         "risk_map": 1 - problem.risk_map,
         "distribution": inverted,
-        "fields": _fields_of(inverted, problem.grid),
+        "fields": _samples_of(inverted, problem.grid),
     }
     is_source = problem.task.rules.free_space.source == name
     free = problem.free ^ is_source
@@ -121,12 +122,12 @@ def create_problem(
     corner = means.new_tensor(grid.extent_m)
     margin = means.new_tensor([1.7, 1.4])
     goal = (corner - margin).repeat(4, 1)
-    fields = _fields_of(mixture, grid)
+    fields = _samples_of(mixture, grid)
     prediction = Prediction(observation, mixture, traversability, fields=fields)
     return pose_problem(task, prediction, start, goal, 60.0)
 
 
-def _fields_of(mixture: TraversabilityMixture, grid: Grid) -> Fields:
+def _samples_of(mixture: TraversabilityMixture, grid: Grid) -> Fields:
     """Return a source of joint samples of λ, with a correlation length of 1 m."""
     covariance = CovarianceModel(grid=grid, correlation_m=1.0)
     belief = Static()

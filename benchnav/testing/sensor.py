@@ -137,8 +137,9 @@ class _SensorCheck:
             expected = tuple(values[members] for values in reported)
             self.breaches.expect(
                 self.is_alike(selected_measurement, expected, self.tolerance),
-                "Expected the same results for single episodes and in another order as "
-                "in the batch, got different results. Draw noise by `NoiseKey.normal`.",
+                "Expected results of an episode that do not depend on the other "
+                "episodes of the batch or on their order, got different results. Draw "
+                "noise with `NoiseKey.normal`.",
             )
         if not is_same:
             return  # all further comparisons would fail
@@ -161,12 +162,12 @@ class _SensorCheck:
         self.breaches.expect(
             by_step or not by_key,
             "Expected different noise in different steps, got the same noise. Draw it "
-            "by `NoiseKey.normal`.",
+            "with `NoiseKey.normal`.",
         )
         self.breaches.expect(
             by_key or not by_step,
-            "Expected different noise for different keys of an episode, got noise that "
-            "differs only between steps. Draw it by `NoiseKey.normal`.",
+            "Expected different noise in different episodes, got noise that differs "
+            "only between steps. Draw it with `NoiseKey.normal`.",
         )
 
     def sense(

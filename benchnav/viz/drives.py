@@ -198,9 +198,9 @@ def mark_ends(
 
 
 def _spread(positions: np.ndarray, spacing_m: float) -> np.ndarray:
-    """Return positions, shape [N, 2], where those closer than a spacing are moved apart.
+    """Return positions, shape [N, 2], after moving close positions apart.
 
-    Each group of close positions is arranged on a circle.
+    Each group of positions closer than the spacing is arranged on a circle.
     """
     distances = np.linalg.norm(positions[:, None] - positions, axis=-1)
     _, labels = connected_components(distances < spacing_m)

@@ -37,7 +37,7 @@ class Figure(Specified, ABC):
 
     def variants(self, data: Any) -> Sequence[Self]:
         """Return the figures to draw, with distinct names; by default, only this one."""
-        return [self] if self.needs(data) else []
+        return [self] if self.is_available(data) else []
 
     def variant(self, **changes: Any) -> Self:
         """Return a copy with changed attributes, such as `name`."""
@@ -57,7 +57,7 @@ class Figure(Specified, ABC):
             for index in range(count)
         ]
 
-    def needs(self, data: Any) -> bool:
+    def is_available(self, data: Any) -> bool:
         """Return whether the data contain what the figure shows."""
         return True
 

@@ -212,7 +212,7 @@ def draw_baseline(
         panel: panel to draw on.
         value: reference value, such as that of a calibrated model.
         label: text of the legend entry.
-        horizontal: whether the value is one of y instead of x.
+        horizontal: whether the value belongs to y instead of x.
     """
     draw_line = panel.axhline if horizontal else panel.axvline
     draw_line(value, color="0.4", lw=0.8, ls="--", zorder=1, label=label)

@@ -35,7 +35,7 @@ def distributions(
     table: SlopeTable, terrain: Terrain
 ) -> tuple[TraversabilityMixture, TraversabilityMixture]:
     """Return the predicted and the true distributions of λ, given the true classes."""
-    predicted = table.own(terrain.class_id, terrain.slope_deg.double())
+    predicted = table.predict_by_class(terrain.class_id, terrain.slope_deg.double())
     truth = [
         v.double()
         for v in (terrain.truth.weights, terrain.truth.means, terrain.truth.stds)
@@ -110,7 +110,7 @@ def prior_error(
     mean = torch.from_numpy(latent_mean(ids.numpy(), slopes.numpy(), classes))[None]
     std = torch.from_numpy(latent_std(ids.numpy(), classes))[None]
     true = TraversabilityMixture(torch.ones_like(mean), mean, std)
-    gap = table.own(ids[None], slopes[None]).mean() - true.mean()
+    gap = table.predict_by_class(ids[None], slopes[None]).mean() - true.mean()
     return f"{gap.square().mean().sqrt():.4f} ({gap.mean():+.4f})"
 
 

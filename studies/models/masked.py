@@ -21,7 +21,7 @@ from benchnav.models import TraversabilityModel, load_model
 from benchnav.models.base import predict_observation
 from benchnav.models.config import Masking
 from benchnav.models.predictor import find_ground_statistics
-from benchnav.models.quality.scores import lower_fifth_and_width
+from benchnav.models.quality.scores import pinball_loss_and_width
 from benchnav.models.training.map_order import draw_visibility
 from benchnav.models.training.masks import RandomMasks
 from studies.study import Rows, Work
@@ -105,7 +105,7 @@ def measure(
         scores = (
             -predicted.log_prob(true),
             predicted.crps(true),
-            lower_fifth_and_width(predicted, true)[0],
+            pinball_loss_and_width(predicted, true)[0],
             is_class_right,
         )
         sums = [

@@ -7,7 +7,7 @@ Planners are given the λ fields (`clairvoyant`), drawn without rejection on map
    both find a path.
 2. The added time if entering immobilising terrain counts as failure (`levels: 0`).
 3. The times of other planners on the same fields, which immobilise no robot. The last
-   column counts planners that beat the optimal one by more than the difference to twice
+   column counts planners that beat the optimal one by more than the difference from twice
    the resolution on that map.
 """
 
@@ -68,7 +68,7 @@ def more_time(times: np.ndarray, base: np.ndarray) -> np.ndarray:
 
 
 def grid_table(problem: Problem) -> tuple[Rows, list[tuple[np.ndarray, np.ndarray]]]:
-    """Return differences to twice the resolution, and the times at both resolutions.
+    """Return differences from twice the resolution, and the times at both resolutions.
 
     There is one pair of times per row, each of shape [B].
     """

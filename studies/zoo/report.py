@@ -220,7 +220,7 @@ def draw_doses(table: pd.DataFrame) -> Figure:
 def quality(table: pd.DataFrame, against: str = "") -> pd.DataFrame:
     """Return means over seeds with the half width of their t interval.
 
-    With `against`, they are of the differences to that method.
+    With `against`, they are of the differences from that method.
     """
     shown = [name for name in SHOWN if name in table and table[name].notna().any()]
     wide = table.set_index(["split", "method", "seed"])[shown]

@@ -17,7 +17,7 @@ from benchnav.core.errors import expect
 from benchnav.core.store import write_text
 from benchnav.datagen import TerrainDataset
 from benchnav.models import load_model, predict
-from benchnav.models.quality.scores import lower_fifth_and_width
+from benchnav.models.quality.scores import pinball_loss_and_width
 from studies import runs
 from studies.runs import command
 from studies.study import Work
@@ -133,7 +133,7 @@ def measure(
             terrain = dataset.terrain(
                 SPLIT, [index for index in indices if index < maps]
             )
-            loss, _ = lower_fifth_and_width(
+            loss, _ = pinball_loss_and_width(
                 predict(model, terrain), terrain.traversability
             )
             losses += loss.mean((1, 2)).tolist()

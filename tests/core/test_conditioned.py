@@ -180,7 +180,7 @@ def test_in_float32_a_tail_of_the_base_may_become_the_middle() -> None:
 def test_scores_of_another_shape_are_refused() -> None:
     base, mean = mixture(3, 0.1, 0.3), torch.zeros(SHAPE)
     for wrong in ((mean[:1], mean), (mean, mean[..., 1:])):
-        with pytest.raises(ConfigError, match=r"of the shape of `base`, \[2, 5, 7\]"):
+        with pytest.raises(ConfigError, match=r"of the shape of `base` .\[2, 5, 7\]"):
             ConditionedDistribution(base, *wrong)
 
 

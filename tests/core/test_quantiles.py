@@ -173,7 +173,7 @@ SPACED = tuple(np.linspace(0, 1, 80).tolist())
         ((math.nan, *LEVELS), "ascend from 0 to 1"),
         (
             SPACED,
-            "at most 0.01 apart up to 0.1, the tail that risk depends on, got a step of 0.0127",
+            "at most 0.01 apart in the tail up to 0.1, got a step of 0.0127",
         ),
     ],
 )

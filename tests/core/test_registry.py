@@ -529,7 +529,7 @@ def test_what_a_part_says_of_its_options_is_told_in_one_line(file: str) -> None:
         ("cvar:", "got ''"),
         (
             "mean:0.5",
-            "Expected risk 'mean' without a value, since it has no options, got 'mean:0.5'",
+            "Expected risk 'mean' without a value, got 'mean:0.5'. This risk has no",
         ),
         ("cvarr:0.5", "Did you mean 'cvar'?"),
         ("cvarr:half", "Did you mean 'cvar'?"),

@@ -253,7 +253,7 @@ def test_a_folder_that_holds_the_working_folder_is_refused(
     asked = Part(
         part=f"{part}:Planner", label="", kind="planner", options={"weights": folder}
     )
-    assert f"contains the working folder, got {folder!r}" in refusal(
+    assert f"a folder around the working folder, got {folder!r}" in refusal(
         lambda: option_files(asked)
     )
 

@@ -268,7 +268,7 @@ def test_an_episode_is_replayed_on_the_device_of_its_run(
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(
         ConfigError,
-        match="a GPU that PyTorch can use, since this run was computed on one",
+        match="a GPU that PyTorch can use, got none",
     ):
         recordings.find_recording(tmp_path / "run", unit, 0)
     with elsewhere() as device:

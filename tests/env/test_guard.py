@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import warnings
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -51,10 +50,10 @@ import gymnasium, numpy as np, torch
 import benchnav
 
 chosen = dict(data="stakes-v1", split="test/std", world="stakes", model="oracle")
-for threads in (1, 4):
+for threads, contexts in ((1, ("fork",)), (4, ("fork", "spawn", "forkserver"))):
     torch.set_num_threads(threads)
     torch.ones(2**22).exp().sum()
-    for context in ("fork", "spawn", "forkserver"):
+    for context in contexts:
         envs = gymnasium.make_vec(
             "benchnav/OffRoad-v1", 1, "async", vector_kwargs={"context": context}, **chosen
         )
@@ -99,10 +98,7 @@ def test_asynchronous_vectors_step_whatever_threads_ran_before_their_workers_sta
     None
 ):
     out, errors = output_of(WORKERS)
-    matrix = [
-        f"{context} {threads}"
-        for threads, context in product((1, 4), ("fork", "spawn", "forkserver"))
-    ]
+    matrix = ["fork 1", "fork 4", "spawn 4", "forkserver 4"]
     # One thread in a worker, also for an environment that its parent made; the parent
     # keeps its own.
     assert out.splitlines() == [*matrix, "1", "1", "4"], errors
@@ -287,7 +283,9 @@ def test_names_of_options_are_those_of_the_environment(
 @pytest.mark.parametrize("mode", ["rgb_array", "human"])
 def test_version_0_says_which_version_draws(dataset_path: Path, mode: str) -> None:
     for build in (make, make_vector):
-        with pytest.raises(ConfigError, match=f"got '{mode}'. Use benchnav/OffRoad-v1"):
+        with pytest.raises(
+            ConfigError, match=f"got '{mode}'.* Use benchnav/OffRoad-v1"
+        ):
             build(V0, dataset_path, render_mode=mode)
 
 

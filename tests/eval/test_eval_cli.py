@@ -37,6 +37,8 @@ def test_run_report_and_replay(
     assert call("eval", "report", str(out)) == 0
     assert call("eval", "replay", str(out), "--view", "false") == 0
     assert ".rrd" in capsys.readouterr().out
+    # A report takes longer than a run.
+    monkeypatch.setattr(eval_cli, "_finish", eval_cli._failed)
     # The same command again finds all done; with another seed it extends the run.
     again = ("run", "--data", str(dataset_path), "--out", str(out), *SMALL)
     assert call("eval", *again) == 0
@@ -44,8 +46,6 @@ def test_run_report_and_replay(
     assert call("eval", *again, "--seed", "1") == 0
     assert f"{out} is extended by more episodes" in capsys.readouterr().err
     # A suite that cannot be run drops nothing.
-    # a report takes longer than a run
-    monkeypatch.setattr(eval_cli, "_finish", eval_cli._failed)
     assert call("eval", *again, "--overwrite", "true", "--maps", "99") == 2
     assert (out / "episodes.parquet").exists()
     assert call("eval", *again, "--overwrite") == 0

@@ -93,7 +93,7 @@ def test_a_figure_whose_needs_are_not_met_is_named(program: Results) -> None:
     class Nothing(Figure):
         name = "nothing"
 
-        def needs(self, data: Any) -> bool:
+        def is_available(self, data: Any) -> bool:
             return False
 
         def draw(self, data: Any) -> Any:
@@ -122,7 +122,7 @@ def test_a_metric_of_one_process_is_marked_and_not_resumed(
     results = evaluate(**given, folder=tmp_path / "run")
     assert (results.episodes["steps"] > 0).all()
     assert any("not reproducible: metric steps" in line for line in results.notes)
-    with pytest.raises(ConfigError, match="metric steps was an object of one process"):
+    with pytest.raises(ConfigError, match="metric steps was a Python object"):
         evaluate(**given, folder=tmp_path / "run")
     with pytest.raises(ConfigError, match="which exists only in this process"):
         evaluate(**given, jobs=2)

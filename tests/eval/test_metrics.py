@@ -325,7 +325,7 @@ def own_metric(folder: Path, value: str, **attributes: str) -> str:
     [
         (
             ("score",),
-            "other than the built-in ones, which every run has, got 'score'. Leave it out",
+            "other than the built-in ones, got 'score'. Every run has",
         ),
         (("enrgy",), "Did you mean 'energy'"),
         (("energy", "energy:5"), "that differ in name and column"),

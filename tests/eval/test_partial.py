@@ -197,7 +197,7 @@ def test_a_run_that_was_read_goes_on_as_if_nobody_had(
     folder = tmp_path / "run"
     steps = run_suite(suite, folder)
     for step in steps:
-        if 0 < step.done < step.total:
+        if step.done in (1, step.total - 1):
             write_report(folder, partial=True)
     results = [pd.read_parquet(place / EPISODES) for place in (folder, whole)]
     same = [
@@ -239,7 +239,7 @@ def test_episodes_of_finished_units_are_replayed_while_the_run_goes_on(
     assert not (running / "playback").exists()
     lacking = next(risk for risk, one in known.items() if one is None)
     ((unit, member),) = find_episodes(running, {"risk": [lacking]}, 1, 0, 1)
-    with pytest.raises(ConfigError, match="does not have yet"):
+    with pytest.raises(ConfigError, match="does not contain yet"):
         find_recording(running, unit, member, tmp_path / "out")
 
 

@@ -92,7 +92,7 @@ def test_the_folder_that_the_user_is_in_can_be_dropped_and_merged_into(
 def test_a_copy_certifies_nothing(run: Path, tmp_path: Path) -> None:
     again = Path(shutil.copytree(run, tmp_path / "again"))
     with pytest.raises(
-        ConfigError, match=r"again, where 1 of 1 units are copies of units of the run"
+        ConfigError, match=r"again, where 1 of 1 units are copies from the original run"
     ):
         list(rerun(run, again))
     # Nor under another account of the run.

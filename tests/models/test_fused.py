@@ -107,7 +107,7 @@ def test_the_class_that_is_read_alone_brings_its_soft_spots_along() -> None:
     first = FusedModel([Certain()], replace(linear_table(), soft=SOFT), NAMES).predict(
         observation
     )
-    own = replace(linear_table(), soft=SOFT).own(
+    own = replace(linear_table(), soft=SOFT).predict_by_class(
         torch.zeros(2, 16, 16, dtype=torch.int64), observation.slope_deg
     )
     torch.testing.assert_close(first.most_likely().cvar(0.9), own.cvar(0.9))

@@ -146,7 +146,7 @@ def test_a_checkpoint_of_other_classes_is_refused_and_both_are_named(
             "resnet19",
         ),
         (["gp", "--data", "DATA", "--out", "x", "--gp.max_points", "9"], "max_points"),
-        (["gp", "--data", "TEST", "--out", "x"], "train and valid"),
+        (["gp", "--data", "TEST", "--out", "x"], "the splits `train` and `valid`"),
         (["gp", "--data", "DATA", "--out", "."], "contains no config.json"),
         *(
             ([kind, "--data", "DATA", "--out", "x/y", *setting], expected)
@@ -235,7 +235,7 @@ def test_pretrained_weights_that_cannot_be_had_are_told_with_the_flag_before_any
     for encoder in ("resnet18", "tu-resnet18"):
         asked = ("--classifier.pretrained", "--classifier.encoder", encoder)
         message = refuses(capfd, "all", "--data", dataset.path, "--out", "x/y", *asked)
-        assert f"ImageNet weights of {encoder} to download" in message
+        assert f"download of the ImageNet weights of {encoder}" in message
         assert "(--classifier.pretrained or --mdn.pretrained)" in message
     assert not (tmp_path / "x").exists()
 
@@ -567,7 +567,7 @@ def test_how_maps_are_read_reaches_the_training(
 
     monkeypatch.setattr(networks, "MapData", opened)
     quick = QUICK_GP if kind == "all" else []
-    for number, how in enumerate(([], ["--workers", 2], ["--in_memory", "true"])):
-        where = ["--data", dataset.path, "--out", tmp_path / str(number)]
+    where = ["--data", dataset.path, "--out", tmp_path / "m", "--resume"]
+    for how in ([], ["--workers", 2], ["--in_memory", "true"]):
         assert call("train", kind, *where, *quick, *how) == 130
     assert seen == [(False, 0), (False, 2), (True, 0)]

@@ -146,7 +146,7 @@ def test_the_command_writes_what_its_flags_say(
     for words, said in (
         (given, "which exists. Pass --overwrite"),
         ((*given, "--overwrite", "--level", 1), "`level` in [0, 1), got 1"),
-        ((*given, "--overwrite", "--opset", 9), "`opset` in 18–"),
+        ((*given, "--overwrite", "--opset", 9), "`opset` from 18 to "),
         ((*given, "--onnx", tmp_path / "model.pt"), "`onnx` to end in .onnx"),
     ):
         assert call("train", *words) == 2
@@ -233,7 +233,7 @@ def test_what_has_no_graph_is_refused(tmp_path: Path) -> None:
     odd = Odd(MDNConfig(hidden=8, encoder_depth=1)).build(COLOURS).eval()
     refused = (
         (Oracle(), "got Oracle"),
-        (odd, "whose graph has an error of"),
+        (odd, "whose exported graph differs from `predict` by up to"),
         (small("swag"), "got SWAGModel, which draws its weights during prediction"),
         (small("evidential"), "got EvidentialModel, which needs the digamma function"),
         (

@@ -279,7 +279,7 @@ def test_a_model_whose_training_was_interrupted_is_told_with_the_command_to_go_o
             "to be an instance of benchnav.models.TraversabilityModel, got Nothing. Write class Nothing(Tr",
         ),
         ("./mine_of_tests.py", "Name a class or function in the file"),
-        ("oracle:3", "since it has no options"),
+        ("oracle:3", "This model has no options"),
         ("checkpoints/papr-v1", "Did you mean 'paper-v1'?"),
         ("papr-v1", "Did you mean 'paper-v1'?"),
         ("checkpoints/minn", "Did you mean 'checkpoints/mine'?"),

@@ -201,7 +201,7 @@ BAD = {
     "another answer": (Forgetful(), "Expected the same result from `predict` when called again"),
     "an answer of the batch": (changed(of_batch), "Expected the same result from `predict` for a single element"),
     "too many names": (Misnamed(), "each of 2 components, got 3"),
-    "members without names": (Nameless(), "`class_names`, since"),
+    "members without names": (Nameless(), "Expected `class_names` with"),
     "members of another shape": (with_members(lambda weights: weights), "shape [M, 3, 2, 32, 32], got [3, 2, 32, 32]"),
     "too few maps of members": (with_members(lambda weights: weights[None, :1]), "got [1, 1, 2, 32, 32]"),
     "no members": (with_members(lambda weights: weights[None][:0]), "got [0, 3, 2, 32, 32]"),
@@ -212,7 +212,7 @@ BAD = {
     ),
     "components of a class without a name": (
         changed(lambda mixture, _: replace(mixture, group=(0, 2))),
-        "classes in `group` below 2, the number of `class_names`, got 2",
+        "classes in `group` below 2, which is the number of `class_names`, got 2",
     ),
     "members whose soft spots are summed up wrongly": (with_soft_spots(0), "as the average of"),
     "members that raise": (with_members(lambda weights: weights[9]), "IndexError"),

@@ -42,7 +42,7 @@ BAD: dict[str, tuple[Any, str]] = {
     "no number": (changed(lambda mean, _: mean * torch.nan), "values in [0, 1]"),
     "slip": (changed(lambda mean, m: (m.stds[:, 0] > 0) / mean.new_zeros(())), "values in [0, 1]"),
     "λ̂ of the batch": (changed(lambda mean, _: mean / (1 + mean.mean())), "same result from `risk` for a single"),
-    "λ̂ of the neighbours": (changed(lambda mean, _: (mean + mean.roll(1, -1)) / 2), "for selected cells as on the map"),
+    "λ̂ of the neighbours": (changed(lambda mean, _: (mean + mean.roll(1, -1)) / 2), "λ̂ of selected cells to equal"),
     "cannot take some cells": (
         changed(lambda mean, _: mean if mean.shape[-2] > 1 else mean[99]),
         "Expected a result from `risk`, got IndexError",

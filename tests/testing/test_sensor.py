@@ -166,7 +166,7 @@ APPEARANCE = "does not depend on colour, slope and layers in unobserved cells, g
 ELEVATION = (
     "does not depend on the elevation of unobserved cells, got a different measurement."
 )
-ALONE = "Expected the same results for single episodes and in another order as in the batch, got different results."
+ALONE = "do not depend on the other episodes of the batch or on their order, got different results."
 BAD: dict[str, tuple[Any, str]] = {
     "senses nothing": (
         probing(lambda found, *_: torch.nan * found),
@@ -379,7 +379,7 @@ BAD: dict[str, tuple[Any, str]] = {
     ),
     "the same in each episode": (
         moved(lambda noise_key: NoiseKey([7] * len(noise_key.keys), noise_key.step)),
-        "Expected different noise for different keys",
+        "Expected different noise in different episodes",
     ),
     "PyTorch's generator": (
         probing(lambda found, *_: found + 0 * torch.rand(1)),

@@ -141,7 +141,7 @@ def load_rasterio() -> Any:
         import rasterio.warp
     except ImportError as error:
         raise ConfigError(
-            f"Expected rasterio, which reads rasters, got: {error}. Install it: pip "
-            "install 'benchnav[geo]'"
+            f"Expected rasterio to be installed for reading rasters, got: {error}. "
+            "Run: pip install 'benchnav[geo]'"
         ) from error
     return rasterio

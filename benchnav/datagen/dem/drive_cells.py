@@ -115,7 +115,7 @@ def _check_in_metres(log: DriveLog, dem: Raster) -> None:
         return
     raise DatasetError(
         f"Expected columns `longitude_deg` and `latitude_deg` in {log.settings.file}, "
-        "got `x_m` and `y_m`, which require an elevation model in metres: the CRS of "
+        "got `x_m` and `y_m`, which require an elevation model in metres. The CRS of "
         f"{dem.name} is {crs.to_string()[:80]}. Log the positions in WGS 84."
     )
 
@@ -139,10 +139,11 @@ def _off_terrain_error(log: DriveLog, dem: Raster, *, is_swapped: bool) -> Datas
     if is_swapped:
         remedy = f"Swap {columns}."
     return DatasetError(
-        f"Expected positions on {dem.name}, which covers x {covered.left:.9g} to "
-        f"{covered.right:.9g} and y {covered.bottom:.9g} to {covered.top:.9g} of "
-        f"{dem.file.crs.to_string()[:80]}, got {names[0]} {west:.9g} to {east:.9g} "
-        f"and {names[1]} {south:.9g} to {north:.9g} in {log.settings.file}. {remedy}"
+        f"Expected positions on {dem.name}, got {names[0]} {west:.9g} to {east:.9g} "
+        f"and {names[1]} {south:.9g} to {north:.9g} in {log.settings.file}. {dem.name} "
+        f"covers x {covered.left:.9g} to {covered.right:.9g} and y "
+        f"{covered.bottom:.9g} to {covered.top:.9g} of "
+        f"{dem.file.crs.to_string()[:80]}. {remedy}"
     )
 
 
@@ -295,8 +296,9 @@ def _split_by_drive(log: DriveLog, splits: Sequence[str]) -> ndarray:
     empty = [splits[split] for split in assigned[is_empty]]
     if empty:
         raise DatasetError(
-            "Expected each split to have at least one drive of its own on its terrain, "
-            f"got none for {', '.join(empty)} in {log.settings.file}. Use fewer "
-            "--splits, other fractions, smaller maps, or drives over more terrain."
+            "Expected at least one drive on the terrain of each split, got none for "
+            f"{', '.join(empty)} in {log.settings.file}. A drive belongs to only one "
+            "split. Use fewer --splits, other fractions, smaller maps, or drives over "
+            "more terrain."
         )
     return split_by_drive

@@ -103,7 +103,7 @@ class Drives:
 
 @dataclass(frozen=True, kw_only=True)
 class DriveLog:
-    """Rows of a log that are used, and the number of those left out.
+    """Used rows of a log, and the number of left-out rows.
 
     Args:
         settings: path of the file, and the selection of its rows.

@@ -27,9 +27,9 @@ from benchnav.datagen.dem.drive_log import (
 )
 from benchnav.datagen.dem.drive_pace import check_pace, check_sign, off_pace
 from benchnav.datagen.dem.drive_tracks import (
+    find_frozen,
     find_jumped,
     find_restarted,
-    find_standing,
     period_of,
     spans_of,
     track_of,
@@ -83,10 +83,10 @@ def compare_motion(log: DriveLog) -> DriveLog:
     if is_slow.all():
         return log.without("slow", is_slow)
     track = track_of(log.rows)
-    standing = find_standing(track, least_speed, by_positions=by_positions)
-    standing = standing.reindex(log.rows.index)
-    _check_rest(log, standing["is_unknown"].to_numpy())
-    log = _leave_out(log, {"frozen": standing["is_frozen"].to_numpy()})
+    still = find_frozen(track, least_speed, by_positions=by_positions)
+    still = still.reindex(log.rows.index)
+    _check_rest(log, still["is_unknown"].to_numpy())
+    log = _leave_out(log, {"frozen": still["is_frozen"].to_numpy()})
 
     rows = log.rows
     commanded = rows["commanded"].to_numpy()
@@ -114,7 +114,7 @@ def compare_motion(log: DriveLog) -> DriveLog:
     spans = spans_of(track, least_speed)
     motion = {**log.motion, **_pace_ratios(spans)}
     motion["period_s"] = period_of(track)
-    motion["standing"] = int(standing["is_unmeasured"].sum())
+    motion["standing"] = int(still["is_unmeasured"].sum())
     log = replace(log, motion=motion)
     check_pace(log, sound_rows, spans, is_jumpy=is_jumpy)
 

@@ -34,7 +34,7 @@ def check_pace(
 
     Args:
         log: log of the drives.
-        rows: rows of the log without faulty ones.
+        rows: rows of the log, without faulty rows.
         spans: spans of these rows.
         is_jumpy: whether positions jump often; the log is then rejected here only if a
             unit explains the ratio.
@@ -48,10 +48,9 @@ def check_pace(
         times = log.rows.groupby("drive")["time_s"]
         longest_s = (times.max() - times.min()).max()
         raise DatasetError(
-            f"Expected motion under a command in {path}, to compare positions with "
-            "`measured_m_s`, got no such motion in "
-            f"drives of up to {longest_s:.3g} s. Log `time_s` "
-            "in seconds, or pass --speed measured."
+            f"Expected motion under a command in {path}, got none in drives of up to "
+            f"{longest_s:.3g} s. Positions and `measured_m_s` are compared during such "
+            "motion. Log `time_s` in seconds, or pass --speed measured."
         )
     if speed == "positions" and spans["measured"].isna().all():
         _check_command(log, rows, spans)
@@ -77,10 +76,9 @@ def check_pace(
     reason = unit or no_unit_text(spans, log.resolution_m)
     low, high = PACE_LIMITS
     raise DatasetError(
-        f"Expected positions to move {low:g} to {high:g} times "
-        "as far as `measured_m_s` implies, got "
-        f"{ratio:.3g} times in {path}, which looks like "
-        f"{reason}. {advice}"
+        f"Expected positions in {path} to move {low:g} to {high:g} times as far as "
+        f"`measured_m_s` implies, got {ratio:.3g} times, which looks like {reason}. "
+        f"{advice}"
     )
 
 

@@ -21,10 +21,10 @@ WINDOW_S = 2.0
 MIN_SPANS = 5  # minimum number of spans for a median (choice)
 # Maximum time between rows in a segment. In a longer gap, motion is unknown.
 GAP_S = 1.0
-# Maximum time for which a position may stay the same, in periods of fixes (choice).
+# Maximum time for which a position may stay the same, in fix periods (choice).
 _FREEZE_FIXES = 3
-# Neighbouring spans are straight if the cosine of the angle between them exceeds this
-# value: a chord is then at most 1 % shorter than its arc.
+# Neighbouring spans count as straight if the cosine of the angle between them exceeds
+# this value. A chord is then at most 1 % shorter than its arc.
 _STRAIGHT_COS = 0.9
 # A larger angle between neighbouring spans is a reversal (choice).
 _MAX_BEND = math.radians(150)
@@ -34,7 +34,7 @@ def find_restarted(rows: pd.DataFrame) -> ndarray:
     """Return a mask of rows with a smaller time than a preceding row of the same drive.
 
     If sorting a drive's rows by time shortens the track, the rows are only out of
-    order: its clock did not restart, and the mask is False.
+    order. The clock of this drive did not restart, and the mask is False.
 
     Returns:
         bool, shape [N].
@@ -51,7 +51,7 @@ def find_restarted(rows: pd.DataFrame) -> ndarray:
 
 
 def _length_m(rows: pd.DataFrame) -> pd.Series:
-    """Return the length of each drive's track in metres; rows are taken as ordered."""
+    """Return the length in metres of each drive's track, with rows in given order."""
     by_drive = rows.groupby("drive")
     step_m = np.hypot(by_drive["x"].diff(), by_drive["y"].diff())
     return step_m.groupby(rows["drive"]).sum()
@@ -81,20 +81,20 @@ def track_of(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def _fixes(track: pd.DataFrame) -> pd.DataFrame:
-    """Return a table by `fix`: the first row of the fix, and its number of `rows`."""
+    """Return a table by `fix`: its first row, and `rows`, the number of its rows."""
     grouped = track.groupby("fix")
     return grouped.first().assign(rows=grouped.size())
 
 
 def _period_s(fixes: pd.DataFrame) -> pd.Series:
-    """Return, by fix, its drive's median time between fixes; 0 for a single fix."""
+    """Return the median fix period of each fix's drive; 0 if it has only one fix."""
     step_s = fixes.groupby("drive")["time_s"].diff()
     by_drive = step_s.groupby(fixes["drive"])
     return by_drive.transform("median").fillna(0)
 
 
 def period_of(track: pd.DataFrame) -> float:
-    """Return the median time between fixes in seconds; 0 if no drive has two fixes."""
+    """Return the median fix period in seconds; 0 if no drive has two fixes."""
     period_s = _period_s(_fixes(track)).median()
     return float(f"{period_s:.3g}")
 
@@ -103,8 +103,7 @@ def knots_of(track: pd.DataFrame) -> pd.DataFrame:
     """Return the rows with a measured position, the knots.
 
     These are the first rows of fixes. In addition, if a position stays the same for
-    more than three periods of fixes, the robot is at rest, and one row per period is a
-    knot.
+    more than three fix periods, the robot is at rest, and one row per period is a knot.
 
     Args:
         track: track from `track_of`.
@@ -122,20 +121,21 @@ def knots_of(track: pd.DataFrame) -> pd.DataFrame:
     return track[~measurements.duplicated()]
 
 
-def find_standing(
+def find_frozen(
     track: pd.DataFrame, least_speed: float, *, by_positions: bool
 ) -> pd.DataFrame:
     """Return masks of rows whose position stays the same for over three fix periods.
 
-    Only rows under a command are used. If the robot moves meanwhile, as its measured
-    speed or a distant next position shows, the receiver is frozen. A robot that stands
+    Only rows under a command are used. If the measured speed or a distant next position
+    shows that the robot moves meanwhile, the receiver is frozen. A robot that stands
     still under its command is immobilised, which is not a fault.
 
     Args:
         track: track from `track_of`; `speed` is NaN where it was not measured.
-        least_speed: speed from which a command is used and a robot is moving [m/s].
-        by_positions: whether a receiver is frozen only if its next position, if there
-            is one, is distant.
+        least_speed: speed from which a command is used, and from which a robot counts
+            as moving [m/s].
+        by_positions: whether a receiver counts as frozen only if the next position, if
+            there is one, is also distant.
 
     Returns:
         A table by the track's index, False in the first row of each fix:
@@ -263,8 +263,8 @@ def spans_of(
         columns.append("z")
     steps = firsts[columns].groupby("segment").diff(-1)
     chord_m = np.hypot(steps["x"], steps["y"])
-    # On a circular arc, neighbouring chords differ in direction by the angle that each
-    # chord subtends at the centre.
+    # On a circular arc, the angle between neighbouring chords equals the angle that
+    # each chord subtends.
     next_steps = steps.groupby("segment").shift(-1)
     after = angle_between(steps, next_steps)
     before = after.groupby("segment").shift(1)
@@ -289,13 +289,13 @@ def spans_of(
 
 
 def _span_of(track: pd.DataFrame, knots: pd.DataFrame, span_s: float) -> pd.Series:
-    """Return the number of each row's span: the span of the last measured position."""
+    """Return each row's span number, which is that of the last measured position."""
     period_s = knots.groupby("segment")["time_s"].diff().median()
     times = track.groupby("drive")["time_s"]
     longest_s = (times.max() - times.min()).max()
     window_s = np.fmax(span_s, period_s)
-    # If times are logged in hours, the log seems short. Shorter spans are then enough
-    # spans for `drive_units` to detect that the unit is the hour.
+    # If times are logged in hours, the log seems short. Shortening the spans yields
+    # enough of them for `drive_units` to detect that the unit is the hour.
     if 0 < longest_s < MIN_SPANS * window_s:
         window_s = longest_s / MIN_SPANS
     span = np.floor(knots["time_s"] / window_s)

@@ -7,16 +7,16 @@ import pandas as pd
 from benchnav.datagen.dem.drive_tracks import MIN_SPANS, spans_of, track_of
 
 # Thresholds are choices of this package.
-_UNIT_TOLERANCE = 0.08  # maximum relative difference of a ratio from that of a unit
+_UNIT_TOLERANCE = 0.08  # maximum relative difference from a unit's ratio
 _MIN_LAMBDA = 0.05  # minimum median λ of a log
 _MAX_LAMBDA = 1.3  # maximum median λ of a log
 # A larger ratio of distance by positions to commanded distance indicates a wrong unit.
 _MAX_COMMAND_RATIO = 5.0
-# Quantile of λ over spans that counts as the maximum. The median may be that of an
-# immobilised robot.
+# Quantile of λ over spans that counts as the maximum. In most spans, the robot may be
+# immobilised.
 _FAST_QUANTILE = 0.95
 # If the ratio of measured to commanded speed is lower, measured speed is the speed over
-# ground, not that of wheels.
+# ground, not wheel speed.
 _MIN_WHEEL_RATIO = 0.9
 # Positions are coarse if the ratio of their resolution to the distance of a span is
 # higher.
@@ -109,7 +109,7 @@ def unit_of(
 
     Returns:
         The unit, empty if no unit fits; the remedy, without a full stop; and whether
-        the unit is one of times or positions rather than speeds.
+        it is a unit of times or positions rather than of speeds.
     """
     ratio = median_ratio(spans, "measured")
     for name, seconds in _TIMES.items():

@@ -41,7 +41,7 @@ def velocity_of(track: pd.DataFrame, columns: list[str]) -> pd.DataFrame:
             `columns`: slopes in m/s, NaN where the fixes span less than half of the
                 window.
             error: standard error of the slopes in m/s, from the scatter of the fixes in
-                the window, or from that of the whole drive if it is larger.
+                the window, or in the whole drive if that scatter is larger.
             window_s: duration of the window in seconds.
             reach_s: half of the time in seconds that the fixes would span if they were
                 dense.

@@ -1,4 +1,4 @@
-"""Detection of measured speeds that are those of wheels instead of speeds over ground.
+"""Detection of logs whose measured speed is wheel speed, not the speed over ground.
 
 Wheels follow the command on any terrain, so their speed hides slip.
 """
@@ -56,7 +56,7 @@ def _ratio_quantiles(spans: pd.DataFrame) -> list[float]:
 
 
 def check_wheels(log: DriveLog, track: pd.DataFrame) -> None:
-    """Reject a log whose measured speed is that of wheels, everywhere or in stretches.
+    """Reject a log whose measured speed is wheel speed, everywhere or in stretches.
 
     Spans of two durations are compared, and the one with longer distances by positions
     counts: short spans follow alternating curves better, and noise can only increase
@@ -67,7 +67,7 @@ def check_wheels(log: DriveLog, track: pd.DataFrame) -> None:
         track: track of the log, with elevation `z` in metres.
 
     Raises:
-        DatasetError: If measured speed is that of wheels.
+        DatasetError: If measured speed is wheel speed.
     """
     least_speed = log.settings.least_speed
     spans = spans_of(track, least_speed, WINDOW_S)
@@ -95,10 +95,10 @@ def check_wheels(log: DriveLog, track: pd.DataFrame) -> None:
         )
     if reasons:
         raise DatasetError(
-            "Expected `measured_m_s` to be the speed over ground in "
-            f"{log.settings.file}, got a speed that {' and '.join(reasons)}, "
-            "as wheel odometry does. Log the speed over ground, or pass --speed "
-            "positions. If the measured speed is right, pass --speed measured."
+            f"Expected `measured_m_s` in {log.settings.file} to be the speed over "
+            f"ground, got a speed that {' and '.join(reasons)}. This suggests wheel "
+            "odometry. Log the speed over ground, or pass --speed positions. If the "
+            "measured speed is right, pass --speed measured."
         )
 
 

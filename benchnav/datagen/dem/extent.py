@@ -138,9 +138,8 @@ class Extent:
         is_on = (start_m >= -SLACK * step) & (start_m < self.size_m)
         expect(
             is_on.all(),
-            f"`origin` on `dem`, x {west} to {east} and y {south} to {north} in "
-            f"{_name_of(self.crs)}, "
-            f"got {list(self.origin_m or ())}.",
+            f"`origin` on `dem` (x {west} to {east} and y {south} to {north} in "
+            f"{_name_of(self.crs)}), got {list(self.origin_m or ())}.",
         )
 
     def _check_room(
@@ -247,7 +246,7 @@ class Extent:
         )
 
     def frame(self, layout: Layout, step: float) -> dict[str, Any]:
-        """Return the cells of all maps, padded by one, for `Raster.resampled`.
+        """Return the cells of all maps, padded by one cell, for `Raster.resampled`.
 
         Args:
             layout: Layout of the maps.

@@ -125,14 +125,14 @@ def import_dem(
     )
     expect(
         not (cut.solvable and rasters.unlabelled),
-        "`classes` with `solvable`, which depends on the classes of cells, got none. "
-        "Leave `solvable` out, or pass --classes.",
+        "`classes` with `solvable`, got none. Whether a map is solvable depends on the "
+        "classes of its cells. Leave `solvable` out, or pass --classes.",
     )
     affecting = [spec.name for spec in recipe.layers if spec.affects]
     expect(
         not affecting,
-        "a recipe whose `layers` do not change λ, since an import draws no layers, got "
-        f"{', '.join(affecting)}.",
+        f"a recipe whose `layers` do not change λ, got {', '.join(affecting)}. An "
+        "import draws no layers. Leave these layers out of the recipe.",
     )
     out = resolve_link(out)
     splits = {
@@ -363,7 +363,7 @@ class _SplitWriter:
 
 
 def _missing_masks(inputs: Maps) -> dict[str, ndarray]:
-    """Return masks of maps without a required input, by its name, bool, shape [B]."""
+    """Return masks of maps that lack a required input, by input, bool, shape [B]."""
     masks: dict[str, Any] = {}
     for name, values in inputs.items():
         masks[name] = np.isnan(values).any(axis=(1, 2, 3))

@@ -19,7 +19,7 @@ class GroundOptions:
         origin: South-west corner of the first map, [X,Y] in the coordinate reference
             system of the maps.
         max_maps: Maximum number of maps. If there are more, the import fails, and the
-            error contains a command that makes fewer.
+            error contains a command for fewer maps.
         coarse: Allow an elevation model with cells at least three times as wide as the
             cells of the maps.
     """

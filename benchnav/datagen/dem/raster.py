@@ -220,8 +220,8 @@ def _check_georeference(argument: str, name: str, file: Any) -> None:
         )
     if file.transform.is_identity:
         raise DatasetError(
-            f"Expected `{argument}` with a geotransform, which states its position and "
-            f"cell size, got {name} without one. If you know it, declare it: rio edit-info "
+            f"Expected `{argument}` with a geotransform (position and cell size), got "
+            f"{name} without one. If you know it, declare it: rio edit-info "
             f"--transform '[CELL, 0, WEST, 0, -CELL, NORTH]' {name}"
         )
 

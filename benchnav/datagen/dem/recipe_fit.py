@@ -77,7 +77,7 @@ def check_fit(
 
     Raises:
         GroundError: If the terrain yields such maps. The error contains settings that
-            do not.
+            avoid this.
     """
     step = recipe.resolution_m
     cell_m = float(max(extent.cell_m))
@@ -88,9 +88,8 @@ def check_fit(
     if is_coarse:
         problem = (
             f"Expected cells of `dem` less than {MAX_RATIO:g} times as wide as the "
-            f"maps' cells of {step:g} m, got {cell_m:.4g} m in {name}, which "
-            f"{n_maps:,} maps would show as smooth terrain. Pass --coarse to "
-            "allow such cells."
+            f"maps' cells of {step:g} m, got {cell_m:.4g} m in {name}. Terrain would "
+            f"be smooth in {n_maps:,} maps. Pass --coarse to allow such cells."
         )
     elif n_maps > max_maps:
         problem = (

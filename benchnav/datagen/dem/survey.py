@@ -68,7 +68,7 @@ class Survey:
         fields: stored fields of layers, by name.
         layers_with_value: names of layers with at least one value so far.
         is_inside: two masks, of the rows and of the columns that lie completely on the
-            elevation model, padded by one.
+            elevation model, padded by one cell.
         indices: class index by raster value; NaN for values without a label.
         cliff_m: difference in height between neighbouring cells that natural terrain
             does not exceed, in metres.
@@ -281,7 +281,7 @@ def _class_names(rasters: Rasters, recipe: Recipe) -> dict[int, str | None]:
     unknown = sorted(map(str, {*class_ids.values()} - {*names, None}))
     expect(
         not unknown,
-        f"`class_ids` to name classes of the recipe, {names}, got {unknown}.",
+        f"`class_ids` to name classes of the recipe, among {names}, got {unknown}.",
     )
     return class_ids
 
@@ -293,8 +293,8 @@ def _stride(cut: Cut, recipe: Recipe) -> Shape:
     n_cells = cut.stride_m / recipe.resolution_m
     expect(
         n_cells > 0.5 and abs(n_cells - round(n_cells)) < 1e-6,
-        f"`stride` as a multiple of the maps' resolution, {recipe.resolution_m:g} m, "
-        f"got {cut.stride_m:g} m.",
+        f"`stride` as a multiple of {recipe.resolution_m:g} m, which is the resolution "
+        f"of the maps, got {cut.stride_m:g} m.",
     )
     return round(n_cells), round(n_cells)
 
@@ -327,7 +327,7 @@ def _resampled_layers(
 
 
 def _inside_masks(extent: Extent, layout: Layout, step: float) -> list[ndarray]:
-    """Return masks of rows and columns, padded by one, inside the elevation model."""
+    """Return masks of rows and columns inside the elevation model, padded by one."""
     slack = SLACK * step
     masks = []
     sides = zip(layout.offset_m, layout.tiling.cells, extent.size_m, strict=True)
@@ -371,8 +371,8 @@ def _check_covers(
         expected = " ".join(f"{value:.10g}" for value in area)
         covered = " ".join(f"{value:.10g}" for value in bounds)
         raise DatasetError(
-            f"Expected `{raster.argument}` to cover all of the terrain, WEST SOUTH "
-            f"EAST NORTH {expected} in {crs.to_string()[:80]}, got {raster.name}, "
+            f"Expected `{raster.argument}` to cover all of the terrain (WEST SOUTH "
+            f"EAST NORTH {expected} in {crs.to_string()[:80]}), got {raster.name}, "
             f"which covers {covered}. Use a raster that covers the terrain, with a "
             "declared value for missing cells, or cut a part out of `dem`: rio clip "
             "DEM part.tif --bounds 'WEST SOUTH EAST NORTH'"

@@ -54,7 +54,7 @@ class Tiling(NamedTuple):
 
     @property
     def cells(self) -> list[int]:
-        """Number of cells of the area of all maps, northward and eastward."""
+        """Number of cells that the maps cover together, northward and eastward."""
         last_map = np.subtract(self.tiles, 1) * self.stride
         return (last_map + self.shape).tolist()
 
@@ -145,7 +145,7 @@ def cut(
     """Return the tiling of terrain into maps and splits.
 
     Args:
-        cells: cells of the terrain, northward and eastward; at least those of a map.
+        cells: number of cells of the terrain, northward and eastward; at least `shape`.
         shape: cells of a map, (H, W).
         stride: cells from one map to the next, northward and eastward.
         shares: fraction of the maps of each split.
@@ -162,8 +162,8 @@ def cut(
     if usable < n_splits:
         raise DatasetError(
             f"Expected terrain for {n_splits} splits with a map's width between "
-            f"them, got {n_lines} maps along its longer side. Use fewer splits, "
-            "smaller maps or larger terrain."
+            f"splits, got {n_lines} maps along the longer side of the terrain. Use "
+            "fewer splits, smaller maps or larger terrain."
         )
     ends = [0]
     for count, total in enumerate(accumulate(shares.values()), start=1):

@@ -66,14 +66,15 @@ def in_unit(dem: Raster, unit: str) -> tuple[Raster, str]:
             option = f"--dem-unit {name}"
         raise DatasetError(
             f"Expected elevations of `dem` in metres, got {declared!r} in {dem.name}. "
-            f"To convert them, pass {option}; "
-            "if they are in metres nevertheless, pass --dem-unit m."
+            f"To convert the elevations, pass {option}. If they are in metres "
+            "nevertheless, pass --dem-unit m."
         )
     if crs.is_projected and crs.linear_units_factor[1] != 1:
         raise DatasetError(
-            f"Expected `dem` to declare the unit of its elevations, since the CRS of "
-            f"{dem.name} is in {crs.linear_units_factor[0]}, got no unit. Pass it: "
-            "--dem-unit us-ft, --dem-unit ft or --dem-unit m."
+            "Expected `dem` to declare the unit of its elevations, got no unit. The "
+            f"CRS of {dem.name} is in {crs.linear_units_factor[0]}, so the unit of "
+            "elevations may not be the metre. Pass the unit: --dem-unit us-ft, "
+            "--dem-unit ft or --dem-unit m."
         )
     return dem, "metres (the raster declares no unit; `dem_unit` sets another)"
 

@@ -75,8 +75,8 @@ def create(
     path = resolve_link(path)
     expect(
         shard is None or not is_one_file(path),
-        "`out` to be a folder, since `shard` writes only part of a dataset, got the "
-        f"name of a single file, {path}. Leave out the suffix.",
+        "`out` to be a folder if `shard` is given, got the name of a single file, "
+        f"{path}. A shard is only part of a dataset. Leave out the suffix.",
     )
     for spec in recipe.layers if jobs > 1 or scheduler else ():
         spec.check_workers()
@@ -160,7 +160,7 @@ def make_shard(
         The shard, and the bytes of its file.
 
     Raises:
-        DatasetError: If the running version of this package is another one.
+        DatasetError: If another version of this package is running.
         ConfigError: If the recipe yields no valid maps.
     """
     if benchnav.__version__ != version:

@@ -179,7 +179,7 @@ def _describe_layer(spec: LayerSpec, classes: ClassTable) -> schema.Json:
 
 
 def _origin(described: schema.Json, part: schema.Json) -> str:
-    """Return the number of maps of a part of a split, and their source, as text."""
+    """Describe a part of a split: its number of maps, and their source."""
     if "recipe" not in part:
         return f"{part['maps']} of {part['source']['file']}"
     recipe = described["recipes"][part["recipe"]]

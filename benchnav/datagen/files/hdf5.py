@@ -118,7 +118,7 @@ class ShardFile(NamedTuple):
 
 
 def contents_of_recipe(recipe: Recipe, files: Mapping[str, Sequence[Path]]) -> Contents:
-    """Return the contents of a dataset of all maps of a recipe.
+    """Return the contents of a dataset with all maps of a recipe.
 
     Args:
         recipe: recipe of the maps.
@@ -270,7 +270,7 @@ def check_output(path: Path, overwrite: bool, names: Collection[str] = ()) -> No
 
 
 def foreign_in(path: Path, names: Collection[str] = ()) -> str:
-    """Return why a path is not that of a dataset, as text; empty if it is.
+    """Return why a path is not a dataset, as text; empty if it is.
 
     A folder may contain only shards and their manifest. Files in `names` are regarded
     as shards.
@@ -338,7 +338,7 @@ def assemble(contents: Contents, folder: Path, out: Path) -> None:
 
 
 def _opened(split: str, files: Iterable[Path]) -> Iterator[h5py.Group]:
-    """Yield the group of a split in each file. A file is open until the next one."""
+    """Yield the group of a split in each file; close each file before the next."""
     for path in files:
         with open_file(path) as file:
             yield file[split]
@@ -421,9 +421,9 @@ def _put(source: ndarray | h5py.Dataset, target: h5py.Dataset, first: int) -> No
 
 
 def _storage_of(array: h5py.Dataset) -> tuple[object, ...]:
-    """Return properties of an array; chunks can be copied between arrays of equal ones.
+    """Return the properties in which two arrays must agree to copy chunks.
 
-    Deflate levels are not among them, since they may differ.
+    The level of deflate is not among them.
     """
     return (
         array.dtype.str,

@@ -55,8 +55,8 @@ def merge(
     Iterate to the end.
 
     Args:
-        paths: paths of two or more datasets, the first of which determines the order of
-            splits; or of folders with the shards of one dataset.
+        paths: paths of two or more datasets, where the first dataset determines the
+            order of splits; or of folders with the shards of one dataset.
         out: path of the file to write, if its suffix is `.h5` or `.hdf5`; else path of
             the folder to write.
         dataset_id: id of the new dataset; if empty, the name of `out`. Not used for
@@ -166,7 +166,8 @@ def _merged_shards(folders: Sequence[Path]) -> Contents:
         if shard.manifest[name] != shards[0].manifest[name]:
             raise DatasetError(
                 f"Expected shards of one dataset, got {shards[0].path} and "
-                f"{shard.path}, whose {name} differ. Pass only shards of one dataset."
+                f"{shard.path}, which differ in `{name}`. Pass only shards of one "
+                "dataset."
             )
     recipe = shards[0].recipe
     files: dict[str, list[Path]] = {}

@@ -3,8 +3,8 @@
 A layer is a frozen dataclass whose fields are its settings. Its class attributes
 describe the stored map, which is float32 without NaN. A subclass must only override
 `draw`: by default, a layer is invisible and does not change λ. The result of a method
-must depend only on settings and arguments, and that of a map not on the other maps of a
-batch. Letters in shapes: B maps, H×W cells, C classes.
+must depend only on settings and arguments. The result for a map must not depend on the
+other maps of a batch. Letters in shapes: B maps, H×W cells, C classes.
 """
 
 from collections.abc import Mapping
@@ -101,7 +101,7 @@ class Layer:
 
     Attributes:
         name: name of the stored field and of the model input: letters, digits and `_`,
-            not beginning with a digit. A name that ends in `_azimuth_deg` is that of a
+            not beginning with a digit. A name that ends in `_azimuth_deg` names a
             direction.
         unit: SI unit, "deg", or "1" for no unit.
         minimum: smallest valid value.

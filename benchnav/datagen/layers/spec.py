@@ -115,8 +115,8 @@ class LayerSpec:
             files = registry.option_files(part) if self.source else {}
         except BenchnavError as error:
             raise ConfigError(
-                f"Expected the code of layer {self.name!r}, to generate maps or to "
-                f"predict λ from colours, got: {error}"
+                f"Expected the code of layer {self.name!r} to be available for "
+                f"generating maps and predicting λ from colours, got: {error}"
             ) from error
         expected = self.digest[:12] or "none"
         got = digest[:12] or "none"
@@ -146,8 +146,8 @@ class LayerSpec:
         is_everywhere = entry is None or entry.everywhere
         expect(
             is_everywhere,
-            f"a single process with layer {self.name!r}, whose class is registered "
-            "only in this process, got several. Pass `jobs` 1, or put the class in a "
+            f"a single process, got several. The class of layer {self.name!r} is "
+            "registered only in this process. Pass `jobs` 1, or put the class in a "
             "file.",
         )
 

@@ -233,7 +233,7 @@ def _checked(
         valid_range = "finite" if is_unbounded else f"in [{low:g}, {high:g}]"
         first = array[invalid][0]
         raise ConfigError(
-            f"Expected {subject} {valid_range}, got {first:g}, the first of "
-            f"{invalid.sum()} invalid values."
+            f"Expected {subject} {valid_range}, got {first:g} (the first of "
+            f"{invalid.sum()} invalid values)."
         )
     return array

@@ -87,8 +87,8 @@ class Vegetation(Layer):
         min_m = 2 * grid.resolution_m
         expect(
             min_m <= self.period_m < np.inf,
-            f"`vegetation_period_m` to be finite and at least two cells, {min_m:g} m, "
-            f"if a class has `vegetation`, got {self.period_m:g} m.",
+            f"finite `vegetation_period_m` of at least {min_m:g} m (two cells) if a "
+            f"class has `vegetation`, got {self.period_m:g} m.",
         )
         names = [item.name for item in classes]
         for name in self.classes:
@@ -101,9 +101,9 @@ class Vegetation(Layer):
             first = alike[0]
             if shown[first] != shown[class_id]:
                 raise ConfigError(
-                    "Expected the same `colour` and `cover` of `vegetation` on "
-                    f"{names[first]!r} and {names[class_id]!r}, since their terrain "
-                    f"has the same colour, got {shown[first]} and {shown[class_id]}. "
+                    f"Expected classes {names[first]!r} and {names[class_id]!r}, whose "
+                    "terrain has the same colour, to have `vegetation` with the same "
+                    f"`colour` and `cover`, got {shown[first]} and {shown[class_id]}. "
                     "Only `height_m` may differ."
                 )
         for scenario, class_colours in colours.items():

@@ -67,8 +67,9 @@ class TerrainClass:
         in_range = self.scale >= 0 and self.exponent > 0 and self.noise > 0
         expect(
             is_finite and in_range,
-            f"`scale` ≥ 0, `exponent` > 0 and `noise` > 0 of class {self.name!r}, all "
-            f"finite, got {self.scale}, {self.exponent} and {self.noise}.",
+            "finite `scale` ≥ 0, `exponent` > 0, `noise` > 0 and `offset` for class "
+            f"{self.name!r}, got `scale` {self.scale}, `exponent` {self.exponent}, "
+            f"`noise` {self.noise} and `offset` {self.offset}.",
         )
 
 
@@ -76,7 +77,7 @@ ClassTable = tuple[TerrainClass, ...]
 
 
 def look_alike_classes(classes: ClassTable) -> list[tuple[int, ...]]:
-    """Return for each class the indices of all classes of its colour, with its own."""
+    """Return, for each class, the indices of all classes of its colour, itself too."""
     by_colour: dict[tuple[int, int, int], tuple[int, ...]] = {}
     for class_id, item in enumerate(classes):
         by_colour[item.colour] = (*by_colour.get(item.colour, ()), class_id)

@@ -34,8 +34,8 @@ class PlacesRule:
         in_range = 0 < self.least_distance_m < np.inf and 0 <= self.margin_m < np.inf
         expect(
             in_range,
-            "`least_distance_m` > 0 and `margin_m` ≥ 0 of `places`, both finite, "
-            f"got {self.least_distance_m} and {self.margin_m}.",
+            "finite `least_distance_m` > 0 and `margin_m` ≥ 0 of `places`, got "
+            f"{self.least_distance_m} and {self.margin_m}.",
         )
 
 
@@ -51,24 +51,24 @@ def check_places(places: PlacesRule, grid: Grid) -> None:
     has_room = (count >= 1).all()
     expect(
         has_room,
-        f"`margin_m` of `places` below {half_side_m:g} m, half of the map's shorter "
-        f"side, got {places.margin_m:g} m.",
+        f"`margin_m` of `places` below {half_side_m:g} m (half of the map's shorter "
+        f"side), got {places.margin_m:g} m.",
     )
     largest_steps = np.hypot(*(count - 1))
     largest_m = float(largest_steps) / _STEPS_PER_M
     shown_m = np.floor(100 * largest_m) / 100
     expect(
         places.least_distance_m <= largest_m,
-        f"`least_distance_m` of `places` at most {shown_m:g} m, the largest "
-        f"distance inside the margin of {places.margin_m:g} m, got "
-        f"{places.least_distance_m:g} m.",
+        f"`least_distance_m` of `places` at most {shown_m:g} m (the largest distance "
+        f"inside the margin of {places.margin_m:g} m), got {places.least_distance_m:g} "
+        "m.",
     )
     diagonal = np.sqrt(2) * grid.resolution_m
     expect(
         places.least_distance_m >= diagonal,
-        f"`least_distance_m` of `places` at least {diagonal:.3g} m, a cell's diagonal, "
-        "so that start and goal are in different cells, got "
-        f"{places.least_distance_m:g} m.",
+        f"`least_distance_m` of `places` at least {diagonal:.3g} m (a cell's "
+        f"diagonal), got {places.least_distance_m:g} m. Start and goal must be in "
+        "different cells.",
     )
 
 

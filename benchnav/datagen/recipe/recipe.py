@@ -152,8 +152,8 @@ class Recipe:
         max_m = LONGEST_CORRELATION * min(self.grid.extent_m)
         expect(
             0 <= self.correlation_m <= max_m,
-            f"`correlation_m` in 0–{max_m:g} m, a quarter of the map's shorter side, "
-            f"got {self.correlation_m:g}.",
+            f"`correlation_m` in 0–{max_m:g} m (a quarter of the map's shorter side), "
+            f"got {self.correlation_m:g} m.",
         )
 
     @property
@@ -323,8 +323,8 @@ def _check_scenarios(recipe: Recipe) -> None:
         covered = max_craters * scenario.mean_crater_area_m2 / area_m2
         expect(
             covered <= _MAX_CRATERED,
-            f"the craters of scenario {name!r} to cover at most {_MAX_CRATERED:.0%} "
-            f"of a map, so that they fit without overlap, got {covered:.0%}. Lower "
+            f"the craters of scenario {name!r} to cover at most {_MAX_CRATERED:.0%} of "
+            f"a map, got {covered:.0%}. Craters must fit without overlap. Lower "
             "`crater_count` or `crater_radius_m`.",
         )
 
@@ -355,8 +355,8 @@ def _check_environments(recipe: Recipe) -> None:
     are_valid = all(recipe.resolution_m <= period < np.inf for period in periods)
     expect(
         periods and are_valid,
-        f"`class_periods_m` as finite lengths of at least a cell, "
-        f"{recipe.resolution_m} m, got {list(periods)}.",
+        f"`class_periods_m` as finite lengths of at least {recipe.resolution_m} m (a "
+        f"cell), got {list(periods)}.",
     )
 
 
@@ -404,10 +404,10 @@ def _check_look_alikes(recipe: Recipe) -> None:
     for unit in never_shown(recipe.units, shown):
         members = ", ".join(names[member] for member in unit)
         raise ConfigError(
-            f"Expected each class to be in a selection of {shown} classes, the number "
-            "of fractions in `occupancy`, that includes all classes of a colour or "
-            f"none of them, got no such selection for {members}. Change `occupancy` or "
-            "a `colour`."
+            f"Expected each class to be in a selection of {shown} classes that "
+            "includes all classes of a colour or none of them, got no such selection "
+            f"for {members}. A map has {shown} classes, as many as `occupancy` has "
+            "fractions. Change `occupancy` or a `colour`."
         )
 
 

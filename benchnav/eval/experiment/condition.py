@@ -58,7 +58,7 @@ NOT_USED = "–"
 ANY_RISK = Part(part="mean", label=NOT_USED, kind="risk")
 # Properties of a split that affect results in addition to its maps;
 # `TerrainDataset.about_digest` is their digest.
-MEANING = "class table, λ_stuck, resolution or kind of truth"
+SPLIT_PROPERTIES = "class table, λ_stuck, resolution or kind of truth"
 # If the robot does not learn, a setting affects the planner only by this input.
 _INPUT_OF_SETTING: Mapping[str, str] = {"risk": "risk_map", "belief": "fields"}
 # Order of the rows of tables: the last kind varies fastest.
@@ -205,7 +205,10 @@ class Condition:
         used = call(owner, self.planner.object.uses, {"task": self.task})
         is_valid = isinstance(used, frozenset) and used <= INPUTS
         names = ", ".join(sorted(INPUTS))
-        expect(is_valid, f"{owner} to return a frozenset of {names}, got {used!r}.")
+        expect(
+            is_valid,
+            f"{owner} to return a frozenset of names from ({names}), got {used!r}.",
+        )
         return used
 
     @property
@@ -218,9 +221,8 @@ class Condition:
         if self.blind or self.learns:
             return ()
         used = self.planner_uses
-        return tuple(
-            kind for kind, name in _INPUT_OF_SETTING.items() if name not in used
-        )
+        inputs = _INPUT_OF_SETTING.items()
+        return tuple(kind for kind, name in inputs if name not in used)
 
     @property
     def rows_id(self) -> str:
@@ -338,8 +340,7 @@ def merge(representative: Condition, conditions: Sequence[Condition]) -> Conditi
         conditions: all conditions, including `representative`.
 
     Returns:
-        `representative`, with `NOT_USED` as the label of parts in which the conditions
-        differ.
+        `representative`, in which parts that differ have the label `NOT_USED`.
     """
     stands_for: dict[str, tuple[str, ...]] = {}
     parts: dict[str, Any] = {}

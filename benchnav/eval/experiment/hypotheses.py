@@ -163,13 +163,13 @@ def _check_margin(hypothesis: Hypothesis, quantity: Quantity, where: str) -> Non
     max_margin = 100 if quantity.unit == "points" else math.inf
     if kind == "difference" and margin:
         raise ConfigError(
-            f"Expected no `margin` in {where}, which claims a difference, got "
-            f"{margin:g}. Leave `margin` out."
+            f"Expected no `margin` in {where}, got {margin:g}. A difference has no "
+            "margin. Leave `margin` out."
         )
     if kind != "difference" and not 0 < margin < max_margin:
         raise ConfigError(
             f"Expected `margin` of {where} above 0 and below {max_margin} "
-            f"{quantity.unit}, since it claims {kind}, got {margin:g}."
+            f"{quantity.unit} for a claim of {kind}, got {margin:g}."
         )
 
 
@@ -180,16 +180,16 @@ def _with_direction(
     kind = hypothesis.kind
     if kind == "equivalence" and hypothesis.direction:
         raise ConfigError(
-            f"Expected no `direction` in {where}, which claims an equivalence, got "
-            f"{hypothesis.direction!r}. Leave `direction` out."
+            f"Expected no `direction` in {where}, got {hypothesis.direction!r}. An "
+            "equivalence has no direction. Leave `direction` out."
         )
     if kind not in ("non-inferiority", "superiority") or hypothesis.direction:
         return hypothesis
     if quantity.better == "neither":
         raise ConfigError(
-            f"Expected `direction` in {where}, which claims {kind}, since neither "
-            f"direction of {hypothesis.metric!r} is better, got none. Set higher or "
-            "lower."
+            f"Expected `direction` in {where} for a claim of {kind}, got none. Neither "
+            f"direction of {hypothesis.metric!r} is better in itself. Set `direction` "
+            "to higher or lower."
         )
     return replace(hypothesis, direction=quantity.better)
 

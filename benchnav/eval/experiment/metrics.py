@@ -76,8 +76,8 @@ def read_metrics(
         robots: robots of the suite.
 
     Raises:
-        ConfigError: If a metric does not exist or breaks its contract, or two share a
-            name or a column.
+        ConfigError: If a metric does not exist or breaks its contract, or two metrics
+            share a name or a column.
     """
     parts = [part for spec in specs for part in read_parts("metric", spec)]
     episodes = []
@@ -88,8 +88,8 @@ def read_metrics(
         metric: Metric = part.object
         if type(metric) in map(type, SHIPPED):
             raise ConfigError(
-                "Expected `metrics` other than the built-in ones, which every run has, "
-                f"got {part.part!r}. Leave it out."
+                f"Expected `metrics` other than the built-in ones, got {part.part!r}. "
+                "Every run has the built-in metrics. Leave it out."
             )
         faults = attribute_faults(metric)
         if faults:

@@ -128,20 +128,20 @@ def _choices(mapping: Mapping[str, Any]) -> Iterator[_Chosen]:
 
 
 def check_count(counts: Iterable[int]) -> None:
-    """Reject a product of more than `MAX_CONDITIONS` settings before it is formed.
+    """Reject more than `MAX_CONDITIONS` combinations before they are formed.
 
     Args:
         counts: number of values in each list of the product.
 
     Raises:
-        ConfigError: If the product has more settings.
+        ConfigError: If the lists have more combinations.
     """
     counts = [count for count in counts if count > 1]
     if math.prod(counts) > MAX_CONDITIONS:
         factors = " × ".join(map(str, counts))
         raise ConfigError(
-            f"Expected at most {MAX_CONDITIONS:,} settings, got a product of "
-            f"{factors} values. List fewer."
+            f"Expected at most {MAX_CONDITIONS:,} combinations of values, got "
+            f"{factors}. List fewer values."
         )
 
 

@@ -93,7 +93,8 @@ class Unit:
 
         The shard depends only on the unit and `of`. Extending a run therefore moves no
         unit to another shard. Consecutive blocks, realisations and seeds of a condition
-        are assigned to consecutive shards; the id of the condition selects the first.
+        are assigned to consecutive shards. The id of the condition selects the first
+        shard.
         """
         first = int(self.condition.id, 16)
         turn = first + self.seed + self.realisation + self.block

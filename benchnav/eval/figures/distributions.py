@@ -19,7 +19,7 @@ _QUANTITIES = {
     "traversability": "λ̄, mean observed λ",
 }
 _DOTS = {"success": (BLUE, "o"), "failure": (ORANGE, "x")}  # colour and marker of a dot
-_MAX_OFFSET = 0.32  # of a dot from the middle of its row, in rows
+_MAX_OFFSET = 0.32  # maximum offset of a dot from its row, in rows
 
 
 class Distributions(Figure):

@@ -32,7 +32,7 @@ class DrivenPaths(Figure):
     name = "driven"
     trim = True
 
-    def needs(self, data: RunData) -> bool:
+    def is_available(self, data: RunData) -> bool:
         """Return whether the run has steps and a stored map."""
         return data.driven is not None
 

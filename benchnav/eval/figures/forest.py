@@ -36,7 +36,7 @@ class Forest(Figure):
 
     name = "forest"
 
-    def needs(self, data: RunData) -> bool:
+    def is_available(self, data: RunData) -> bool:
         """Return whether the suite has hypotheses."""
         return not data.tests.empty
 

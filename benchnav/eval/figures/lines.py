@@ -27,8 +27,8 @@ def divide_lines(
             enough lines in each panel is used, otherwise the last list.
 
     Returns:
-        The columns in the titles of panels; and the title and the indices of lines of
-        each panel.
+        The columns in the titles of panels; and, for each panel, its title and the
+        indices of its lines.
     """
     is_blind = labels["model"] == NOT_USED
     numbered = labels.assign(line=labels.index)

@@ -27,9 +27,9 @@ def known_colours(recording: Recording, step: int) -> dict[str, np.ndarray]:
 
     Returns:
         Colours by name, uint8, each of shape [H, W, 3]. `risk` is λ̂ with non-free
-        cells. If the robot learns, `mean` and `spread` are those of the belief, and
-        these three are veiled in unobserved cells; `seen` is light in observed cells
-        and blue in cells with measured λ.
+        cells. If the robot learns, `mean` and `spread` show the belief, and these
+        three are veiled in unobserved cells; `seen` is light in observed cells and blue
+        in cells with measured λ.
     """
     predicted, free = recording.given_at(step)
     risk = maps.shades(predicted)
@@ -50,7 +50,7 @@ def known_colours(recording: Recording, step: int) -> dict[str, np.ndarray]:
 def true_colours(recording: Recording) -> np.ndarray:
     """Return colours of the λ field and its immobilising cells, uint8, [H, W, 3].
 
-    If λ is resampled, the colours are those of E[λ].
+    If λ is resampled, the colours show E[λ].
     """
     if recording.field is None:
         return maps.shades(recording.true_mean)

@@ -45,7 +45,7 @@ class Regret(Figure):
 
     name = "regret"
 
-    def needs(self, data: RunData) -> bool:
+    def is_available(self, data: RunData) -> bool:
         """Return whether the run has a chain of conditions."""
         return not data.regret.empty
 

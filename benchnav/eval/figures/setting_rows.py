@@ -30,7 +30,8 @@ def lay_out(
 
     Args:
         summary: table from `summary.summarise`.
-        measures: axis labels of the quantities; each block has a panel for each.
+        measures: axis labels of the quantities; each block has a panel for each
+            quantity.
         legend_in: height reserved for a legend, in inches.
 
     Returns:

@@ -40,7 +40,7 @@ class Trajectories(Figure):
             data.recordings, list(data.summary["condition"])
         )
 
-    def needs(self, data: RunData) -> bool:
+    def is_available(self, data: RunData) -> bool:
         """Return whether there are recordings, or steps from which to create them."""
         return bool(self._shown(data))
 

@@ -34,7 +34,7 @@ from benchnav.core.sources import digest_of, digests_of_package_modules
 from benchnav.core.store import text_digest
 from benchnav.core.touched import Touches, differing_entries, touches_of
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.eval.experiment.condition import MEANING, Condition
+from benchnav.eval.experiment.condition import SPLIT_PROPERTIES, Condition
 from benchnav.eval.experiment.unit import Conditions, Unit
 from benchnav.models.checkpoint import digests_of
 from benchnav.models.predictor import ModelPart
@@ -44,12 +44,12 @@ PACKAGES = ("torch", "numpy", "scipy", "gpytorch", "segmentation-models-pytorch"
 
 # The module that runs a unit; rows depend on its imports.
 _UNIT = "benchnav.eval.run.unit"
-_MAX_NAMED = 3
+_MAX_LISTED_MODULES = 3  # maximum number of modules that a message lists
 
 Code = dict[str, dict[str, Any]]
-METRICS = "metrics"  # group of `Code` for metrics in addition to the built-in ones
-# Additional key in `Code`, next to its groups: files, packages and environment variables
-# that custom parts read, which are known only after a run.
+METRICS = "metrics"  # key in `Code` of metrics in addition to the built-in ones
+# Additional key in `Code`: files, packages and environment variables that custom parts
+# read. They are known only after a run.
 TOUCHED = "touched"
 
 
@@ -125,15 +125,15 @@ def describe_parts(condition: Condition) -> Code:
     parts: dict[str, Any] = {}
     for kind, part in condition.parts.items():
         name = f"{kind} {part.part}"
-        target = part.found
+        source = part.found
         folder = part.folder if isinstance(part, ModelPart) else None
         if folder is not None:
             parts[name] = text_digest(digests_of(folder))
-        if target.shipped:
-            modules.append(target.target.__module__)
+        if source.shipped:
+            modules.append(source.target.__module__)
         else:
             class_name = f"class of {name}" if folder else name
-            parts[class_name] = text_digest([target.origin, target.digest])
+            parts[class_name] = text_digest([source.origin, source.digest])
         for text, digest in registry.option_files(part).items():
             parts[f"{text} of {name}"] = digest
     statistics = condition.statistics
@@ -143,24 +143,27 @@ def describe_parts(condition: Condition) -> Code:
 
 
 def describe_metrics(metrics: Iterable[Part]) -> dict[str, Any]:
-    """Return each metric's part, options, and digest of code and files, by column."""
+    """Return a description of each metric, by column: part, options and digest.
+
+    The digest is that of the metric's code and files.
+    """
     described = {}
     for part in metrics:
-        target = part.found
-        sources: Any = [target.origin, target.digest]
-        if target.shipped:
-            sources = digests_of_package_modules([target.target.__module__])
+        source = part.found
+        code: Any = [source.origin, source.digest]
+        if source.shipped:
+            code = digests_of_package_modules([source.target.__module__])
         files = registry.option_files(part)
         described[part.object.column] = {
             "part": part.part,
             "options": dict(part.options),
-            "digest": text_digest([sources, files]),
+            "digest": text_digest([code, files]),
         }
     return described
 
 
-def lacks_metrics(code: Mapping[str, Any], expected: Code) -> list[str]:
-    """Return the columns of additional metrics that rows lack, by their code.
+def missing_metrics(code: Mapping[str, Any], expected: Code) -> list[str]:
+    """Return the columns of additional metrics that rows do not have.
 
     Args:
         code: code of the rows.
@@ -170,7 +173,7 @@ def lacks_metrics(code: Mapping[str, Any], expected: Code) -> list[str]:
     return [column for column in expected.get(METRICS, {}) if column not in columns]
 
 
-def touches(condition: Condition, metrics: Iterable[Part] = ()) -> Touches:
+def inputs_read_by_parts(condition: Condition, metrics: Iterable[Part] = ()) -> Touches:
     """Return the files, packages and variables that custom parts read in this process.
 
     See `benchnav.core.touched`.
@@ -180,7 +183,10 @@ def touches(condition: Condition, metrics: Iterable[Part] = ()) -> Touches:
 
 
 def describe_datasets(conditions: Conditions) -> dict[str, Any]:
-    """Return each dataset's id, and digests of its maps and properties by split."""
+    """Return each dataset's id, and digests by split: of its maps and its properties.
+
+    The digest of the properties has the key `about`, as in the dataset's reader.
+    """
     described: dict[str, Any] = {}
     for condition, extent in conditions.values():
         dataset = condition.dataset
@@ -210,9 +216,9 @@ def code_differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list
     modules = _differing(earlier, now, "modules")
     if modules:
         more = ""
-        if len(modules) > _MAX_NAMED:
-            more = f" and {len(modules) - _MAX_NAMED} more of its modules"
-        lines.append(f"{', '.join(modules[:_MAX_NAMED])}{more}")
+        if len(modules) > _MAX_LISTED_MODULES:
+            more = f" and {len(modules) - _MAX_LISTED_MODULES} more modules of benchnav"
+        lines.append(f"{', '.join(modules[:_MAX_LISTED_MODULES])}{more}")
     for name in _differing(earlier, now, "environment"):
         before = earlier["environment"][name]
         lines.append(f"{name} ({before} to {now['environment'][name]})")
@@ -253,7 +259,7 @@ def dataset_differences(
                 changed.append(f"maps of {data} {split}")
             properties = entry["about"][split]
             if now_entry["about"].get(split, properties) != properties:
-                changed.append(f"{MEANING} of {data} {split}")
+                changed.append(f"{SPLIT_PROPERTIES} of {data} {split}")
     return changed
 
 

@@ -112,8 +112,8 @@ def read_results(folder: Path, partial: bool = False) -> Results:
     if not finished:
         raise ConfigError(
             f"Expected a run with a finished unit, got {folder}, where 0 of "
-            f"{len(all_units)} units are finished. Wait for the first unit, or run the "
-            "run's `benchnav-eval run` command."
+            f"{len(all_units)} units are finished. Wait for the first unit, or repeat "
+            "the `benchnav-eval run` command of this folder."
         )
     episodes = pd.concat(tables, ignore_index=True)
     with_rows = set(episodes["condition"])

@@ -32,7 +32,7 @@ from benchnav.eval.folder.provenance import (
     TOUCHED,
     Origin,
     code_digest,
-    touches,
+    inputs_read_by_parts,
 )
 from benchnav.eval.folder.sealed import (
     CONTENT,
@@ -166,11 +166,11 @@ def read_table(folder: Path, name: str) -> pd.DataFrame:
                 "…`."
             )
         raise ConfigError(
-            f"Expected a finished run, got {folder} without {name}. Run its "
-            "`benchnav-eval run` command again to finish it; `benchnav-eval report "
-            "--partial` and `replay` can read unfinished runs."
+            f"Expected a finished run, got {folder} without {name}. To finish the run, "
+            "repeat its `benchnav-eval run` command. `benchnav-eval report --partial` "
+            "and `replay` can read unfinished runs."
         )
-    with damaged(path, "Remove it, and run the run's command again."):
+    with damaged(path, "Remove it, and repeat the command of the run."):
         digests = run.manifest.get("tables", {})
         if digests.get(name) != digest_of_path(path):
             raise DamageError("it was changed after benchnav wrote it")
@@ -319,7 +319,7 @@ def write_unit(
         "made": secrets.token_hex(8),
         "traceback": traceback,
         "errors": list(errors),
-        TOUCHED: touches(unit.condition, unit.metrics),
+        TOUCHED: inputs_read_by_parts(unit.condition, unit.metrics),
         "steps": steps_metadata.get(CONTENT, ""),
         "recordings": recordings,
     }

@@ -146,7 +146,7 @@ def metric_table(table: pd.DataFrame, quantity: Quantity, by: str) -> Table:
     notes = (
         f"Tests by {grouped}: signs of the difference, p corrected over {pairs} "
         "(Holm).",
-        "Intervals are of means and not corrected: they can exclude 0 where p > "
+        "Intervals are for means and not corrected: they can exclude 0 although p > "
         f"{ALPHA}.",
     )
     return _pair_table(table, by, ("n_maps", "n_episodes"), columns, notes)
@@ -238,6 +238,6 @@ def _comparison_notes(table: pd.DataFrame, difference: float) -> tuple[str, ...]
     return (
         f"Tests by {unit}: signs of the difference (success) and ranks (T_total), p "
         f"corrected over {pairs} (Holm).",
-        "Intervals are of means and not corrected: they can exclude 0 where p > "
+        "Intervals are for means and not corrected: they can exclude 0 although p > "
         f"{ALPHA}. {needed}",
     )

@@ -75,8 +75,8 @@ def hypothesis_table(
     notes = (
         f"Tests: {used.format(unit=unit)}; p is corrected over {family} (Holm). "
         f"Supported: p < {ALPHA}.",
-        "Intervals are those of single differences, without correction, so that an "
-        "interval and p can disagree.",
+        "Each interval is for one difference and is not corrected, so an interval and "
+        "its p can disagree.",
     )
     rows = tests.assign(number=range(1, len(tests) + 1)).to_dict("records")
     columns = [
@@ -114,11 +114,18 @@ def hypothesis_table(
 
 
 def _claim(row: Mapping[Any, Any], quantities_by_name: Mapping[str, Quantity]) -> str:
-    """Return the claim of a hypothesis, with names of conditions as in tables."""
+    """Return the claim of a hypothesis, with names of conditions as in tables.
+
+    Names with commas are in brackets, which show where a name ends.
+    """
     names = [field.name for field in fields(Hypothesis)]
     test = Hypothesis(**{name: row[name] for name in names})
-    first, second = map(reading_names, row["names"])
+    first, second = (_in_brackets(reading_names(name)) for name in row["names"])
     return test.claim(first, second, quantities_by_name[test.metric])
+
+
+def _in_brackets(name: str) -> str:
+    return f"({name})" if ", " in name else name
 
 
 def _result(row: Mapping[Any, Any]) -> str:

@@ -276,7 +276,7 @@ def _mean_column(metric: Metric, write: Callable[[Any], str]) -> Column:
 
 
 def _columns_to_full(rows: Sequence[Row], summary: pd.DataFrame) -> list[Column]:
-    """Return columns of differences to the same condition with the sensor `full`."""
+    """Return columns of differences from the same condition with sensor `full`."""
     is_full = summary["sensor"] == "full"
     full = {_without_sensor(row): row for row in summary[is_full].to_dict("records")}
 

@@ -56,7 +56,7 @@ class Report(RunData):
         table: table of results, one row per condition.
         warnings: lines on errors, and on contents that could not be shown.
         mark: mark of an unfinished run; empty for a finished run.
-        faults: those of the warnings that are about custom figures.
+        faults: warnings about custom figures, which `warnings` also contains.
     """
 
     name: str

@@ -1,1 +1,1 @@
-"""Running a suite: its episodes, in one process or many, and again."""
+"""Running a suite in one or several processes, and merging or repeating runs."""

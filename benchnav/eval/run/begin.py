@@ -114,7 +114,7 @@ def _parts(metrics: Iterable[NamedMetric]) -> tuple[Part, ...]:
 
 
 def _merged(new: Conditions, earlier: Conditions) -> tuple[Conditions, Conditions]:
-    """Merge new conditions into those of a run.
+    """Merge new conditions into the conditions of a run.
 
     A new condition that differs from an earlier one only in unused settings is merged
     into the earlier one.
@@ -200,7 +200,8 @@ def check_resumable(run: Run) -> None:
     if parts:
         raise ConfigError(
             f"Expected a run that can be resumed, got {run.folder}, whose {parts[0]} "
-            "was an object of one process. Evaluate the suite into a new folder."
+            "was a Python object that existed only in the process that began the run. "
+            "Evaluate the suite into a new folder."
         )
 
 

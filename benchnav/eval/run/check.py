@@ -80,7 +80,8 @@ def check_suite(suite: Suite, uses_workers: bool) -> Checked:
     if not conditions:
         raise ConfigError(
             "Expected a suite with at least one condition, got none. `data` has the "
-            f"scenarios {scenarios_of(suite.data)}; it needs a split test/SCENARIO."
+            f"scenarios {scenarios_of(suite.data)}. The dataset needs a split "
+            "test/SCENARIO."
         )
     maps = {
         condition.id: check_split(condition, suite.maps) for condition in conditions
@@ -172,23 +173,23 @@ def check_split(condition: Condition, maps: int) -> int:
     dataset = condition.dataset
     scenarios = scenarios_of(condition.data)
     if condition.scenario not in scenarios:
+        suggestion = hint(condition.scenario, scenarios)
         raise ConfigError(
-            f"Expected `scenarios` of {dataset.path}, which has {scenarios}, got "
-            f"{condition.scenario!r}."
-            f"{hint(condition.scenario, scenarios)}{_remedy(dataset, condition.split, 1)}"
+            f"Expected `scenarios` among {scenarios} for {dataset.path}, got "
+            f"{condition.scenario!r}.{suggestion}{_remedy(dataset, condition.split, 1)}"
         )
     count = dataset.map_count(condition.split)
     if maps > count:
         raise ConfigError(
-            f"Expected `maps` at most {count}, the number of maps of {condition.split} "
-            f"in {dataset.path}, got {maps}. Use 0 for all maps."
-            f"{_remedy(dataset, condition.split, maps)}"
+            f"Expected `maps` at most {count}, which is the number of maps of "
+            f"{condition.split} in {dataset.path}, got {maps}. Use 0 for all "
+            f"maps.{_remedy(dataset, condition.split, maps)}"
         )
     return maps or count
 
 
 def _remedy(dataset: TerrainDataset, split: str, maps: int) -> str:
-    """Return a sentence with the command that creates missing maps; empty without one."""
+    """Return a sentence with the command that creates missing maps; may be empty."""
     if dataset.id not in shipped_recipes():
         return ""
     if shipped_sizes(dataset.id).get(split, 0) < maps:
@@ -210,10 +211,11 @@ def check_everywhere(
     for part in parts:
         if not part.found.everywhere:
             raise ConfigError(
-                f"Expected a {part.kind} that other processes can load, since `jobs`, "
-                f"`scheduler` or `planner_limit_s` uses them, got {part.part!r}, which "
-                "exists only in this process. Write its class into a file, and import "
-                "it from the file or name it as path/to/file.py:Name."
+                f"Expected a {part.kind} that other processes can load, got "
+                f"{part.part!r}, which exists only in this process. `jobs`, "
+                "`scheduler` or `planner_limit_s` uses other processes. Write the "
+                "class into a file, and import it from the file or name it as "
+                "path/to/file.py:Name."
             )
 
 
@@ -245,7 +247,7 @@ def build_each(conditions: Sequence[Condition], maps: int) -> list[str]:
 
 
 def _distinct(conditions: Sequence[Condition], *names: str) -> list[Condition]:
-    """Return the first condition of each combination of values of some fields."""
+    """Return the first of all conditions that agree in the named fields."""
     first: dict[str, Condition] = {}
     for condition in conditions:
         value = {**condition.value, "scenario": condition.scenario}

@@ -35,8 +35,8 @@ def run_on_worker(
         settings: settings of the run.
 
     Raises:
-        ConfigError: If `check_worker` rejects the worker, or its code or maps differ;
-            the message names the worker.
+        ConfigError: If `check_worker` rejects the worker, or the worker has other code
+            or maps; the message names the worker.
     """
     from distributed import get_worker
 
@@ -60,7 +60,7 @@ def run_on_worker(
 
 
 def check_worker(worker: Any, settings: Settings) -> None:
-    """Reject a worker whose rows would differ from those of the command's process.
+    """Reject a worker whose rows would differ from rows of the command's process.
 
     Args:
         worker: Dask worker.
@@ -78,9 +78,9 @@ def check_worker(worker: Any, settings: Settings) -> None:
         )
     if settings.planner_limit_s and multiprocessing.current_process().daemon:
         raise ConfigError(
-            "Expected workers that may start processes, which `planner_limit_s` "
-            f"needs, got {worker.address}, which may not. Start workers by `dask "
-            "worker … --no-nanny`, or set DASK_DISTRIBUTED__WORKER__DAEMON=False."
+            "Expected workers that may start processes for `planner_limit_s`, got "
+            f"{worker.address}, which may not. Start workers by `dask worker … "
+            "--no-nanny`, or set DASK_DISTRIBUTED__WORKER__DAEMON=False."
         )
     if settings.device == "cuda" and not torch.cuda.is_available():
         raise ConfigError(

@@ -81,8 +81,8 @@ def _plans_once(condition: Condition) -> str:
         return ""
     return (
         "Expected belief 'static' and sensor 'full' for planner "
-        f"{condition.planner.label!r}, which plans once, got "
-        f"{condition.belief.label!r} and {condition.sensor.label!r}."
+        f"{condition.planner.label!r}, got {condition.belief.label!r} and "
+        f"{condition.sensor.label!r}. This planner plans only once."
     )
 
 
@@ -91,8 +91,8 @@ def _given_truth(condition: Condition) -> str:
     if not is_given or condition.model.part == "clairvoyant":
         return ""
     return (
-        f"Expected model 'clairvoyant' for planner {condition.planner.label!r}, which "
-        f"is given λ itself, got {condition.model.label!r}."
+        f"Expected model 'clairvoyant' for planner {condition.planner.label!r}, got "
+        f"{condition.model.label!r}. This planner needs the true λ."
     )
 
 

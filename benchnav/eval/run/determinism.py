@@ -37,8 +37,8 @@ def check_determinism(
     Rows are compared bit for bit, except planning times. The second process runs units
     and maps in reverse order, twice. The rows of its second repetition are compared,
     since parts that retain state have accumulated it by then. If rows differ, a third
-    process repeats the units of the first, which distinguishes retained state from
-    external input.
+    process repeats the units of the first process, which distinguishes retained state
+    from external input.
 
     Args:
         suite: suite whose conditions are checked.

@@ -23,7 +23,8 @@ from benchnav.planning.planners.planner import Plan, Planner
 from benchnav.planning.problem import Problem
 from benchnav.planning.sensing.sensor import Step
 
-# Time limits in seconds. Calls that may start or compile get the first in addition.
+# Time limits in seconds. Calls that may start or compile get the first limit in
+# addition.
 _START_S = 120.0
 _CLOSE_S = 5.0
 

@@ -55,7 +55,7 @@ class KnowledgeTracker:
         problem: the planner's problem at the start.
 
     Attributes:
-        revisions: number of changes of each robot's map of λ̂, int64, shape [B].
+        revisions: number of times each robot's λ̂ map was updated, int64, shape [B].
         seen_cells: number of cells whose appearance each robot has observed up to its
             last update, int64, shape [B].
         sensed_cells: number of cells whose λ each robot has measured up to its last
@@ -187,7 +187,7 @@ class KnowledgeTracker:
         return risk_map, free | self._at_goal
 
     def _merged_belief(self, state: Any, indices: Tensor) -> Any:
-        """Return `state` with the belief of some episodes replaced by the current one.
+        """Return `state` with the current belief in some episodes.
 
         Args:
             state: belief state of the remaining episodes in the planner's problem.
@@ -241,7 +241,7 @@ class KnowledgeTracker:
         return is_near & (turn.abs() <= math.radians(AHEAD_DEG))
 
     def maps_of(self, step: int, episode_indices: Iterable[int]) -> dict[int, KnownMap]:
-        """Return the known maps of those of the given episodes that still remain.
+        """Return the known maps of the given episodes that still run.
 
         Args:
             step: index of the step.

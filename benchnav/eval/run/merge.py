@@ -142,8 +142,8 @@ def _open_shard(part: Path) -> Run:
     run = open_run(part)
     if run.shard is None:
         raise ConfigError(
-            "Expected folders of shards, created by `benchnav-eval run … --shard "
-            f"I/N`, got {part}, which is not a shard. Leave it out."
+            f"Expected folders of shards, got {part}, which is not a shard. "
+            "`benchnav-eval run … --shard I/N` creates shards. Leave this folder out."
         )
     return run
 
@@ -151,7 +151,9 @@ def _open_shard(part: Path) -> Run:
 def _check_alike(runs: Sequence[Run]) -> None:
     """Reject shards of different runs, listing all differences."""
     if not runs:
-        raise ConfigError("Expected one or more `parts`, folders of shards, got none.")
+        raise ConfigError(
+            "Expected one or more folders of shards as `parts`, got none."
+        )
     reasons = []
     for run in runs[1:]:
         differing = _unlike(runs[0], run)
@@ -213,8 +215,8 @@ def _find(unit: Unit, runs: Sequence[Run]) -> Finished | None:
         damage = finished_unit.damage()
         if damage:
             raise ConfigError(
-                f"{finished_unit.folder} is damaged: {damage[0]}. Run the shard's command "
-                "again: it runs the damaged unit again."
+                f"{finished_unit.folder} is damaged: {damage[0]}. Repeat the command "
+                "of the shard, which runs the damaged unit again."
             )
     if not newest:
         return None
@@ -243,9 +245,9 @@ def _check_whole(missing: Sequence[Unit], runs: Sequence[Run]) -> None:
         begun = f" in {folders[index]}" if index in folders else ""
         named.append(f"{count} {noun} of shard {index}/{of}{begun}")
     raise ConfigError(
-        f"Expected all units of the run, but these are missing: {', '.join(named)}. "
-        "Run the run's command with each of these shards as `--shard`, then run this "
-        "command again with all parts."
+        f"Expected all units of the run, got shards without {', '.join(named)}. Repeat "
+        "the command of the run once for each shard named here, with that shard as "
+        "`--shard`. Then repeat this command with the folders of all shards."
     )
 
 

@@ -108,9 +108,9 @@ def _row(folder: Path, unit: Unit, map_index: int) -> dict[str, Any]:
     matches = _matching(rows, keys)
     if matches.empty:
         raise ConfigError(
-            f"Expected a finished episode, got one that {folder} does not have yet. "
-            "Run its `benchnav-eval run` command again to finish it, or select another "
-            "condition."
+            f"Expected a finished episode, got one that {folder} does not contain yet. "
+            "To finish the episode, repeat the `benchnav-eval run` command of that "
+            "folder, or select another condition."
         )
     return matches.to_dict("records")[0]
 

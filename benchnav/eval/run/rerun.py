@@ -68,7 +68,7 @@ def rerun(
     check_resumable(run)
     if folder.resolve() == run_folder.resolve():
         raise ConfigError(
-            "Expected `out` to differ from the folder of the repeated run, got "
+            "Expected `out` to differ from the folder of the original run, got "
             f"{folder}. Choose another `out`."
         )
     if not overwrite and (folder / RUN).exists():
@@ -132,7 +132,7 @@ def compare(run_folder: Path, folder: Path) -> tuple[bool, list[str]]:
 
 
 def _open(folder: Path) -> Run:
-    """Open a finished run; reject one without a table."""
+    """Open a finished run; reject a run without a table."""
     run = open_run(folder)
     read_table(folder, EPISODES)
     return run
@@ -150,8 +150,8 @@ def _check_repeats(run: Run, folder: Path) -> None:
     if copied:
         raise ConfigError(
             f"Expected `out` to be new or an earlier rerun of {run.folder}, got "
-            f"{folder}, where {len(copied)} of {len(run_units)} units are copies of "
-            "units of the run. Choose another `out`, or pass --overwrite."
+            f"{folder}, where {len(copied)} of {len(run_units)} units are copies from "
+            "the original run. Choose another `out`, or pass --overwrite."
         )
 
 
@@ -179,7 +179,7 @@ def _check_available(run: Run) -> None:
             missing[str(error)] = None
     if missing:
         raise ConfigError(
-            f"Expected all inputs of {run.folder}, but some are missing: "
+            f"Expected all inputs of {run.folder}, got none for some parts or maps: "
             f"{' '.join(missing)}"
         )
     conditions = [condition for condition, _ in run.conditions.values()]

@@ -68,17 +68,17 @@ class Episodes:
         states: robot states, shape [B, N + 1, S].
         actions: commanded actions, shape [B, N, A].
         traversability: observed λ of each step, shape [B, N].
-        speed_mps: speed that the action of each step would give on terrain with λ = 1,
-            in m/s, shape [B, N].
-        turn_rate_radps: turn rate that the action of each step would give on terrain
-            with λ = 1, in rad/s, shape [B, N].
+        unhindered_speed_mps: speed that the action of each step would give on terrain
+            with λ = 1, in m/s, shape [B, N].
+        unhindered_turn_rate_radps: turn rate that the action of each step would give on
+            terrain with λ = 1, in rad/s, shape [B, N].
         outcome: codes of `Outcome`, int64, shape [B].
         steps: number of steps to the end, int64, shape [B].
         begin_s: wall time of the planner's preparation for the batch, in seconds.
         planning_s: wall time of planning at each step, for all planned episodes, in
             seconds, shape [N].
         planned: number of planned episodes at each step, int64, shape [N].
-        revisions: number of changes of each robot's map of λ̂, int64, shape [B].
+        revisions: number of times each robot's λ̂ map was updated, int64, shape [B].
         learning_s: wall time of sensing and updates in all steps, in seconds.
         errors: one-line description of the error that ended each episode, length B;
             empty without an error.
@@ -95,8 +95,8 @@ class Episodes:
     states: Tensor
     actions: Tensor
     traversability: Tensor
-    speed_mps: Tensor
-    turn_rate_radps: Tensor
+    unhindered_speed_mps: Tensor
+    unhindered_turn_rate_radps: Tensor
     outcome: Tensor
     steps: Tensor
     begin_s: float
@@ -161,7 +161,7 @@ class _Log:
         no_actions = empty[..., None].expand(-1, 0, n_actions)
         self._steps = [[no_actions, empty, empty, empty]]
         self.clock = Clock(device)  # times the preparation, then each plan
-        self.learning = Clock(device)  # times sensing and updates
+        self.learning_clock = Clock(device)  # times sensing and updates
         self.planned: list[int] = []
         self._reasons: list[str] = []
         # Index of each episode's reason; -1 without an error.
@@ -223,15 +223,15 @@ class _Log:
             states=track.cpu(),
             actions=actions.cpu(),
             traversability=traversability.cpu(),
-            speed_mps=(distance_m / self.dt_s).cpu(),
-            turn_rate_radps=turn_rate.cpu(),
+            unhindered_speed_mps=(distance_m / self.dt_s).cpu(),
+            unhindered_turn_rate_radps=turn_rate.cpu(),
             outcome=outcome.cpu(),
             steps=now.step.cpu(),
             begin_s=seconds[0] if seconds else 0.0,
             # If the planner raised, its last plan belongs to no step.
             planning_s=torch.tensor(seconds[1 : n_steps + 1], dtype=torch.float64),
             planned=torch.tensor(self.planned[:n_steps]),
-            learning_s=sum(self.learning.seconds()),
+            learning_s=sum(self.learning_clock.seconds()),
             errors=tuple(errors),
             traceback=traceback_,
             **learning,
@@ -303,7 +303,7 @@ def run_episodes(
             if tracker is not None:
                 state = batch.part_of(now.state)
                 running_part = batch.part_of(now.running)
-                with log.learning.timed():
+                with log.learning_clock.timed():
                     revised_problem = tracker.learn(count, state, running_part)
                 if tracker.is_due(count):
                     tracker.look_ahead(count, state, running_part)
@@ -400,7 +400,7 @@ class _Batch:
         return indices
 
     def part_of(self, values: Tensor) -> Tensor:
-        """Select the planned episodes from `values` of all, shape [B, ...]."""
+        """Select the planned episodes from the values of all episodes, [B, ...]."""
         return values[self._index]
 
     def revise(self, problem: Problem, generator: torch.Generator) -> None:
@@ -434,7 +434,7 @@ class _Batch:
 
 
 class RobotError(BenchnavError):
-    """The robot dynamics F raised an error in the simulation; no result is valid."""
+    """The robot dynamics F raised an error in the simulation, so no result is valid."""
 
 
 def _move(

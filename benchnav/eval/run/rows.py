@@ -66,8 +66,8 @@ def finished_episodes(
             states=_float64(episodes.states[b, : steps + 1]),
             actions=_float64(episodes.actions[b, :steps]),
             action_names=problem.robot.action_names,
-            speed_mps=_float64(episodes.speed_mps[b, :steps]),
-            turn_rate_radps=_float64(episodes.turn_rate_radps[b, :steps]),
+            speed_mps=_float64(episodes.unhindered_speed_mps[b, :steps]),
+            turn_rate_radps=_float64(episodes.unhindered_turn_rate_radps[b, :steps]),
             traversability=_float64(episodes.traversability[b, :steps]),
             outcome=outcome.name.lower(),
             dt_s=problem.dt_s,
@@ -175,7 +175,7 @@ def episode_rows(
         of the unit's additional metrics.
 
     Raises:
-        MetricError: If a metric raises, or returns an infinite value or no number.
+        MetricError: If a metric raises, or returns an infinite or non-numeric value.
     """
     further = [part.create() for part in unit.metrics]
     rows = []

@@ -32,7 +32,7 @@ from benchnav.eval.folder.provenance import (
     Origin,
     Origins,
     code_differences,
-    lacks_metrics,
+    missing_metrics,
 )
 from benchnav.eval.folder.run_folder import (
     EPISODES,
@@ -271,7 +271,7 @@ def _units_to_run(
     say: Say,
     is_local: bool,
 ) -> list[tuple[Unit, Origin]]:
-    """Return the units to run: unfinished, damaged, changed or unrecorded ones.
+    """Return the units to run: unfinished, damaged, changed or unrecorded units.
 
     Args:
         shard_units: requested units.
@@ -338,7 +338,7 @@ def _why_missing(
         return "new", []
     newest = finished_units[0]
     differences = _differences(newest, origin)
-    columns = lacks_metrics(newest.metadata["code"], origin.code)
+    columns = missing_metrics(newest.metadata["code"], origin.code)
     if columns and not differences:
         return "unmeasured", [", ".join(columns)]
     return "other", differences
@@ -365,7 +365,7 @@ def _valid_file(
     if not reuse_code:
         return None
     for finished_unit in finished_units:
-        has_metrics = not lacks_metrics(finished_unit.metadata["code"], origin.code)
+        has_metrics = not missing_metrics(finished_unit.metadata["code"], origin.code)
         if finished_unit.metadata["digests"] == maps and has_metrics:
             return finished_unit
     return None
@@ -403,8 +403,8 @@ def _check_unchanged(finished: list[Finished], is_local: bool) -> None:
     if changed:
         raise ConfigError(
             "Expected files, packages and variables that parts read not to change "
-            f"during the run, got changes: {'; '.join(changed)}. Run the run's command "
-            "again: it runs the units with other contents again."
+            f"during the run, got changes: {'; '.join(changed)}. Repeat the command of "
+            "the run, which runs the units with other contents again."
         )
 
 
@@ -425,8 +425,8 @@ def _finished(
         if finished_unit is None:
             raise ConfigError(
                 f"Expected unit {unit.name} of condition {unit.condition.id} in "
-                f"{folder}, got none, since it was removed. Run its `benchnav-eval "
-                "run` command again."
+                f"{folder}, got none, because the unit was removed. Repeat the "
+                "`benchnav-eval run` command of this folder."
             )
         counted.append((unit, finished_unit))
         changed = []

@@ -153,9 +153,9 @@ def _check_origin(unit: Unit, origin: Origin, settings: Settings) -> None:
         changed.append(f"maps of {unit.condition.data} {unit.condition.split}")
     if changed or now != origin:
         raise ConfigError(
-            "Expected the code and the maps with which the run was begun, got "
-            f"changes: {'; '.join(changed)}. Run the run's command again; finished "
-            "units are kept."
+            "Expected the code and the maps with which the run was begun, got changes: "
+            f"{'; '.join(changed)}. Repeat the command of the run; finished units are "
+            "kept."
         )
 
 

@@ -13,8 +13,8 @@ from benchnav.core.settings import check_known
 from benchnav.eval.experiment.condition import (
     KNOWLEDGE,
     LABELS,
-    MEANING,
     NOT_USED,
+    SPLIT_PROPERTIES,
     differences,
 )
 from benchnav.eval.experiment.unit import DRAW
@@ -49,7 +49,7 @@ class Compared:
         maps: digests of the maps, in the order of maps.
         episodes: rows of the condition, with T as `time_budget_s`.
         code: code of the rows by name of the run, as in `Origin.code`.
-        map_properties: digest of the properties `MEANING` of the maps; empty if the run
+        map_properties: digest of the `SPLIT_PROPERTIES` of the maps; empty if the run
             does not contain it.
     """
 
@@ -171,8 +171,9 @@ def by_what(conditions: Sequence[Compared], by: str = "", against: str = "") -> 
     columns = list(columns_of[against])
     if len(columns) > 1:
         raise ConfigError(
-            f"Expected `against` to be a label of one column, got {against!r}, a label "
-            f"of {' and of '.join(columns)}. Pass --by {' or --by '.join(columns)}."
+            f"Expected `against` to be a label of one column, got {against!r}, which "
+            f"is a label of {' and of '.join(columns)}. Pass --by "
+            f"{' or --by '.join(columns)}."
         )
     return columns[0]
 
@@ -344,7 +345,7 @@ def check_maps(first: Compared, second: Compared, names: str) -> None:
     differing = []
     has_properties = bool(first.map_properties and second.map_properties)
     if has_properties and first.map_properties != second.map_properties:
-        differing.append(MEANING)
+        differing.append(SPLIT_PROPERTIES)
     if not first_groups[common_maps].equals(second_groups[common_maps]):
         differing.append("groups of maps")
     if differing:

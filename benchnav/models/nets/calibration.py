@@ -118,10 +118,11 @@ def sample_logits(
 ) -> tuple[Tensor, Tensor]:
     """Classify maps and return a sample of at most 200 000 cells.
 
-    At most equally many cells are taken from each map.
+    Each map contributes at most the same number of cells.
 
     Args:
-        classifier: returns logits [B, C, H, W] from the layers of maps by name.
+        classifier: function that returns logits [B, C, H, W] from the layers of maps by
+            name.
         maps: a `models.training.data.MapDataset` with its inputs and `class_id`.
         seed: root seed for sampling cells.
         device: device of the computation, to which the classifier is moved.
@@ -163,10 +164,11 @@ def sample_scores(
 ) -> tuple[Tensor, Tensor]:
     """Predict maps and return the normal scores of at most 200 000 observed cells.
 
-    At most equally many cells are taken from each map.
+    Each map contributes at most the same number of cells.
 
     Args:
-        predict: returns distributions [B, H, W] from the layers of maps by name.
+        predict: function that returns distributions [B, H, W] from the layers of maps
+            by name.
         maps: a `models.training.data.MapDataset` with the inputs and `traversability`.
         inputs: layers that the model receives.
         seed: root seed for sampling cells.

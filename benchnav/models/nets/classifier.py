@@ -197,7 +197,7 @@ class WithFullResolution(nn.Module):
     """A network whose last layers also receive features of the full-resolution image.
 
     Args:
-        network: returns features [B, 32, H, W] from images [B, N, H, W].
+        network: network that returns features [B, 32, H, W] from images [B, N, H, W].
         channels: N, number of channels of the images.
         class_count: C, number of classes.
     """
@@ -256,9 +256,9 @@ def build_network(
             if not config.pretrained:
                 raise
             raise out_of_memory_error(error) or ConfigError(
-                f"Expected the ImageNet weights of {config.encoder} to download for "
-                f"`pretrained`, got: {one_line(error).rstrip('.')}. Try again with a "
-                "network connection, or leave out `pretrained` "
+                f"Expected the download of the ImageNet weights of {config.encoder} "
+                f"for `pretrained` to succeed, got: {one_line(error).rstrip('.')}. Try "
+                "again with a network connection, or leave out `pretrained` "
                 "(--classifier.pretrained or --mdn.pretrained)."
             ) from error
         except (ValueError, TypeError) as error:
@@ -287,8 +287,9 @@ def _network_sizes(config: ClassifierConfig) -> dict[str, Any]:
     has_channels = isinstance(default_channels, tuple)
     expect(
         has_channels or not config.decoder_channels,
-        f"no `decoder_channels` for the architecture {config.architecture}, which has "
-        f"no such setting, got {list(config.decoder_channels)}. Leave it out.",
+        f"no `decoder_channels` for the architecture {config.architecture}, got "
+        f"{list(config.decoder_channels)}. The architecture has no such setting. Leave "
+        "it out.",
     )
     sizes: dict[str, Any] = {}
     if config.decoder_channels:

@@ -106,6 +106,6 @@ def check_inputs(inputs: Sequence[str], fields: Iterable[str]) -> None:
     for name in inputs:
         if name not in options:
             raise ConfigError(
-                f"Expected `inputs` among the layers of the maps, "
-                f"{', '.join(options)}, got {name!r}.{hint(name, options)}"
+                "Expected `inputs` among the layers of the maps "
+                f"({', '.join(options)}), got {name!r}.{hint(name, options)}"
             )

@@ -21,7 +21,7 @@ def nearest_colour(rgb: Tensor, colours: Tensor) -> Tensor:
         colours: colours of the classes, 0–255, shape [C, 3].
 
     Returns:
-        Class ids, int64, shape [B, H, W]; of equally near classes, the first.
+        Class ids, int64, shape [B, H, W]. Of equally near classes, the first is chosen.
     """
     pixels = rgb.movedim(1, -1).float().flatten(1, 2)
     palette = colours.float().expand(len(rgb), -1, -1)

@@ -54,7 +54,7 @@ class Severity(Figure):
         "maps, 1 the scenario itself."
     )
 
-    def needs(self, data: QualityData) -> bool:
+    def is_available(self, data: QualityData) -> bool:
         """Return whether a series of shifts was measured."""
         return bool(find_series(data.qualities))
 

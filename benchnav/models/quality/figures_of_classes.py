@@ -33,7 +33,7 @@ class Confusion(Figure):
         "split."
     )
 
-    def needs(self, data: QualityData) -> bool:
+    def is_available(self, data: QualityData) -> bool:
         """Return whether the model predicts classes."""
         return bool(data.by_class)
 
@@ -105,7 +105,7 @@ class Reliability(Figure):
         "calibrated model is on the dashed line, an overconfident model below it. ECE is "
         "the mean gap. Lower panel: fraction of cells with that probability."
     )
-    needs = Confusion.needs
+    is_available = Confusion.is_available
 
     def draw(self, data: QualityData) -> Drawing:
         """Draw two panels per split."""

@@ -70,19 +70,21 @@ class PIT(Figure):
         mean_count = counts.sum() / PIT_BINS
         density = counts / mean_count
         tail = round((1 - LEVEL) * PIT_BINS)
-        self._draw_bins(panel, density, 0, tail, ORANGE, "observed, under VaR at 0.9")
+        self._draw_bins(
+            panel, density, 0, tail, ORANGE, "observed λ below the VaR (0.9)"
+        )
         self._draw_bins(panel, density, tail, PIT_BINS, SKY, "observed")
         panel.axhline(1, color="black", lw=0.7, label="calibrated")
         interval = np.array(binom.interval(0.9, counts.sum(), 1 / PIT_BINS))
         low, high = interval / mean_count
-        label = "90 % of a calibrated model's bins"
+        label = "90 % range of a calibrated model's bins"
         panel.fill_between(
             [0, 1], low, high, color=_BAND_COLOUR, lw=0, zorder=0.5, label=label
         )
         for bound in (0.05, 0.95):
             panel.axvline(bound, color="black", lw=0.7, ls=":", label="central 90 %")
         note = (
-            f"in 5–95 %: {quality.coverage:.3f} (ideally 0.9)\nunder VaR: "
+            f"in 5–95 %: {quality.coverage:.3f} (ideally 0.9)\nbelow VaR: "
             f"{quality.tail_rate:.3f} (ideally 0.1)"
         )
         aligned: dict[str, Any] = {"ha": "center", "va": "top", "linespacing": 1.3}
@@ -117,12 +119,12 @@ class Latent(Figure):
     title = "Latent functions of the Gaussian processes"
     text = (
         "Predicted traversability over slope for each class, with the truth in black "
-        "if it is available. Few measured cells are as steep as the light grey part, "
-        "and no cell is as steep as the dark grey part."
+        "if it is available. Few measured cells reach slopes in the light grey area; "
+        "none reaches slopes in the dark grey area."
     )
 
-    def needs(self, data: QualityData) -> bool:
-        """Return whether the model has Gaussian processes and class scores exist."""
+    def is_available(self, data: QualityData) -> bool:
+        """Return whether the model has GPs and there are results by class."""
         return data.table is not None and bool(data.by_class)
 
     def draw(self, data: QualityData) -> Drawing:
@@ -145,7 +147,9 @@ class Latent(Figure):
         x = x[x <= x_max]
         class_ids = np.arange(len(classes))[:, None, None]
         class_id, slopes = np.broadcast_arrays(class_ids, x)
-        mixture = data.table.own(torch.tensor(class_id), torch.tensor(slopes))
+        mixture = data.table.predict_by_class(
+            torch.tensor(class_id), torch.tensor(slopes)
+        )
         predicted = (
             mixture.weights.numpy(),
             mixture.means.numpy(),
@@ -209,10 +213,10 @@ class Latent(Figure):
         panel.plot(x, expected, "k:", lw=1, label="true E[λ]")
 
     def _shade_steep(self, panel: Axes, cells: Sequence[int]) -> None:
-        """Shade slopes that few cells exceed, and darker those that no cell exceeds."""
+        """Shade slopes that few cells exceed; shade slopes that none exceeds darker."""
         shades = (
-            (_RARE_FRACTION, 0.12, "steeper: 1 cell in 1000"),
-            (0.0, 0.25, "steeper: no cell of the class"),
+            (_RARE_FRACTION, 0.12, "only 1 cell in 1000 is steeper"),
+            (0.0, 0.25, "no cell of the class is steeper"),
         )
         for fraction, alpha, label in shades:
             start = _slope_quantile(cells, fraction)

@@ -240,7 +240,7 @@ def _notes(
     plural = "s" if threads > 1 else ""
     cpu = f"the CPU with {threads} thread{plural}"
     lines.append(
-        f"ms a map: median over repeated predictions of a map of {height}×{width} "
+        f"ms per map: median over repeated predictions of a map of {height}×{width} "
         f"cells on {gpu_name(measurement.device) or cpu}"
     )
     return lines

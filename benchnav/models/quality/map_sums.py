@@ -16,13 +16,13 @@ from benchnav.models.quality.scores import (
     LEVEL,
     PIT_BINS,
     TAIL_LEVELS,
-    lower_fifth_and_width,
+    pinball_loss_and_width,
     pit_counts,
     sparsification,
 )
 from benchnav.stats.scores import Sums
 
-# Number of points of a sparsification curve. No cell is removed at the first.
+# Number of points of a sparsification curve. At the first point, no cell is removed.
 STEPS = 50
 
 
@@ -74,7 +74,12 @@ class MapTally:
         self.ranked = np.zeros((2, STEPS))
 
     def add(self, cells: CellScores | None, count: int) -> None:
-        """Add the scores of `count` maps; `cells` is None if no cell was observed."""
+        """Add the scores of `count` maps.
+
+        Args:
+            cells: observed cells of these maps; None if no cell was observed.
+            count: number of maps.
+        """
         sums = {name: torch.zeros(count, dtype=torch.float64) for name in self.names}
         if cells is not None:
             sums |= self._sums_of(cells, count)
@@ -83,14 +88,17 @@ class MapTally:
             self._append(name, values)
 
     def _sums_of(self, cells: CellScores, count: int) -> dict[str, Tensor]:
-        """Return the sums of scores by map, each of shape [count]; update `ranked`."""
+        """Return the sums of scores by map, each of shape [count].
+
+        The sparsification curves are added to `ranked`.
+        """
         scores = dict(cells.scores)
         scores["cells"] = torch.ones_like(cells.observed)
         scores["inside"] = (cells.transformed - 0.5).abs() <= LEVEL / 2
         for level in TAIL_LEVELS:
             scores[f"under_{round(100 * level)}"] = cells.transformed < 1 - level
         if self.quantiles:
-            loss, width = lower_fifth_and_width(cells.predicted, cells.observed)
+            loss, width = pinball_loss_and_width(cells.predicted, cells.observed)
             scores["pinball"] = loss
             scores["width"] = width
             scores["areas"] = self._rank(cells, width[0], count)
@@ -114,7 +122,7 @@ class MapTally:
         true = class_id[labelled]
         is_hit = predicted == true
         hits = true[is_hit] + offset[is_hit]
-        indices = {"true": offset + true, "found": offset + predicted, "hits": hits}
+        indices = {"true": offset + true, "predicted": offset + predicted, "hits": hits}
         for name, index in indices.items():
             counts = torch.bincount(index, minlength=n_maps * self.classes)
             self._append(name, counts.view(n_maps, self.classes))
@@ -170,7 +178,7 @@ _OF_QUANTILES = ("pinball", "width", "areas")
 
 
 def by_group(sums: Sums, groups: np.ndarray) -> dict[str, np.ndarray]:
-    """Add up the sums of each group of maps, so that it counts as one statistical unit.
+    """Add up the sums of all maps of a group, which counts as one statistical unit.
 
     For example, overlapping maps are a group. Groups without observed cells are left
     out.

@@ -58,7 +58,7 @@ class ClassQuality:
         mutual_information: mean mutual information of class and member, in nats; NaN for a
             model with fewer than two members.
         entropy_auroc: probability that a misclassified cell has a higher entropy than a
-            correct one; NaN if all cells or no cells are misclassified.
+            correct cell; NaN if all cells or no cells are misclassified.
         mutual_information_auroc: the same probability for mutual information.
         confusion: number of cells by true class (row) and most likely class (column),
             [C][C].
@@ -164,7 +164,7 @@ def known_splits(dataset: TerrainDataset, splits: Iterable[str] = ()) -> list[st
     if not chosen:
         raise DatasetError(
             f"Expected a test split in {dataset.path}, got {sorted(dataset.splits)}. "
-            "Choose other splits with `splits`."
+            "Choose one or more of these with `splits`."
         )
     for split in chosen:
         dataset.map_count(split)  # raises an error if there is no such split

@@ -87,7 +87,7 @@ def tail_rate(transformed: Tensor, level: float = LEVEL) -> float:
     return float(is_below.double().mean())
 
 
-def lower_fifth_and_width(
+def pinball_loss_and_width(
     distribution: TraversabilityDistribution, observed: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return the pinball loss of quantiles up to 0.2, and the central interval's width.
@@ -120,9 +120,10 @@ def lower_fifth_and_width(
 def sparsification(error: Tensor, uncertainty: Tensor) -> Tensor:
     """Return the mean error of the remaining cells as uncertain cells are removed.
 
-    Cells whose uncertainties differ by less than 0.1 % are tied: each has the mean error of
-    the tied cells. The mean of the first row minus that of the second is the area under the
-    sparsification error curve (AUSE). It is 0 if uncertainties rank cells as errors do.
+    Cells whose uncertainties differ by less than 0.1 % are tied: each has the mean
+    error of the tied cells. The mean of the first row minus the mean of the second row
+    is the area under the sparsification error curve (AUSE). It is 0 if uncertainties
+    rank cells as errors do.
 
     Args:
         error: error of each cell, ≥ 0, shape [N].

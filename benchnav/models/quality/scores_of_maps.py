@@ -52,7 +52,7 @@ def _root(squares: np.ndarray, cells: np.ndarray) -> np.ndarray:
 
 
 def _miou(hits: np.ndarray, true: np.ndarray, predicted: np.ndarray) -> np.ndarray:
-    """Return the intersection over union, averaged over classes that occur in truth."""
+    """Return the intersection over union, averaged over the true classes."""
     union = true + predicted - hits
     divisor = np.where(union > 0, union, 1)
     overlap: np.ndarray = np.where(true > 0, hits / divisor, 0.0)
@@ -62,7 +62,7 @@ def _miou(hits: np.ndarray, true: np.ndarray, predicted: np.ndarray) -> np.ndarr
 
 
 def _tail_error(cells: np.ndarray, *under: np.ndarray) -> np.ndarray:
-    """Return the mean distance of the fractions of λ below each VaR from 1 − level."""
+    """Return the mean over levels of |fraction of λ below the VaR − (1 − level)|."""
     gaps = []
     for count, level in zip(under, TAIL_LEVELS, strict=True):
         fraction = _ratio(count, cells)
@@ -88,7 +88,7 @@ def _score(
 # Neither direction of the width is better: a narrow interval must also cover λ.
 COMPARED = (
     _score("accuracy", "hits", "true", better="higher"),
-    _score("miou", "hits", "true", "found", of=_miou, better="higher"),
+    _score("miou", "hits", "true", "predicted", of=_miou, better="higher"),
     _score("rmse_expected", "expected_squares", "labelled", of=_root),
     _score("rmse_observed", "squares", "cells", of=_root),
     _score("nll", "nll", "cells"),

@@ -299,7 +299,7 @@ def cell_nll(cells: Cells, table: SlopeTable) -> float:
         Mean over all cells, with the log density in (0, 1) and the log mass at 0 and 1.
     """
     class_id = cells.class_id.view(1, 1, -1)
-    mixture = table.own(class_id, cells.slope_deg.view(1, 1, -1))
+    mixture = table.predict_by_class(class_id, cells.slope_deg.view(1, 1, -1))
     log_prob = mixture.log_prob(cells.traversability.view(1, 1, -1))
     return -float(log_prob.double().mean())
 
@@ -330,7 +330,7 @@ def measure_latent(
         class_id = terrain.class_id[labelled].unsqueeze(0)
         slope_deg = terrain.slope_deg[labelled].unsqueeze(0)
         traversability = terrain.traversability[labelled].unsqueeze(0)
-        predicted = table.own(class_id, slope_deg)
+        predicted = table.predict_by_class(class_id, slope_deg)
         true = terrain.truth.at(labelled)
         is_observed = ~traversability.isnan()
         log_prob = predicted.log_prob(traversability)[is_observed]

@@ -16,8 +16,8 @@ Rprop. The inducing values are not whitened, so that the function remains close 
 data while the kernel changes.
 
 The likelihood is that of the censored Gaussian: observed traversability is the latent
-plus Gaussian noise, clipped to [0, 1]. In (0, 1) an observation has the Gaussian
-density; at 0 and 1 it has the probability mass that was clipped there.
+function plus Gaussian noise, clipped to [0, 1]. In (0, 1) an observation has the
+Gaussian density; at 0 and 1 it has the probability mass that was clipped there.
 
 Sources: paper III-B; Hensman et al. (2015), "Scalable variational Gaussian process
 classification"; Salimbeni et al. (2018), "Natural gradients in practice"; Tobin (1958),

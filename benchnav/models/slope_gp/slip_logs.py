@@ -29,12 +29,13 @@ from benchnav.models.slope_gp.cells import Cells
 
 _LIMITS = {"slope_deg": (0, 90), "traversability": (0, 1)}
 COLUMNS = ("class", *_LIMITS)
-# With at least this many rows, slopes that never exceed π/2 are taken to be in radians.
+# With at least this many rows, a log whose slopes never exceed π/2 is taken to be in
+# radians.
 _MIN_ROWS_TO_CHECK_UNIT = 20
 _MAX_CLASSES = 256  # class ids are stored in a byte
 
 
-class SlipLogs(NamedTuple):
+class SlipLog(NamedTuple):
     """Training data of a slip log.
 
     Args:
@@ -51,7 +52,7 @@ class SlipLogs(NamedTuple):
     drive: Tensor | None
 
 
-def read_slip_logs(path: str | Path, class_names: tuple[str, ...] = ()) -> SlipLogs:
+def read_slip_log(path: str | Path, class_names: tuple[str, ...] = ()) -> SlipLog:
     """Read a slip log.
 
     Args:
@@ -81,8 +82,8 @@ def read_slip_logs(path: str | Path, class_names: tuple[str, ...] = ()) -> SlipL
     if is_checked and 0 < steepest <= np.pi / 2:
         raise DatasetError(
             f"Expected `slope_deg` in degrees in {path}, got at most {steepest:.4g} "
-            f"in {len(observed)} rows, as in radians. Multiply radians by 57.2958. If "
-            "the slopes are in degrees, log steeper terrain too."
+            f"in {len(observed)} rows, which suggests radians. Multiply radians by "
+            "57.2958. If the slopes are in degrees, log steeper terrain too."
         )
     class_names, class_id = _read_classes(observed, path, class_names)
     slope = torch.from_numpy(observed["slope_deg"].to_numpy(np.float32))
@@ -94,7 +95,7 @@ def read_slip_logs(path: str | Path, class_names: tuple[str, ...] = ()) -> SlipL
         drive_index = np.unique(drive_names, return_inverse=True)[1]
         drive = torch.from_numpy(drive_index)
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    return SlipLogs(class_names, cells, digest, drive)
+    return SlipLog(class_names, cells, digest, drive)
 
 
 def _read_classes(

@@ -64,8 +64,9 @@ class SlopeTable:
         n_nodes = len(table_slopes())
         expect(
             is_positive and self.mean.shape[1:] == (n_nodes,),
-            f"finite tables of the GPs over {n_nodes} slopes, with `std` > 0, got tables "
-            f"of shape {list(self.mean.shape)} or with other values. Train the GPs again.",
+            f"finite tables of the GPs over {n_nodes} slopes with `std` > 0, got "
+            f"tables of shape {list(self.mean.shape)} or with other values. Train the "
+            "GPs again.",
         )
 
     def lookup(self, slope_deg: Tensor) -> tuple[Tensor, Tensor]:
@@ -81,8 +82,10 @@ class SlopeTable:
         mean, std = self._read(slice(None), slope_deg)
         return mean.movedim(0, -3), std.movedim(0, -3)
 
-    def own(self, class_id: Tensor, slope_deg: Tensor) -> TraversabilityMixture:
-        """Return the mixture of each cell's own class at its slope.
+    def predict_by_class(
+        self, class_id: Tensor, slope_deg: Tensor
+    ) -> TraversabilityMixture:
+        """Return the prediction for each cell from its class and slope.
 
         Args:
             class_id: class of each cell, int64, shape [*B, H, W].

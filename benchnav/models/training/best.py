@@ -15,7 +15,7 @@ _TRUSTED = ("lightning.", "benchnav.models.training.")
 
 
 class KeepBest(Callback):
-    """A callback that keeps and restores the weights of the best epoch, or of the last.
+    """A callback that keeps and restores the weights of the best or last epoch.
 
     The best epoch has the lowest validation loss. The weights and metrics are stored in the
     state from which training resumes. Lightning's `ModelCheckpoint` would write the weights
@@ -158,8 +158,9 @@ class WeightGuard(Checkpoint):
         if self.digest and _digest_of_weights(module) != self.digest:
             raise ConfigError(
                 "Expected trained weights to stay unchanged, got weights that "
-                f"`on_train_end` of {type(module).__name__} changed; restoring the best "
-                "epoch would replace them. Change them in `on_fit_end` of the model."
+                f"`on_train_end` of {type(module).__name__} changed. Restoring the "
+                "best epoch would undo this change. Change the weights in `on_fit_end` "
+                "of the model."
             )
 
 

@@ -124,8 +124,8 @@ def _check_trainer(
     interval = trainer.check_val_every_n_epoch or 0
     expect(
         interval <= config.max_epochs,
-        f"`trainer.check_val_every_n_epoch` of at most {config.max_epochs}, the "
-        f"number of epochs, got {interval}.",
+        f"`trainer.check_val_every_n_epoch` of at most {config.max_epochs}, which is "
+        f"the number of epochs, got {interval}.",
     )
     for split, name in ((TRAIN, "limit_train_batches"), (VALID, "limit_val_batches")):
         n_samples = dataset.map_count(split)

@@ -37,8 +37,9 @@ def check_valid(dataset: TerrainDataset) -> None:
     expect(
         n_maps >= _MIN_MAPS,
         f"at least {_MIN_MAPS} maps in split {VALID} of {dataset.path} for "
-        f"`conformal`, which uses every second map, got {n_maps}. Add maps to {VALID}: "
-        "with n maps for scores, the lowest guaranteed level is 1 / (n + 1).",
+        f"`conformal`, got {n_maps}. Every second map is used for scores. With n maps "
+        "for scores, the lowest guaranteed level is 1 / (n + 1). Add maps to the split "
+        f"{VALID}.",
     )
 
 

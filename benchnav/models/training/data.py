@@ -94,7 +94,7 @@ class MapDataset(TerrainMaps):
 
     def __getitem__(self, key: MapKey) -> Batch:  # type: ignore[override]
         """Return all fields of the maps in `key`, shape [b, *, H, W]."""
-        # A map of which several squares are cut is read once.
+        # A map from which several squares are cut is read once.
         map_ids, positions = key.maps.unique(return_inverse=True)
         maps = self.read(map_ids.tolist())
         squares = list(
@@ -391,9 +391,9 @@ def open_dataset(data: str) -> TerrainDataset:
     dataset = TerrainDataset(find_dataset(data))
     if not {TRAIN, VALID} <= set(dataset.splits):
         raise DatasetError(
-            f"Expected splits train and valid in {dataset.path} to train on, got "
-            f"{sorted(dataset.splits)}. Create a dataset with both splits, for example "
-            "with `benchnav-datagen create paper-v1`."
+            f"Expected {dataset.path} to have the splits `train` and `valid`, got "
+            f"{sorted(dataset.splits)}. Train on a dataset with both splits, for "
+            "example one created with `benchnav-datagen create paper-v1`."
         )
     return dataset
 
@@ -414,7 +414,7 @@ def check_maps(dataset: TerrainDataset, field: str, crop: int = 0) -> None:
     shape = dataset.grid.shape
     expect(
         crop == 0 or 8 <= crop <= min(shape),
-        f"`crop` of 8 cells to {min(shape)}, the shorter side of the maps, or of 0 for "
+        f"`crop` from 8 to {min(shape)} cells (the shorter side of the maps), or 0 for "
         f"whole maps, got {crop}.",
     )
     values_to_learn = {

@@ -24,17 +24,18 @@ def find_trainable(source: str, settings: dict[str, Any]) -> Trainable:
     kind = match.target
     if not (isinstance(kind, type) and issubclass(kind, TrainableModel)):
         raise ConfigError(
-            f"Expected a trainable model, {', '.join(_trainable_names())} or "
-            "FILE.py:Class with a benchnav.models.TrainableModel, got "
-            f"{source!r}, which is not trainable."
+            f"Expected a trainable model ({', '.join(_trainable_names())} or "
+            f"FILE.py:Class with a benchnav.models.TrainableModel), got {source!r}, "
+            "which is not trainable."
         )
     owner = f"model {source!r}"
     config_kind = config_class(kind)
     if config_kind is None or not issubclass(config_kind, TrainingConfig):
         raise ConfigError(
-            f"Expected __init__ of {owner} to have one parameter, `config`, a subclass of "
-            "benchnav.models.TrainingConfig, got other parameters. Write def "
-            "__init__(self, config: MyConfig = MyConfig()) with such a class MyConfig."
+            f"Expected __init__ of {owner} to have only the parameter `config`, whose "
+            "type is a subclass of benchnav.models.TrainingConfig, got other "
+            "parameters. Write def __init__(self, config: MyConfig = MyConfig()) with "
+            "such a subclass MyConfig."
         )
     config = read(config_kind, settings, of(owner))
     name = kind.__name__
@@ -46,7 +47,7 @@ def find_trainable(source: str, settings: dict[str, Any]) -> Trainable:
     ):
         raise ConfigError(
             f"Expected a class whose name no model of this package has, got {name!r}. "
-            "Rename the class, since checkpoints identify it by its name."
+            "Checkpoints identify a class by its name. Rename the class."
         )
     code = "" if match.shipped else match.digest
     return Trainable(kind=kind, config=config, name=name, family=name, code=code)
@@ -63,7 +64,7 @@ def find_kind(source: str) -> registry.Found:
     if is_name and source not in registry.names("model"):
         names = _trainable_names()
         raise ConfigError(
-            f"Expected a trainable model, {', '.join(names)} or FILE.py:Class, got "
+            f"Expected a trainable model ({', '.join(names)} or FILE.py:Class), got "
             f"{source!r}.{registry.hint(source, names)}"
         )
     return registry.find("model", source)

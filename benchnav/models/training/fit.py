@@ -114,8 +114,8 @@ class FitOptions(TrainOptions):
         is_cpu_count = self.place.type == "cpu" and isinstance(devices, int)
         expect(
             not is_cpu_count or 1 <= devices <= n_processors,
-            f"`trainer.devices` in 1–{n_processors}, the number of processors, got "
-            f"{devices}.",
+            f"`trainer.devices` from 1 to {n_processors}, which is the number of "
+            f"processors, got {devices}.",
         )
 
     @property
@@ -337,8 +337,8 @@ def _prepare(folder: Path, resume: bool, settings: Mapping[str, Any]) -> Path | 
         if differences:
             raise CheckpointError(
                 f"Expected the settings of the interrupted training in {folder} for "
-                f"--resume, got {differences}. Use the same settings again, or pass "
-                "--overwrite to restart the training."
+                f"--resume, got {differences}. Use the settings of that training, or "
+                "pass --overwrite to restart the training."
             )
         return state
     if is_first_process():

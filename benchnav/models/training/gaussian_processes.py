@@ -25,7 +25,7 @@ from benchnav.models.slope_gp.cells import (
     sum_split,
 )
 from benchnav.models.slope_gp.gp import LatentGPs
-from benchnav.models.slope_gp.slip_logs import read_slip_logs
+from benchnav.models.slope_gp.slip_logs import read_slip_log
 from benchnav.models.slope_gp.soft_modes import find_soft_modes
 from benchnav.models.training.data import TRAIN, VALID, open_dataset, training_digest
 from benchnav.models.training.fit import FitOptions, fit, say
@@ -121,7 +121,7 @@ def _train_on_logs(
     """
     checkpoint = existing(Path(out), options.overwrite)
     known_classes = checkpoint.class_names if checkpoint else ()
-    names, cells, sha256, drive = read_slip_logs(data, known_classes)
+    names, cells, sha256, drive = read_slip_log(data, known_classes)
     sums = SlopeSums.of(cells, len(names))
     digest = f"file:{sha256}"
     target = open_target(out, Checkpoint(class_names=names), [GP], digest, options)

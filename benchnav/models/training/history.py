@@ -62,8 +62,9 @@ class History(Callback):
         for name, value in metrics.items():
             if name in _LOSSES and not math.isfinite(value):
                 raise TrainingError(
-                    f"Expected a finite {name}, got {value} in epoch {epoch}, which is not "
-                    "saved. Train with a lower `learning_rate`, or correct the loss."
+                    f"Expected a finite {name}, got {value} in epoch {epoch}. This "
+                    "epoch is not saved. Train with a lower `learning_rate`, or "
+                    "correct the loss."
                 )
 
     def state_dict(self) -> dict[str, Any]:

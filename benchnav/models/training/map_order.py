@@ -1,8 +1,9 @@
 """Order of the maps in an epoch of training, and the random numbers of each map.
 
-In a fully random order of maps, nearly every map would be in another of thousands of
-shards, whose file would be opened again. Therefore the shards are shuffled and divided
-into windows, and the maps within a window are shuffled, so that each file is opened once.
+With thousands of shards, consecutive maps of a fully random order would nearly always
+be in different files, and each file would be opened many times. Therefore the shards
+are shuffled and divided into windows, and the maps within a window are shuffled, so
+that each file is opened once.
 Letters in shapes: B maps in total, b maps in a batch.
 """
 
@@ -46,7 +47,7 @@ def map_order(shards: Sequence[int], seed: int, epoch: int) -> np.ndarray:
 
 
 class MapKey(NamedTuple):
-    """Indices of the maps of a batch, and the augmentation of each.
+    """Indices of the maps of a batch, and the augmentation of each map.
 
     Args:
         maps: indices of the maps, int64, shape [b].

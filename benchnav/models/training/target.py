@@ -97,9 +97,10 @@ class Target:
                 "pass --overwrite with --resume to resume the training that replaces it"
             )
         raise CheckpointError(
-            f"Expected the {name} in {self.folder} to have the same settings, seed and "
-            f"maps, got a part with seed {part.seed}, trained on {part.data_id}, with "
-            f"{differences}. Use its settings again, or {remedy}."
+            f"Expected the {name} in {self.folder} to have the settings, seed and maps "
+            f"of this command, got a part with seed {part.seed}, trained on "
+            f"{part.data_id}, with {differences}. Use the settings of that part, or "
+            f"{remedy}."
         )
 
     def add(self, name: str, part: Part) -> None:
@@ -222,7 +223,8 @@ def _check_family(folder: Path, checkpoint: Checkpoint, fresh: Checkpoint) -> No
     if checkpoint.code != fresh.code and checkpoint.model == fresh.model:
         raise CheckpointError(
             f"Expected checkpoint {folder} to be trained with the current code of "
-            f"{fresh.model}, got one of other code. Pass --overwrite to replace it."
+            f"{fresh.model}, got a checkpoint of other code. Pass --overwrite to "
+            "replace the checkpoint."
         )
     if (checkpoint.model, checkpoint.class_names) != (fresh.model, fresh.class_names):
         expected, got = (

@@ -75,9 +75,9 @@ def make_callbacks(specs: Any) -> list[Callback]:
         for callback in callbacks:
             expect(
                 not isinstance(callback, kind),
-                "`trainer.callbacks` that change neither weights, learning rate nor batch "
-                f"size, got {type(callback).__name__}, whose effect would be undone. "
-                f"{remedy}",
+                "`trainer.callbacks` that change neither weights, learning rate nor "
+                f"batch size, got {type(callback).__name__}. Its effect would be "
+                f"undone. {remedy}",
             )
     return callbacks
 

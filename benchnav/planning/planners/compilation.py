@@ -59,7 +59,7 @@ class Fused(Generic[R]):
         rollouts: number of rollouts per episode in a call.
         min_rollouts: minimum number of rollouts per episode for which a function is
             compiled on the CPU.
-        batched: indices of the arguments whose first dimension is that of the episodes;
+        batched: indices of the arguments whose first dimension counts the episodes;
             each item of a tuple counts as an argument.
     """
 

@@ -37,7 +37,7 @@ def pad_fields(problem: Problem, fields: Tensor) -> Tensor:
         fields: fields of λ in [0, 1], shape [B, M, H, W].
 
     Returns:
-        Padded maps, M consecutive ones for each episode, shape [B·M, N].
+        Padded maps, M consecutive maps for each episode, shape [B·M, N].
     """
     free = problem.free[:, None].expand_as(fields)
     return ground_map(problem.grid, fields, free).flatten(0, 1)
@@ -75,8 +75,8 @@ def tail_cost(cost: Tensor, level: float) -> Tensor:
         level: level α in [0, 1); 0 for the mean.
 
     Returns:
-        CVaR, shape [B, K]. If the worst fraction is no whole number of fields, the last
-        field has a weight below 1.
+        CVaR, shape [B, K]. If the worst fraction is not a whole number of fields, the
+        last field has a weight below 1.
     """
     if level == 0:
         return cost.mean(1)

@@ -40,7 +40,7 @@ def dubins_segments_to_point(
         point: positions (x, y) in metres, shape [*B, 2]. The leading dimensions of
             `start`, `point` and `radius` broadcast.
         radius: minimum turning radius in metres, shape [*B].
-        far_side: whether to use the turning circle on the other side than the point,
+        far_side: whether to use the turning circle on the side away from the point,
             which makes the path longer.
 
     Returns:

@@ -192,8 +192,8 @@ class MPPI(LocalPlanner[MPPIState]):
         config = self.config
         expect(
             config.noise is None or len(names) == len(config.noise),
-            f"option `noise` of MPPI with {len(names)} values, one for each of "
-            f"{', '.join(names)}, got {config.noise}.",
+            f"option `noise` of MPPI with {len(names)} values (one for each of "
+            f"{', '.join(names)}), got {config.noise}.",
         )
         seed = int(torch.randint(2**62, (), generator=generator))
         low, high = problem.action_bounds

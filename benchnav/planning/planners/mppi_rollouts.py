@@ -75,7 +75,7 @@ class TerminalInputs(NamedTuple):
     """Inputs of the terminal costs of rollouts.
 
     Args:
-        padded_ground: padded maps of λ, M consecutive ones for each episode, shape
+        padded_ground: padded maps of λ, M consecutive maps for each episode, shape
             [B·M, N].
         target: target (x, y) in metres, shape [B·M, 1, 2].
         grid: size and resolution of the maps.
@@ -110,7 +110,7 @@ def roll_out(
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Roll out sampled action sequences and sum their costs, without terminal costs.
 
-    The cost of a step is that of J plus the penalty of non-free cells.
+    The cost of a step is its stage cost under J plus the penalty of non-free cells.
 
     Args:
         problem: B problems.

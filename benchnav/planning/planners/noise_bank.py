@@ -89,7 +89,7 @@ def sampled_actions(sampled: Sampled, step: int) -> Tensor:
 
 
 def perturb(mean: Tensor, noise: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """Return clip(u + ε), whose dimension before the last is that of the actions.
+    """Return clip(u + ε), whose last dimension but one counts the actions.
 
     Args:
         mean: mean actions u, shape […, A, 1].

@@ -67,10 +67,10 @@ from benchnav.planning.sensing.pairs import split_by_class, statistics_of
 from benchnav.planning.sensing.score_table import TabulatedDistribution
 from benchnav.planning.sensing.sensor import Measurement
 
-_MAX_STRENGTH = 0.88  # below the critical strength ln(1 + √2) of a Potts field
-_FIRST_SWEEPS = 40  # at the start, over whole maps
-_MORE_SWEEPS = 10  # over cells that are assigned to a pair later
-_MIN_STD = 1e-9  # of a score, as a divisor
+_MAX_STRENGTH = 0.88  # below the critical β of a Potts field, ln(1 + √2)
+_FIRST_SWEEPS = 40  # number of sweeps over whole maps at the start
+_MORE_SWEEPS = 10  # number of sweeps over cells that are assigned to a pair later
+_MIN_STD = 1e-9  # minimum standard deviation of a score, as a divisor
 _SAME_LOG_ODDS = 0.01  # smaller differences of predicted log odds are ignored
 
 
@@ -79,7 +79,8 @@ class Classes(Belief[ClassesState]):
     """Belief that updates the class of look-alike cells, and λ within the class.
 
     Two approximations are made. If an observation is a number under one class and an
-    interval under the other, labels are weighted with the noise of the first class.
+    interval under the other class, labels are weighted with the noise of the first
+    class.
     Drawn fields have no skewness under the less probable class.
 
     Args:

@@ -32,8 +32,8 @@ _UPDATE_RADIUS = 4.0  # in ℓ; the correlation is 3e-4 at this distance
 # In ℓ. Observations beyond it change no cell within `_UPDATE_RADIUS` by `_MIN_CHANGE`.
 _EXTRA_RADIUS = 2.0
 # Maximum number of observations without a lattice, so that an update takes at most half
-# a second. The observations nearest to changed ones are used. Observed cells beyond the
-# limit are not updated.
+# a second. The observations nearest to changed observations are used. Observed cells
+# beyond the limit are not updated.
 _MAX_EXACT = 2048
 _MIN_CHANGE = 0.005  # in normal scores
 _MEDIAN_PER_SKEW = 1 / 6  # change of the median of a score per change of its skewness

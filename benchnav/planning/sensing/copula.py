@@ -75,7 +75,7 @@ class Copula(Belief[CopulaState]):
             1.5 m at first, and is estimated at 8, 16, 32, … observations until the
             window is full.
         window: maximum number of observations in an estimate of ℓ, ≥ 1; the
-            observations nearest to changed ones are used. If an update has more
+            observations nearest to changed observations are used. If an update has more
             observations and ℓ is four cells or more, the field is approximated by a
             lattice of cells (`lattice`).
         nugget: fraction of the variance of a cell's score that is independent of all
@@ -193,7 +193,7 @@ class Copula(Belief[CopulaState]):
         """Condition one episode on its observations, in place.
 
         Episodes are conditioned one by one, since their numbers of observations differ
-        and no episode may depend on another.
+        and no episode may depend on another episode.
 
         Args:
             state: state of all episodes, on the CPU; it is changed.

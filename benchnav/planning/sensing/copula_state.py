@@ -21,7 +21,7 @@ from benchnav.planning.sensing.sensor import MIN_STD, Measurement
 _SAME_SCORE = 1e-6
 _SAME_STD = 0.99
 _MAX_SCORE = 6.0
-_SAME_PREDICTION = 1e-3  # of a parameter; its effect on λ̂ is about as large
+_SAME_PREDICTION = 1e-3  # tolerance of parameters; λ̂ changes by about as much
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -37,7 +37,7 @@ DAMPED_ROUNDS = 40
 """Maximum number of updates of the terms."""
 _TOLERANCE = 1e-3  # maximum change of a mean at convergence, in normal scores
 MIN_VARIANCE = 1e-12
-_MAX_SKEW = 2.0  # of an exponential distribution, the limit far out in a tail
+_MAX_SKEW = 2.0  # skewness of an exponential distribution, as far out in a tail
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ class Field(Batch):
     def covariance_without_nugget(
         self, member: int | Tensor, rows: Tensor, columns: Tensor
     ) -> Tensor:
-        """Return `covariance` without the nugget, which a cell has with itself."""
+        """Return `covariance` without the nugget, which affects only equal cells."""
         down = self.down[member, rows.abs()]
         across = self.across[member, columns.abs()]
         return (1 - self.nugget) * down * across
@@ -267,10 +267,10 @@ def predict(
 
     An interval skews the posterior of its cell and, by correlation, of cells nearby. A
     cell's third cumulant is a sum over the interval-censored cells: the third cumulant
-    of each, times the cube of the cell's regression coefficient on it. The sum is exact
-    for one interval and of first order for several (Opper, Paquet and Winther 2013,
-    "Perturbative corrections for approximate inference in Gaussian latent variable
-    models").
+    of each such cell, times the cube of the cell's regression coefficient on it. The
+    sum is exact for one interval and of first order for several (Opper, Paquet and
+    Winther 2013, "Perturbative corrections for approximate inference in Gaussian latent
+    variable models").
 
     Args:
         solved: the conditioned field, from `condition`.

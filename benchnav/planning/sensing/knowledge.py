@@ -28,7 +28,7 @@ from benchnav.planning.sensing.appearance import Memory
 from benchnav.planning.sensing.sensor import Measurement
 from benchnav.planning.world.outcome import Outcome
 
-_PESSIMISTIC_LEVEL = 0.8  # of the CVaR that `pessimistic` assumes for unobserved λ
+_PESSIMISTIC_LEVEL = 0.8  # CVaR level of unobserved λ under `pessimistic`
 
 Result = TypeVar("Result")
 

@@ -8,11 +8,11 @@ neighbours that may belong to the same pair. Without an outer field, at strength
 A label is one bit, 1 for the first class. The labels of a cell in the 64 chains are the
 bits of one integer, its word, so that a few integer operations sweep all chains
 (multi-spin coding). Heat-bath sweeps draw first the cells of one colour of the
-checkerboard, then those of the other. P(class) is estimated from clusters (Swendsen and
-Wang 1987): bonds join coupled neighbours of equal label with the probability
-1 − exp(−β). If no bonds join a cell to evidence, either class has the probability ½ in
-that chain, and the cell's bit is ignored. Random numbers depend only on the cell and on
-its episode's number of sweeps, not on the other episodes of a batch.
+checkerboard, then the cells of the other. P(class) is estimated from clusters (Swendsen
+and Wang 1987): bonds join coupled neighbours of equal label with the probability 1 −
+exp(−β). If no bonds join a cell to evidence, either class has the probability ½ in that
+chain, and the cell's bit is ignored. Random numbers depend only on the cell and on its
+episode's number of sweeps, not on the other episodes of a batch.
 Letters in shapes: B episodes, H×W cells, S chains.
 """
 
@@ -119,8 +119,8 @@ def sweep_bits(
         column: columns of the cells, int64, shape [B, H, W].
         degree: number of coupled neighbours of each cell, int64, shape [B, H, W].
         strength: β, ≥ 0.
-        size: number of rows and of columns of stored random numbers, at least that of a
-            map.
+        size: number of rows and of columns of stored random numbers, at least those of
+            a map.
     """
     bank = _bank(strength, size).to(row.device)
     uses = sweep[:, None, None] // _SWEEPS

@@ -77,9 +77,9 @@ class Learner:
         """
         expect(
             self.covariance.statistics is not None,
-            "`CovarianceModel.statistics`, which a sensor that does not observe the "
-            "whole map needs, got None. Use a model that has terrain statistics, or "
-            "the sensor 'full'.",
+            "`CovarianceModel.statistics` for a sensor that does not observe the whole "
+            "map, got None. Use a model that has terrain statistics, or the sensor "
+            "'full'.",
         )
         assert self.covariance.statistics is not None
         return self.covariance.statistics
@@ -248,8 +248,8 @@ class Learner:
             shape = believed.shape
             expect(
                 shape == expected_shape,
-                f"a distribution of shape {list(expected_shape)} from `at`, got "
-                f"{list(shape)}.",
+                "`at` of the belief to return a distribution of shape "
+                f"{list(expected_shape)}, got shape {list(shape)}.",
             )
             return believed
 
@@ -268,8 +268,8 @@ class Learner:
             shape = getattr(believed, "shape", type(believed).__name__)
             expect(
                 shape == expected_shape,
-                f"a distribution of shape {list(expected_shape)} from `distribution`, "
-                f"got {shape}.",
+                "`distribution` of the belief to return a distribution of shape "
+                f"{list(expected_shape)}, got {shape}.",
             )
             return believed
 
@@ -377,8 +377,8 @@ class Learner:
             _check_measurement(measurement, truth.field)
             expect(
                 sensor is not self.sensor or measurement.appearance is not None,
-                "`Measurement.appearance` from an appearance sensor, got None. List "
-                "traversability sensors under `grounds`.",
+                "`Measurement.appearance` from an appearance sensor, got None. If the "
+                "sensor measures traversability, list it under `grounds`.",
             )
             return measurement
 

@@ -28,8 +28,8 @@ def statistics_of(covariance: CovarianceModel) -> GroundStatistics:
     """
     expect(
         covariance.statistics is not None,
-        "`CovarianceModel.statistics`, which list the look-alike classes, got None. Use "
-        "a model that has terrain statistics, or the belief 'copula'.",
+        "`CovarianceModel.statistics` with the look-alike classes, got None. Use a "
+        "model that has terrain statistics, or the belief 'copula'.",
     )
     return cast(GroundStatistics, covariance.statistics)
 
@@ -59,9 +59,9 @@ def split_by_class(
     if not isinstance(prior, TraversabilityMixture) or prior.group is None:
         suffix = " without `group`" if is_mixture else ""
         raise ConfigError(
-            "Expected a TraversabilityMixture with `group`, the class of each component, "
-            f"for the belief 'classes', got {type(prior).__name__}{suffix}. Use another "
-            "model, or the belief 'copula'."
+            "Expected a TraversabilityMixture with `group` for the belief 'classes', "
+            f"got {type(prior).__name__}{suffix}. `group` gives the class of each "
+            "component. Use another model, or the belief 'copula'."
         )
     paired_names = {name for pair in pairs for name in pair}
     unknown = sorted(paired_names - set(names))

@@ -21,7 +21,7 @@ _REACH = 12  # distance from changed observations up to which labels are drawn, 
 _SETTLED = 0.005
 MIN_CHANGE = 0.01
 """Minimum change of an unobserved cell's P(class); smaller changes are ignored."""
-_MIN_PRECISION = 1e-6  # of a Gaussian term
+_MIN_PRECISION = 1e-6  # minimum precision of a Gaussian term
 
 
 @dataclass(frozen=True, kw_only=True)

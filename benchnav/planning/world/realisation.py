@@ -143,8 +143,8 @@ class Realisation:
         distribution transforms it to λ.
 
         Args:
-            step: index of the step, counted from 0; a larger index than that of the
-                last step means the last step.
+            step: index of the step, counted from 0; an index after the last step means
+                the last step.
         """
         index = min(step, self._noise.shape[1] - 1)
         noise = self._noise[:, index, None, None]
@@ -185,9 +185,9 @@ def check_traversability(terrain: Terrain, world: World) -> None:
     """
     if bool(terrain.truth.means.isnan().any()):
         raise ConfigError(
-            "Expected maps with a class in each cell, since episodes need λ "
-            "everywhere, got maps with unlabelled cells. "
-            "Use such maps only to train and evaluate models."
+            "Expected maps with a class in each cell, got maps with unlabelled cells. "
+            "Episodes need λ in each cell. Use maps with unlabelled cells only to "
+            "train and evaluate models."
         )
     if world.noise == "stored" and bool(terrain.traversability.isnan().any()):
         raise ConfigError(
@@ -223,8 +223,8 @@ def draw_frozen(
     max_m = LONGEST_CORRELATION * min(grid.extent_m)
     expect(
         world.correlation_m <= max_m,
-        f"`world.correlation_m` of at most {max_m:g} m, a quarter of the maps' "
-        f"shorter side, got {world.correlation_m:g} m. Use larger maps or a shorter "
+        f"`world.correlation_m` of at most {max_m:g} m (a quarter of the maps' shorter "
+        f"side), got {world.correlation_m:g} m. Use larger maps or a shorter "
         "correlation length.",
     )
     field = torch.zeros_like(terrain.traversability)

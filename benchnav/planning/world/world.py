@@ -44,7 +44,7 @@ class Endpoints(Batch):
 
 @dataclass(frozen=True, kw_only=True)
 class World:
-    """Model of λ; by default that of the paper, in which low λ only slows a robot.
+    """Model of λ; by default the paper's model, in which low λ only slows a robot.
 
     Args:
         noise: source of λ. `resampled`: λ is drawn at each step. `stored`: λ is the
@@ -194,13 +194,12 @@ class World:
         is_missing = reference_time_s.isnan()
         if bool(is_missing.any()):
             raise ConfigError(
-                "Expected a reference time on each map for `time_budget_ratio`, "
-                f"got none on {int(is_missing.sum())} of {len(is_missing)} maps, since "
-                "their recipe does not require solvable maps. Create solvable "
+                "Expected a reference time on each map for `time_budget_ratio`, got "
+                f"none on {int(is_missing.sum())} of {len(is_missing)} maps. The "
+                "recipe of the maps does not require solvable maps. Create solvable "
                 "maps: benchnav-datagen create RECIPE id=NAME "
-                "splits.SPLIT.solvable=true; or set "
-                "`time_budget_s`, as in world={'preset': 'stakes', 'time_budget_s': "
-                "60}."
+                "splits.SPLIT.solvable=true; or set `time_budget_s`, as in "
+                "world={'preset': 'stakes', 'time_budget_s': 60}."
             )
         return self.time_budget_ratio * reference_time_s / top_speed_mps
 
@@ -222,9 +221,9 @@ class World:
         is_too_short = ~(steps >= 1)  # true for NaN
         if bool(is_too_short.any()):
             raise ConfigError(
-                f"Expected a time budget of at least one time step, {dt_s:g} s, got "
-                f"{float(budget_s.min()):g} s. "
-                "Raise `time_budget_s` or `time_budget_ratio`."
+                f"Expected a time budget of at least {dt_s:g} s (one time step), got "
+                f"{float(budget_s.min()):g} s. Raise `time_budget_s` or "
+                "`time_budget_ratio`."
             )
         if bool((steps > MAX_STEPS).any()):
             raise ConfigError(

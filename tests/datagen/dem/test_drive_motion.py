@@ -198,7 +198,7 @@ def test_a_measured_speed_of_no_unit_is_rejected_too() -> None:
     ):  # positions agree with the command: they are no feet
         with pytest.raises(
             DatasetError,
-            match=rf"got {ratio}\d* times .* like no known unit\. .* m, or pass",
+            match=rf"got {ratio}\d* times, .*like no known unit\. .* m, or pass",
         ):
             compare_motion(log_of(rows.assign(speed=rows["speed"] * factor)))
 
@@ -238,9 +238,7 @@ def test_short_drives_are_compared_too(rows: int) -> None:
 def test_a_log_without_motion_under_one_command_is_not_compared() -> None:
     commanded = np.tile([1.0, -1.0], 300)
     rows = drive(commanded, np.full(600, 0.8))
-    with pytest.raises(
-        DatasetError, match=r"got no such motion in drives of up to 59\.9 s"
-    ):
+    with pytest.raises(DatasetError, match=r"got none in drives of up to 59\.9 s"):
         compare_motion(log_of(rows))
 
 
@@ -561,7 +559,7 @@ def test_a_speed_that_is_the_command_is_of_wheels() -> None:
     ):
         compare_slopes(log, np.zeros(1200))
     with pytest.raises(
-        DatasetError, match=r"got 0.7 times .* like wheel odometry, since it equals"
+        DatasetError, match=r"got 0.7 times, .*like wheel odometry, since it equals"
     ):
         compare_motion(log_of(drive(np.ones(600), np.full(600, 0.7)).assign(speed=1.0)))
 
@@ -586,7 +584,7 @@ def test_wheels_in_a_part_of_a_drive_are_seen(part: float) -> None:
     rows = drive(np.ones(2400), 0.6 + 0.1 * np.sin(np.arange(2400) / 37), turn=0.1)
     rows["speed"] = rows["speed"].where(rows.index >= part * 2400, rows["commanded"])
     with pytest.raises(
-        DatasetError, match=r"over 15% less far in \d\d% of spans, as wheel"
+        DatasetError, match=r"over 15% less far in \d\d% of spans. .* wheel odometry"
     ):
         compare_slopes(compare_motion(log_of(rows)), np.zeros(2400))
 

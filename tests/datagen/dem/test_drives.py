@@ -716,11 +716,11 @@ MOVE = "".join(
         (HEAD + "0,1,1,1,30,a\n", "`measured_m_s` in m/s.*median of 30"),
         (
             HEAD + "0,1,1,1,1,a\n",
-            "covers x 500000 to 500096 and y .*got x_m 1 to 1 and y_m 1 to 1 in",
+            "got x_m 1 to 1 and y_m 1 to 1 in .* covers x 500000 to 500096 and y",
         ),
         (
             HEAD + "0,500010,3999910,1,1,a\n",
-            "got no such motion in drives of up to 0 s",
+            "got none in drives of up to 0 s",
         ),
         (HEAD + MOVE, "a drive for each of the 3 splits .* got 1 in .*--splits"),
         (
@@ -744,7 +744,7 @@ def test_a_drive_on_the_ground_of_each_split_is_needed(dem: Path) -> None:
     rows = rows[(rows["x"] < 30) | (rows["drive"] == "drive-11")]
     path = log_of(rows, dem.parent / "log.csv")
     with pytest.raises(
-        DatasetError, match="of its own on its terrain, got none for valid in"
+        DatasetError, match="on the terrain of each split, got none for valid in"
     ):
         imported(dem, path)
 

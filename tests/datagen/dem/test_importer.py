@@ -306,7 +306,7 @@ def test_the_truth_of_imported_ground_is_unknown(tmp_path: Path) -> None:
 @pytest.mark.parametrize("stride", [0.7, 0, -1, np.nan])
 def test_a_stride_is_a_number_of_cells(tmp_path: Path, stride: float) -> None:
     message = refusal(write(tmp_path / "dem.tif", FLAT), stride_m=stride)
-    assert "`stride` as a multiple of the maps' resolution, 0.5 m" in message
+    assert "`stride` as a multiple of 0.5 m, which is the resolution" in message
 
 
 def test_a_split_without_maps_is_named_with_the_reason(tmp_path: Path) -> None:

@@ -238,7 +238,7 @@ def test_a_raster_that_does_not_cover_the_ground_is_refused(tmp_path: Path) -> N
     for raster in (half, elsewhere):
         message = refusal(dem, f"vegetation_m={raster}")
         assert (
-            f"Expected `layer vegetation_m` to cover all of the terrain, WEST SOUTH EAST NORTH {ours} in EPSG:32654"
+            f"Expected `layer vegetation_m` to cover all of the terrain (WEST SOUTH EAST NORTH {ours} in EPSG:32654)"
             in message
         )
         assert raster.name in message

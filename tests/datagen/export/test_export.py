@@ -412,7 +412,7 @@ def test_imported_maps_need_a_licence_and_a_creator(
     assert (
         datagen("export", dataset_path, "--out", "out", "--license", "CC-BY-4.0") == 2
     )
-    assert "maps are not of a shipped recipe" in capsys.readouterr().err
+    assert "maps do not come from a shipped recipe" in capsys.readouterr().err
     assert datagen("export", dataset_path, "--out", "out", *OWN) == 0
     assert "file site.tif" in metadata(Path("out"))["description"]
     about = {

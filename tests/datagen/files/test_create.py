@@ -264,7 +264,7 @@ def test_a_folder_that_holds_anything_else_is_left_alone(tmp_path: Path) -> None
     assert digests(folder) == digests(
         tiny_dataset(tmp_path / "o.h5", replace(tiny_recipe(), seed=3))
     )
-    with pytest.raises(ConfigError, match="folder, since `shard`"):
+    with pytest.raises(ConfigError, match="folder if `shard` is given"):
         make(tmp_path / "e.h5", shard=Shard(index=1, of=2))
 
 

@@ -120,7 +120,7 @@ def test_a_dataset_is_read_and_driven_on_without_the_code(
     with pytest.raises(ConfigError) as caught:
         generate(dataset.recipe, "train", np.arange(1))
     assert str(caught.value).startswith(
-        "Expected the code of layer 'wetness', to generate maps"
+        "Expected the code of layer 'wetness' to be available for"
     )
     assert "\n" not in str(caught.value)
 
@@ -209,7 +209,9 @@ def test_a_layer_of_this_process_only_is_not_made_in_two(
     monkeypatch.setattr(part_lookup, "_REGISTERED", {})
     registry.register("layer", "mine", Plain)
     recipe = recipe_from_dict(small_stakes().to_dict() | {"layers": ["mine"]}, "test")
-    with pytest.raises(ConfigError, match="a single process with layer 'plain'"):
+    with pytest.raises(
+        ConfigError, match=r"a single process, got several\. The class of layer 'plain'"
+    ):
         next(create_dataset(recipe, tmp_path / "d.h5", jobs=2))
     assert generate(recipe, "train", np.arange(1))["plain"].shape == (1, 32, 32)
 

@@ -210,7 +210,7 @@ def test_a_class_may_be_overgrown_altogether_or_by_less_than_a_cell() -> None:
         ("wet_clay", {"cover": 1.1}, "`cover` of vegetation in (0, 1], got 1.1"),
         ("wet_clay", {"colour": [0, 0, 256]}, "`colour` of vegetation in 0–255, got (0, 0, 256)"),
         ("wet_clay", {"colour": [152, 126, 100]}, "on 'wet_clay' to have a `colour` that no terrain has in"),
-        ("packed_soil", {}, "on 'packed_soil' and 'crusted_soil', since their terrain has the same colour, got"),
+        ("packed_soil", {}, "'packed_soil' and 'crusted_soil', whose terrain has the same colour, to have"),
         ("wet_clay", {"width": 3}, "'width'"),
     ],
 )  # fmt: skip
@@ -234,10 +234,10 @@ def test_what_does_not_grow_is_refused_in_one_line(
     [
         (
             0.9,
-            "to be finite and at least two cells, 1 m, if a class has `vegetation`, got 0.9",
+            "finite `vegetation_period_m` of at least 1 m (two cells) if a class has `vegetation`, got 0.9",
         ),
-        (0.0, "to be finite and at least two cells"),
-        (float("inf"), "to be finite and at least two cells"),
+        (0.0, "finite `vegetation_period_m` of at least 1 m"),
+        (float("inf"), "finite `vegetation_period_m` of at least 1 m"),
         ("wide", "Expected `vegetation_period_m` as a number, got 'wide'"),
     ],
 )

@@ -138,10 +138,10 @@ def replace_solvable(recipe):
     [
         (
             {"least_distance_m": 40},
-            r"at most 34\.98 m, the largest distance inside the margin of 1 m, got 40",
+            r"at most 34\.98 m .the largest distance inside the margin of 1 m., got 40",
         ),
         ({"margin_m": 10}, r"`margin_m` of `places` below 10 m"),
-        ({"least_distance_m": 0.5}, r"0\.707 m, a cell's diagonal"),
+        ({"least_distance_m": 0.5}, r"0\.707 m .a cell's diagonal"),
         ({"least_distance_m": 0}, "`least_distance_m` > 0"),
         ({"least_distance_m": float("nan")}, "`least_distance_m` > 0"),
         ({"margin_m": -1}, "`margin_m` ≥ 0"),

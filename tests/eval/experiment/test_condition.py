@@ -296,7 +296,7 @@ def test_a_planner_that_uses_nothing_is_as_a_blind_one() -> None:
     assert [condition.blind for condition in made] == [True, True]
     with pytest.raises(
         ConfigError,
-        match="`uses` of planner 'Vague' to return a frozenset of distribution",
+        match="to return a frozenset of names from",
     ):
         conditions(planners=("tests.eval.parts:Vague",))
 

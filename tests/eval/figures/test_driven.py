@@ -215,7 +215,7 @@ def test_the_figure_is_of_the_stored_steps_of_its_map(tmp_path: Path) -> None:
     driven = read_driven(folder, rows)
     assert driven
     data = run_data(folder, rows)
-    assert DrivenPaths().needs(data)
+    assert DrivenPaths().is_available(data)
     assert (
         "std, map 1, seed 0, realisation 0. Outcomes differ most on this map."
         in DrivenPaths().caption(data)

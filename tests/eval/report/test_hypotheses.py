@@ -47,6 +47,14 @@ def test_each_hypothesis_is_said_with_its_numbers() -> None:
     ]
 
 
+def test_names_with_commas_are_in_brackets() -> None:
+    row = a_test(**OTHER, names=("std, mppi, cvar", "straight"))
+    (sentences,) = hypothesis_findings(pd.DataFrame([row]), ABOUT, "map").values()
+    assert sentences[0].startswith(
+        "1. Success of (std, MPPI, CVaR) differs from that of straight: "
+    )
+
+
 def test_an_extension_after_the_hypotheses_is_told() -> None:
     conditions = {"a": {"draws": [[0, 0, 200]]}, "b": {"draws": [[0, 0, 80]]}}
     (said,) = hypothesis_findings(

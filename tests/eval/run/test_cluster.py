@@ -98,7 +98,7 @@ def suite_on(dataset: Path, log: Path, **changes: object) -> Suite:
     }
     given = {
         "data": str(dataset), "model": "oracle", "planners": (held,), "risks": ("mean", "cvar"),
-        "scenarios": ("std", "hs"), "maps": 2, "seeds": (0, 1), "world": {"noise": "stored", "time_budget_s": 30.0},
+        "scenarios": ("std", "hs"), "maps": 2, "seeds": (0, 1), "world": {"noise": "stored", "time_budget_s": 6.0},
     } | changes  # fmt: skip
     return Suite(**given)  # type: ignore[arg-type]
 

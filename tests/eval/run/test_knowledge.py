@@ -330,7 +330,7 @@ def told(how: Learning, problem: Problem, steps: int) -> list[tuple[int, Problem
     return found
 
 
-@pytest.mark.parametrize("every", [0.1, 0.5, 1.0])
+@pytest.mark.parametrize("every", [0.1, 1.0])
 def test_maps_are_revised_when_it_is_due_and_where_something_is_known(
     every: float,
 ) -> None:
@@ -360,16 +360,16 @@ def test_maps_are_revised_when_it_is_due_and_where_something_is_known(
         if now % round(every / 0.1) == 0:
             state, sensed = belief.update(state, sensed), None
         at = at + torch.tensor([0.1, 0.0, 0.0])
-    believed = belief.distribution(state)
-    assert (last.risk_map - measure(believed)).abs().max() < 0.035
+    few = torch.arange(2)
+    believed = belief.distribution(state.select(few))
+    mean = believed.mean()
+    assert (last.risk_map[few] - measure(believed)).abs().max() < 0.035
     assert (last.risk_map - given.problem.risk_map).abs().max() > 0.3
-    closed = (believed.mean() < 0.09) & ~given.problem.free
-    assert not last.free[(believed.mean() < 0.09) & given.problem.free].any() or bool(
-        closed.any()
-    )
-    torch.testing.assert_close(
-        last.distribution.mean(), believed.mean(), atol=1e-5, rtol=0
-    )
+    before = given.problem.free[few]
+    closed = (mean < 0.09) & ~before
+    assert not last.free[few][(mean < 0.09) & before].any() or bool(closed.any())
+    revised = last.distribution.mean()[few]
+    torch.testing.assert_close(revised, mean, atol=1e-5, rtol=0)
     assert torch.equal(last.start[:, 1:], given.problem.start[:, 1:])
     assert float(last.start[0, 0] - given.problem.start[0, 0]) == pytest.approx(
         0.1 * step, abs=1e-5
@@ -488,7 +488,7 @@ def test_a_sensor_under_the_key_of_the_other_kind_is_refused() -> None:
     given = drives()
     truth = given.learning.truth
     with pytest.raises(
-        KnowledgeError, match="List traversability sensors under `grounds`"
+        KnowledgeError, match="measures traversability, list it under `grounds`"
     ):
         learning(given.problem, truth, sensor=Probe(1.0), covariance=ALIKE)
     # What senses both may stand under either.
@@ -625,7 +625,7 @@ def test_a_sensor_and_a_belief_may_write_into_what_they_are_given() -> None:
             return found
 
     given = drives()
-    options: dict[str, Any] = {"stop": lambda step: step == 40}
+    options: dict[str, Any] = {"stop": lambda step: step == 16}
     wanted = given.run(astar_dwa(), given.learning, **options)
     scribbled = learning(
         given.problem, given.learning.truth, ground=Scribbles(), belief=Scrawls()
@@ -640,7 +640,7 @@ def test_a_planner_that_begins_anew_learns_too() -> None:
             return NotImplemented
 
     given = drives()
-    options: dict[str, Any] = {"stop": lambda step: step == 60}
+    options: dict[str, Any] = {"stop": lambda step: step == 36}
     found = given.run(Forgets(CONFIG), given.learning, **options)
     assert (found.revisions > 5).all()
     assert not same(given.run(Forgets(CONFIG), None, **options), found)
@@ -720,7 +720,7 @@ EXPLORES = AStarDWA(replace(CONFIG, explore=1.0))
 @pytest.mark.parametrize("planner", [*SHIPPED, EXPLORES], ids=[*SHIPPED, "explores"])
 def test_what_an_episode_learns_depends_on_no_other(planner: Any) -> None:
     given = drives(ground=Contact())
-    options: dict[str, Any] = {"stop": lambda step: step == 25}
+    options: dict[str, Any] = {"stop": lambda step: step == 16}
     one = make(planner) if isinstance(planner, str) else planner
     whole = given.run(one, given.learning, **options)
     for members in ([2], [7, 1]):

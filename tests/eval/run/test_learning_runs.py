@@ -566,7 +566,7 @@ def test_rows_of_a_planner_that_is_given_the_ground_have_a_lower_bound_and_other
     }
     suite = Suite(
         data=str(dataset_path), models=("clairvoyant",), planners=("near_optimal", SEARCHES), risks=("mean",),
-        scenarios=("std",), maps=2, record="none", world=(world,), task=({"min_traversability": 0.05},),
+        scenarios=("std",), maps=1, record="none", world=(world,), task=({"min_traversability": 0.05},),
         objectives=("travel_time",),
     )  # fmt: skip
     list(run_suite(suite, tmp_path / "run"))

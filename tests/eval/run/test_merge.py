@@ -231,9 +231,9 @@ def test_missing_units_are_told_with_their_shards(
     for given, expected in (
         (
             [parts[0], parts[2]],
-            rf"these are missing: {count} units of shard 2/3, 1 unit of shard 3/3 in .*part3",
+            rf"got shards without {count} units of shard 2/3, 1 unit of shard 3/3 in .*part3",
         ),
-        (parts, r"these are missing: 1 unit of shard 3/3 in .*part3"),
+        (parts, r"got shards without 1 unit of shard 3/3 in .*part3"),
     ):
         with pytest.raises(ConfigError, match=expected):
             list(merge_shards(given, tmp_path / "all"))

@@ -250,7 +250,7 @@ def test_all_that_is_no_longer_there_is_told_before_anything_is_run(
     (tmp_path / "tiny.h5").unlink()
     with pytest.raises(
         ConfigError,
-        match=r"all inputs of .*run, but some are missing: .*dataset.*tiny\.h5.*mine\.py",
+        match=r"all inputs of .*run, got none for some parts or maps: .*dataset.*tiny\.h5.*mine\.py",
     ):
         repeat(run, tmp_path / "again")
     assert not (tmp_path / "again").exists()
@@ -262,7 +262,7 @@ def test_a_dataset_with_fewer_maps_is_told(suite: Suite, tmp_path: Path) -> None
     factories.tiny_dataset(tmp_path / "tiny.h5", factories.tiny_recipe(test_std=1))
     with pytest.raises(
         ConfigError,
-        match=r"Expected `maps` at most 1, the number of maps of test/std in .*, got 2",
+        match=r"Expected `maps` at most 1, which is the number of maps of test/std in .*, got 2",
     ):
         repeat(run, tmp_path / "again")
 

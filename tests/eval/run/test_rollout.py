@@ -142,8 +142,12 @@ def test_commanded_speed_and_turn_rate_are_those_of_undisturbed_motion() -> None
     )
     planner: Any = Steady()
     episodes = rollout.run_episodes(planner, problem, simulation, torch.Generator())
-    torch.testing.assert_close(episodes.speed_mps, torch.full((BATCH, 4), 0.6))
-    torch.testing.assert_close(episodes.turn_rate_radps, torch.full((BATCH, 4), 0.2))
+    torch.testing.assert_close(
+        episodes.unhindered_speed_mps, torch.full((BATCH, 4), 0.6)
+    )
+    torch.testing.assert_close(
+        episodes.unhindered_turn_rate_radps, torch.full((BATCH, 4), 0.2)
+    )
 
 
 class Breaking(Simulation):

@@ -52,8 +52,10 @@ def made(**changes: object) -> tuple[Problem, Episodes]:
             [[[1.0, 0.0], [1.0, 0.5], [9, 9], [9, 9]], [[0.0, 0.0]] * 4]
         ),
         traversability=torch.tensor([[0.2, 0.8, 9, 9], [0.3, 0.1, 0.31, 0.5]]),
-        speed_mps=torch.tensor([[1.0, 1.0, 9, 9], [0.0, 0.0, 0.0, 0.0]]),
-        turn_rate_radps=torch.tensor([[0.0, 0.5, 9, 9], [0.0, 0.1, 0.0, 0.1]]),
+        unhindered_speed_mps=torch.tensor([[1.0, 1.0, 9, 9], [0.0, 0.0, 0.0, 0.0]]),
+        unhindered_turn_rate_radps=torch.tensor(
+            [[0.0, 0.5, 9, 9], [0.0, 0.1, 0.0, 0.1]]
+        ),
         outcome=torch.tensor([Outcome.SUCCESS, Outcome.STUCK]),
         steps=torch.tensor([2, 4]),
         begin_s=0.6,

@@ -771,7 +771,10 @@ def test_suites_are_checked_before_anything_is_run_or_dropped(
         ({"data": "no-such-data"}, "no-such-data"),
         ({"world": {"noise": "loud"}}, "loud"),
         ({"maps": 9}, "Use 0 for all maps"),
-        ({"world": {"time_budget_s": 0.01}}, "time budget of at least one time step"),
+        (
+            {"world": {"time_budget_s": 0.01}},
+            "time budget of at least 0.1 s .one time step",
+        ),
         ({"planners": ("astar_dwa",), "robots": ("bicycle",)}, "steering_rad"),
         ({"planners": ("cl_rrt",), "robots": ("bicycle",)}, "steering_rad"),
         ({"planners": ({"part": "mppi", "options": {"noise": [0.5]}},)}, "noise"),

@@ -231,7 +231,7 @@ def test_what_changes_during_a_run_ends_it(
     monkeypatch.setattr(runner, "measure_latencies", change)
     with pytest.raises(
         ConfigError,
-        match=r"not to change during the run, got changes: file .*speed\.json\. Run",
+        match=r"not to change during the run, got changes: file .*speed\.json\. Repeat",
     ):
         run(own, dataset_path, "run")
 

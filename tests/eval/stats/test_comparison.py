@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
-from scipy.stats import binomtest, wilcoxon
+from scipy.stats import binomtest, t, wilcoxon
 
 from benchnav.eval.stats.comparison import compare
 from benchnav.eval.stats.pairs import Pair
@@ -133,6 +133,24 @@ def test_a_difference_of_time_knows_what_failures_cost() -> None:
     difference, low, high = time_difference(pair(late, same).episodes)
     assert difference == pytest.approx(5)
     assert (low + high) / 2 == pytest.approx(5)
+
+
+def test_a_difference_of_time_separates_the_cost_of_failures() -> None:
+    # The first condition fails on 4 of 20 maps, and is as fast on all others.
+    other = [30.0 + i % 3 for i in range(20)]
+    failed = np.arange(20) < 4
+    first = np.where(failed, 100.0, other)
+    difference, low, high = time_difference(pair(first.tolist(), other).episodes)
+    assert difference == pytest.approx((first - other).mean())
+    times = np.concatenate((first[~failed], other))
+    penalty = 100 - times.mean()
+    rest = first - other - penalty * failed  # what no failure explains
+    half_width = t.ppf(0.975, 15) * rest.std(ddof=1) / np.sqrt(20)
+    _, *ends = success_interval(np.where(failed, -1, 0), 1)
+    below = np.hypot(half_width, penalty * (0.2 + ends[1]))
+    above = np.hypot(half_width, penalty * (-ends[0] - 0.2))
+    assert low == pytest.approx(difference - below)
+    assert high == pytest.approx(difference + above)
 
 
 def test_a_group_of_maps_is_one_number() -> None:

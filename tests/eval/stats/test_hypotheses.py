@@ -151,18 +151,18 @@ def test_the_digest_is_that_of_all_that_is_claimed(change: dict[str, Any]) -> No
         ({"margin": 1}, "Leave `margin` out"),
         (
             {"kind": "equivalence"},
-            "above 0 and below 100 points, since it claims equivalence, got 0",
+            "above 0 and below 100 points for a claim of equivalence, got 0",
         ),
         (
             {"kind": "superiority"},
-            "above 0 and below 100 points, since it claims superiority, got 0",
+            "above 0 and below 100 points for a claim of superiority, got 0",
         ),
         (
             {"kind": "superiority", "metric": "end_time", "margin": 1},
-            "`direction` in hypothesis 1, .* neither direction of 'end_time' is better",
+            "`direction` in hypothesis 1 .* Neither direction of 'end_time' is better",
         ),
         ({"kind": "equivalence", "margin": -1}, "above 0 .*got -1"),
-        ({"kind": "equivalence", "margin": 100}, "below 100 points, since .*, got 100"),
+        ({"kind": "equivalence", "margin": 100}, "below 100 points for .*, got 100"),
         ({"kind": "equivalence", "margin": 1, "direction": "lower"}, "no `direction`"),
         ({"one": MEAN}, "two conditions with the same labels in"),
         (

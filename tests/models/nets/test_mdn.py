@@ -422,7 +422,7 @@ def test_training_is_reproducible_and_a_resumed_one_ends_with_the_same_weights(
     assert [resumed[name] for name in measured] == [metrics[name] for name in measured]
     for name, value in whole.state_dict().items():
         assert torch.equal(value, again.state_dict()[name]), name
-    with pytest.raises(CheckpointError, match="Use the same settings again"):
+    with pytest.raises(CheckpointError, match="Use the settings of that training"):
         fit_network(
             trainable(replace(SMALL, components=2)),
             dataset,

@@ -282,7 +282,9 @@ def test_soft_spots_are_drawn_and_count_in_what_is_expected() -> None:
     assert list(level.get_ydata()) == pytest.approx([0.1, 0.1])
     slopes = torch.from_numpy(drawn[1].get_xdata()).float().view(1, 1, -1)
     expected = (
-        whole.own(torch.zeros(1, 1, slopes.shape[2], dtype=torch.int64), slopes)
+        whole.predict_by_class(
+            torch.zeros(1, 1, slopes.shape[2], dtype=torch.int64), slopes
+        )
         .mean()
         .flatten()
     )

@@ -11,7 +11,7 @@ from benchnav.models.fused import FusedModel
 from benchnav.models.predictor import Oracle
 from benchnav.models.quality.map_sums import MapTally, by_group
 from benchnav.models.quality.measure import Quality, measure
-from benchnav.models.quality.scores import lower_fifth_and_width, sparsification
+from benchnav.models.quality.scores import pinball_loss_and_width, sparsification
 from benchnav.models.quality.scores_of_maps import SCORES
 from benchnav.stats.scores import summarise
 from tests.models.stub import ColourModel
@@ -100,7 +100,7 @@ def test_the_measures_of_a_comparison_are_those_computed_by_hand() -> None:
     terrain = make_terrain(batch=2, size=32)
     _, tally = measured(MODEL, terrain)
     predicted, observed = MODEL.predict(terrain.observe()), terrain.traversability
-    loss, width = lower_fifth_and_width(predicted, observed)
+    loss, width = pinball_loss_and_width(predicted, observed)
     found = whole(tally)
     assert found["pinball"] == pytest.approx(float(loss.mean()), rel=1e-6)
     assert found["width"] == pytest.approx(float(width.mean()), rel=1e-6)
@@ -147,7 +147,7 @@ def test_a_model_of_other_classes_is_measured_by_its_traversability_alone() -> N
 
 
 def test_a_class_that_is_nowhere_true_has_no_share_in_the_miou() -> None:
-    counts = {"true": [10, 10, 0], "found": [12, 6, 2], "hits": [8, 6, 0]}
+    counts = {"true": [10, 10, 0], "predicted": [12, 6, 2], "hits": [8, 6, 0]}
     sums = {name: np.array([own], dtype=float) for name, own in counts.items()}
     assert SCORES["accuracy"].value(sums) == pytest.approx(14 / 20)
     assert SCORES["miou"].value(sums) == pytest.approx((8 / 14 + 6 / 10) / 2)

@@ -35,8 +35,8 @@ from benchnav.models.quality.scores import (
     brier_score,
     calibration_error,
     coverage,
-    lower_fifth_and_width,
     mutual_information,
+    pinball_loss_and_width,
     pit,
     pit_counts,
     predictive_entropy,
@@ -415,7 +415,7 @@ def test_a_dataset_without_look_alikes_has_no_such_numbers(
 def test_the_pinball_loss_is_that_of_the_closed_form_quantiles() -> None:
     mixture = single(0.5, 0.05, (1, 201))
     observed = torch.linspace(0.2, 0.8, 201, dtype=torch.float64)[None]
-    loss, width = lower_fifth_and_width(mixture, observed)
+    loss, width = pinball_loss_and_width(mixture, observed)
     levels = np.arange(1, 21) / 100
     gap = observed.numpy()[0][:, None] - (0.5 + 0.05 * ndtri(levels))
     exact = np.where(gap >= 0, levels * gap, (levels - 1) * gap).mean(1)
@@ -431,7 +431,7 @@ def test_the_pinball_loss_is_least_where_the_lower_fifth_is_right_and_blind_to_t
     def loss(values: Tensor) -> float:
         knots = values.view(-1, 1, 1).expand(-1, 1, 4000).contiguous()
         return float(
-            lower_fifth_and_width(QuantileDistribution(knots, LEVELS), drawn)[0].mean()
+            pinball_loss_and_width(QuantileDistribution(knots, LEVELS), drawn)[0].mean()
         )
 
     levels = torch.tensor(LEVELS, dtype=torch.float64)

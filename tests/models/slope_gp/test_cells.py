@@ -255,7 +255,9 @@ def test_a_second_mode_counts_in_the_nll_of_the_processes_and_not_in_their_error
         measure_latent(one, [terrain]) for one in (table, replace(table, soft=soft))
     )
     assert both["latent_rmse"] == plain["latent_rmse"]
-    own = replace(table, soft=soft).own(terrain.class_id, terrain.slope_deg)
+    own = replace(table, soft=soft).predict_by_class(
+        terrain.class_id, terrain.slope_deg
+    )
     wanted = -float(own.log_prob(terrain.traversability).mean())
     assert both["nll"] == pytest.approx(wanted, rel=1e-5)
     assert both["nll"] != pytest.approx(plain["nll"], rel=1e-2)

@@ -166,7 +166,7 @@ def test_the_sums_of_the_main_mode_are_those_of_its_own_cells() -> None:
 
 
 def predicted(table, slope: torch.Tensor) -> TraversabilityMixture:  # type: ignore[no-untyped-def]
-    return table.own(
+    return table.predict_by_class(
         torch.zeros(1, 1, len(slope), dtype=torch.int64), slope.view(1, 1, -1)
     )
 

@@ -233,7 +233,8 @@ def test_a_training_is_not_gone_on_with_under_other_settings_of_the_trainer(
     )
     for name, value in OTHER_TRAINERS.items():
         with pytest.raises(
-            CheckpointError, match=rf"got another `trainer\.{name}`\. Use the same"
+            CheckpointError,
+            match=rf"got another `trainer\.{name}`\. Use the settings of",
         ):
             train(dataset, cut, resume=True, **{name: value})
     assert (

@@ -229,7 +229,7 @@ def test_other_code_is_told_and_not_gone_on_with(
         "--resume",
     )
     assert call("train", *command) == 2
-    assert "got one of other code" in capfd.readouterr().err
+    assert "got a checkpoint of other code" in capfd.readouterr().err
 
 
 def test_an_installed_class_is_loaded_by_its_name_and_its_code_compared_too(

@@ -121,10 +121,10 @@ def test_resuming_keeps_parts_of_the_same_settings_seed_and_maps(
     assert not state.exists()
     assert not target.has_part("classifier", NetConfig(), 0)
     for config, seed in ((Config(width=4), 0), (Config(), 1)):
-        with pytest.raises(CheckpointError, match="Use its settings again"):
+        with pytest.raises(CheckpointError, match="Use the settings of that part"):
             target.has_part("gp", config, seed)
     target.digest = "other"
-    with pytest.raises(CheckpointError, match="Use its settings again"):
+    with pytest.raises(CheckpointError, match="Use the settings of that part"):
         target.has_part("gp", Config(), 0)
 
 
@@ -155,16 +155,16 @@ def test_a_network_is_kept_if_the_trainer_and_the_precision_are_the_same(
     assert holds(replace(kept, trainer=None), gradient_clip_val=3)
     with pytest.raises(
         CheckpointError,
-        match=r"another `trainer\.gradient_clip_val`\. Use its settings",
+        match=r"another `trainer\.gradient_clip_val`\. Use the settings of that",
     ):
         holds(kept, gradient_clip_val=0.6)
     with pytest.raises(
         CheckpointError,
-        match=r"another `trainer\.limit_train_batches`\. Use its settings",
+        match=r"another `trainer\.limit_train_batches`\. Use the settings of that",
     ):
         holds(kept, limit_train_batches=2)
     with pytest.raises(
-        CheckpointError, match=r"another `half_precision`\. Use its settings"
+        CheckpointError, match=r"another `half_precision`\. Use the settings of that"
     ):
         holds(kept, half_precision=False)
     # processes, which no such trainer trains

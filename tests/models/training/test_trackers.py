@@ -171,7 +171,7 @@ def test_callbacks_whose_effect_would_be_undone_are_refused_by_name(
     name: str, init_args: dict[str, Any], remedy: str
 ) -> None:
     with pytest.raises(
-        ConfigError, match=rf"got {name}, whose effect would be undone\. .*{remedy}"
+        ConfigError, match=rf"got {name}\. Its effect would be undone\. .*{remedy}"
     ):
         FitOptions(
             device="cpu",

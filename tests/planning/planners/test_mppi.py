@@ -389,7 +389,7 @@ def test_noise_for_another_number_of_actions_is_asked_for_by_name() -> None:
 
     problem = factories.problem(torch.full((1, 16, 16), 0.85), robot=Three())
     with pytest.raises(
-        ConfigError, match=r"`noise` of MPPI with 3 values, one for each of .*crab_mps"
+        ConfigError, match=r"`noise` of MPPI with 3 values .one for each of .*crab_mps"
     ):
         MPPI(replace(SMALL, noise=(0.5, 0.5))).init(problem, generator())
     MPPI(replace(SMALL, noise=(0.5, 0.5, 0.2))).init(problem, generator())
@@ -573,50 +573,43 @@ def test_runs_begin_everywhere_and_parts_change_hands() -> None:
     assert (begin % 200).max() > 140
 
 
-# goals 6 m behind the robot, and in the turning circle at its left
-BEHIND, WITHIN = (
-    (7.0, 10.0),
-    (13.0, 11.2),
-)
+# Goals 6 m behind the robot, and in the turning circle on its left.
+BEHIND, WITHIN = (7.0, 10.0), (13.0, 11.2)
 
 
 @pytest.mark.parametrize(
-    ("objective", "least_mps", "traversability", "wheelbase_m", "goal", "within_s"),
+    ("objective", "min_speed_mps", "wheelbase_m", "drives"),
     [
         # Half a turn of radius 0.73 m and 5 m back take 8.5 s at 0.85 m/s, 5 m in
         # reverse 5.9 s.
-        ("travel_time", 0.0, 0.85, 0.5, BEHIND, 12.0),
-        ("goal_distance", 0.0, 0.85, 0.5, BEHIND, 12.0),
-        ("goal_distance", -1.0, 0.85, 0.5, BEHIND, 8.0),
-        # Half a turn takes 7 s and 13 s, and the horizon is 5 s: Dubins paths of 8.5 m
-        # and 11.3 m.
-        ("goal_distance", 0.0, 0.35, 0.5, BEHIND, 26.0),
-        ("travel_time", 0.0, 0.35, 1.0, BEHIND, 32.0),
-        # A Dubins path of 8.3 m, away from the goal and back.
-        ("travel_time", 0.0, 0.85, 1.0, WITHIN, 13.0),
-        ("goal_distance", 0.0, 0.35, 1.0, WITHIN, 30.0),
+        ("travel_time", 0.0, 0.5, [(0.85, BEHIND, 12.0)]),
+        ("goal_distance", -1.0, 0.5, [(0.85, BEHIND, 8.0)]),
+        # At 0.35 m/s half a turn takes 7 s, and the horizon is 5 s.
+        ("goal_distance", 0.0, 0.5, [(0.85, BEHIND, 12.0), (0.35, BEHIND, 26.0)]),
+        # Dubins paths of 10.7 m, and of 8.3 m, away from the goal and back.
+        ("travel_time", 0.0, 1.0, [(0.85, BEHIND, 16.0), (0.85, WITHIN, 13.0)]),
     ],
 )
 def test_a_bicycle_turns_to_any_goal(
     objective: str,
-    least_mps: float,
-    traversability: float,
+    min_speed_mps: float,
     wheelbase_m: float,
-    goal: tuple[float, float],
-    within_s: float,
+    drives: list[tuple[float, tuple[float, float], float]],
 ) -> None:
-    robot = Bicycle(speed_mps=(least_mps, 1.0), wheelbase_m=wheelbase_m)
-    radius_m = 1.0 if goal == BEHIND else 0.5
+    robot = Bicycle(speed_mps=(min_speed_mps, 1.0), wheelbase_m=wheelbase_m)
+    radius_m = 0.5 if wheelbase_m == 1 else 1.0
     cost = registry.make("objective", objective, robot=robot, goal_radius_m=radius_m)
-    ground = torch.full((2, 40, 40), traversability)
+    traversability, goals, max_s = zip(*drives, strict=True)
+    ground = torch.tensor(traversability)[:, None, None].expand(-1, 40, 40)
     problem = factories.problem(
-        ground, (13.0, 10.0), goal, robot, cost, Rules(goal_radius_m=radius_m)
+        ground, (13.0, 10.0), BEHIND, robot, cost, Rules(goal_radius_m=radius_m)
     )
     problem = with_start(problem, 13.0, 10.0, 0.0)
-    driven = drive(
-        MPPI(replace(SMALL, samples=128, horizon_s=5.0)), problem, None, within_s
-    )
-    assert driven.outcome.tolist() == [Outcome.SUCCESS] * 2
+    problem = replace(problem, goal_m=torch.tensor(goals))
+    planner = MPPI(replace(SMALL, samples=128, horizon_s=5.0))
+    driven = drive(planner, problem, None, max(max_s))
+    assert driven.outcome.tolist() == [Outcome.SUCCESS] * len(drives)
+    assert bool((0.1 * driven.steps <= torch.tensor(max_s)).all())
 
 
 def test_turns_are_full_steering_for_some_of_the_time_and_then_straight() -> None:

@@ -1,5 +1,6 @@
 import math
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import pytest
@@ -50,6 +51,24 @@ def time_to_go(planner: Any, posed: Problem) -> Tensor:
     """By value iteration only."""
     state = Optimal.init(planner, posed, generator())
     return primitives_from(posed.start, state.dwell_s, state).cost.min(1).values
+
+
+class Solved:
+    """A planner that solves its first problem once, for all calls of `init`."""
+
+    def __init__(self, planner: Optimal, posed: Problem) -> None:
+        self.planner = planner
+        self.state = planner.init(posed, generator())
+        self.plan = planner.plan
+
+    def init(self, *_: Any) -> Any:
+        return self.state
+
+    def time_to_go(self) -> Tensor:
+        """By value iteration only."""
+        state = self.state
+        cost = primitives_from(state.problem.start, state.dwell_s, state).cost
+        return cost.min(1).values
 
 
 def curve(x: float, y: float, heading: float, radius_m: float = 1.0) -> float:
@@ -104,16 +123,20 @@ def test_on_free_ground_the_cost_to_go_is_the_least_time() -> None:
     assert max(near) < 0.2
 
 
-@pytest.mark.parametrize("turned", [0.0, 1.5, -2.2, 3.1])
-def test_on_free_ground_it_drives_in_the_least_time(turned: float) -> None:
-    posed = problem(torch.ones(1, 64, 64), (4.1, 4.3), (27.0, 20.0))
-    posed = replace(posed, start=posed.start + torch.tensor([0.0, 0.0, turned]))
-    done = drive(Optimal(), posed)
-    assert done.outcome.tolist() == [Outcome.SUCCESS]
-    x, y, heading = posed.start[0].tolist()
-    wanted = least_time(x - 27, y - 20, heading)
-    assert 0.1 * int(done.steps[0]) == pytest.approx(wanted, rel=0.03)
-    assert float(time_to_go(Optimal(), posed)) == pytest.approx(wanted, rel=0.02)
+def test_on_free_terrain_it_drives_in_the_minimum_time() -> None:
+    turned = torch.tensor([0.0, 1.5, -2.2, 3.1])
+    posed = problem(torch.ones(4, 64, 64), (4.1, 4.3), (27.0, 20.0))
+    start = posed.start.clone()
+    start[:, 2] += turned
+    posed = replace(posed, start=start)
+    solved = Solved(Optimal(), posed)
+    done = drive(solved, posed)
+    assert (done.outcome == Outcome.SUCCESS).all()
+    times_s = []
+    for x, y, heading in posed.start.tolist():
+        times_s.append(least_time(x - 27, y - 20, heading))
+    assert (0.1 * done.steps).tolist() == pytest.approx(times_s, rel=0.03)
+    assert solved.time_to_go().tolist() == pytest.approx(times_s, rel=0.02)
 
 
 def test_through_strips_the_time_adds_up_and_slow_ground_is_gone_around_where_that_is_quicker() -> (
@@ -123,13 +146,14 @@ def test_through_strips_the_time_adds_up_and_slow_ground_is_gone_around_where_th
     ground[0, :, 15:25] = 0.2
     ground[1, 15:25, 15:25] = 0.1
     posed = problem(ground, (2.25, 10.25), (17.25, 10.25))
-    found = time_to_go(Optimal(), posed)
+    solved = Solved(Optimal(), posed)
+    found = solved.time_to_go()
     through = 9.0 / 0.8 + 5 / 0.2
     assert float(found[0]) == pytest.approx(through, rel=0.03)
     # By two corners, of which it keeps half a cell at most.
     around = 2 * math.hypot(5.25, 2.75) + 5 - 1
     assert 0.98 * around / 0.8 < float(found[1]) < 1.06 * around / 0.8
-    done = drive(Optimal(), posed)
+    done = drive(solved, posed)
     assert done.outcome.tolist() == [Outcome.SUCCESS] * 2
     assert (0.1 * done.steps).tolist() == pytest.approx(found.tolist(), rel=0.03)
 
@@ -144,12 +168,13 @@ def test_half_the_traversability_takes_twice_the_time() -> None:
 
 
 def test_finer_grids_tell_about_the_same_time() -> None:
-    drawn = torch.rand(3, 1, 36, 36, generator=generator(2))
+    drawn = torch.rand(2, 1, 28, 28, generator=generator(2))
     ground = 0.15 + 0.85 * torch.nn.functional.avg_pool2d(drawn, 5, 1)[:, 0]
-    posed = problem(ground, (2.25, 2.25), (13.25, 12.25))
+    posed = problem(ground, (2.25, 2.25), (9.25, 8.25))
     coarse = time_to_go(Optimal(), posed)
-    finer = Optimal(OptimalConfig(refine=3)).init(posed, generator())
-    assert finer.to_go.value.shape == (3, 1, 32, 96, 96)
+    one = posed.select(torch.tensor([0]))
+    finer = Optimal(OptimalConfig(refine=3)).init(one, generator())
+    assert finer.to_go.value.shape == (1, 1, 32, 72, 72)
     fine = time_to_go(Optimal(OptimalConfig(refine=2, headings=64)), posed)
     torch.testing.assert_close(coarse, fine, rtol=0.02, atol=0)
     assert not torch.equal(coarse, fine)
@@ -170,8 +195,8 @@ def test_what_the_ground_is_like_where_it_has_arrived_costs_nothing() -> None:
 
 
 def test_the_time_held_is_counted_while_it_drives() -> None:
-    posed, planner = held_ground(0.08, 4.0), NearOptimal()
-    state = planner.init(posed, generator())
+    solved = solved_bar(4.0)
+    posed, planner, state = solved.state.problem, solved.planner, solved.state
     for met, wanted in ((0.05, 0.1), (0.02, 0.2), (0.5, 0.0)):
         step = replace(first(posed), traversability=torch.tensor([met]))
         state = planner.plan(step, state)[1]
@@ -189,12 +214,13 @@ def test_ground_that_is_not_free_is_gone_around_and_crossed_where_there_is_no_ot
     free[:, wall] = False
     free[0, 21, 11] = True  # a gap of one cell
     posed = replace(posed, free=free)
-    found = time_to_go(Optimal(), posed)
+    solved = Solved(Optimal(), posed)
+    found = solved.time_to_go()
     around = math.hypot(3.5, 4.5) * 2 - 1
     turn = 2 * math.atan(4.5 / 3.5)
     assert around / 0.9 < float(found[0]) < 1.01 * (around + turn) / 0.9
     assert float(found[1]) == pytest.approx(PENALTY * 0.5, rel=0.3)
-    done = drive(Optimal(), posed)
+    done = drive(solved, posed)
     assert done.outcome.tolist() == [Outcome.SUCCESS] * 2
     column = (done.states[0, :, 0] / 0.5).long()
     assert set((done.states[0, column == 11, 1] / 0.5).long().tolist()) == {21}
@@ -233,19 +259,26 @@ def held_ground(below: float, for_s: float) -> Problem:
     )
 
 
+@cache
+def solved_bar(for_s: float) -> Solved:
+    return Solved(NearOptimal(), held_ground(0.08, for_s))
+
+
 def test_the_reference_crosses_what_does_not_hold_for_long_enough() -> None:
     across = 6 - 0.5
     crossed = across / 0.9 + 0.5 / 0.08  # 6.3 s on ground that holds
-    bound, entry = NearOptimal(), NearOptimal(NearOptimalConfig(levels=0))
+    entry = NearOptimal(NearOptimalConfig(levels=0))
     for for_s, crosses in ((4.0, False), (9.0, True)):
-        posed = held_ground(0.08, for_s)
-        found, lost = float(time_to_go(bound, posed)), float(time_to_go(entry, posed))
+        solved = solved_bar(for_s)
+        posed = solved.state.problem
+        found = float(solved.time_to_go())
+        lost = float(time_to_go(entry, posed))
         assert lost > 30
         if crosses:
             assert found == pytest.approx(crossed, rel=0.05)
         else:
             assert found == pytest.approx(lost, rel=0.02)
-        done = drive(bound, posed, world=known_world(posed))
+        done = drive(solved, posed, world=known_world(posed))
         assert done.outcome.tolist() == [Outcome.SUCCESS]
         ends = int(done.steps[0])
         met = posed.traversability_at(done.states[0, None, : ends + 1])[0]
@@ -266,10 +299,11 @@ def test_between_two_bars_the_time_held_is_over() -> None:
         distribution=factories.certain(ground),
     )
     wanted = (7 - 1.0) / 0.9 + 2 * 0.5 / 0.08
-    assert float(time_to_go(NearOptimal(), posed)) == pytest.approx(wanted, rel=0.05)
+    solved = Solved(NearOptimal(), posed)
+    assert float(solved.time_to_go()) == pytest.approx(wanted, rel=0.05)
     # What it simulates is what the world does.
-    simulated = NearOptimal().init(posed, generator()).drive
-    done = drive(NearOptimal(), posed, world=known_world(posed))
+    simulated = solved.state.drive
+    done = drive(solved, posed, world=known_world(posed))
     assert simulated is not None
     assert simulated.steps.tolist() == done.steps.tolist()
     assert torch.equal(simulated.states[0, : int(done.steps[0]) + 1], done.states[0])
@@ -287,13 +321,17 @@ def wide_bar(for_s: float) -> Problem:
     )
 
 
-@pytest.mark.parametrize(
-    ("for_s", "crosses"), [(12.0, False), (15.0, False), (16.5, True), (20.0, True)]
-)
+@cache
+def solved_wide_bar(for_s: float) -> Solved:
+    return Solved(NearOptimal(), wide_bar(for_s))
+
+
+@pytest.mark.parametrize(("for_s", "crosses"), [(15.0, False), (16.5, True)])
 def test_over_several_cells_dwell_time_adds_up(for_s: float, crosses: bool) -> None:
-    posed, planner = wide_bar(for_s), NearOptimal()
-    found = float(time_to_go(planner, posed))
-    done = drive(planner, posed, world=known_world(posed))
+    solved = solved_wide_bar(for_s)
+    posed = solved.state.problem
+    found = float(solved.time_to_go())
+    done = drive(solved, posed, world=known_world(posed))
     assert done.outcome.tolist() == [
         Outcome.SUCCESS if crosses else Outcome.IMMOBILISED
     ]
@@ -326,11 +364,8 @@ def test_dwell_time_that_is_left_is_exact_along_a_bar() -> None:
     ("crossing", "cells", "below", "share"),
     [
         (0.79, 3, 0.8, 0.95),
-        (0.79, 3, 0.8, 0.7),
         (0.65, 4, 0.7, 0.96),
         (0.45, 3, 0.5, 0.5),
-        (0.45, 3, 0.5, 0.95),
-        (0.9, 4, 0.95, 0.97),
         (0.3, 2, 0.35, 0.98),
         (0.2, 3, 0.25, 0.99),
     ],
@@ -344,14 +379,13 @@ def test_a_wall_that_straight_crosses_is_crossed_as_soon(
     posed = problem(ground, (3.25, 3.25), (10.0, 3.25), time_budget_s=20.0)
     immobile = Immobile(below=below, for_s=cells * 0.5 / crossing / share)
     posed = replace(posed, immobile=immobile, distribution=factories.certain(ground))
-    straight, reference = (
-        drive(planner, posed, world=known_world(posed))
-        for planner in (Straight(), NearOptimal())
-    )
+    solved = Solved(NearOptimal(), posed)
+    straight = drive(Straight(), posed, world=known_world(posed))
+    reference = drive(solved, posed, world=known_world(posed))
     assert straight.outcome.tolist() == reference.outcome.tolist() == [Outcome.SUCCESS]
     assert int(reference.steps[0]) <= int(straight.steps[0])
     # Value iteration finds it too.
-    found = float(time_to_go(NearOptimal(), posed))
+    found = float(solved.time_to_go())
     assert found == pytest.approx(0.1 * int(straight.steps[0]), rel=0.05)
 
 
@@ -375,11 +409,8 @@ def small_worlds(seed: int, for_s: float) -> Problem:
     )
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_it_succeeds_wherever_a_star_with_dwa_or_straight_do_and_no_later(
-    seed: int,
-) -> None:
-    posed = small_worlds(10 * seed, 3.0 + seed)
+def test_it_succeeds_wherever_a_star_with_dwa_or_straight_do_and_no_later() -> None:
+    posed = small_worlds(10, 4.0)
     reference, *others = (
         drive(planner, posed, world=known_world(posed))
         for planner in (NearOptimal(), AStarDWA(), Straight())
@@ -427,8 +458,8 @@ def test_where_value_iteration_fails_it_follows_the_earlier_of_the_others(
 
 
 def test_a_robot_that_is_off_its_drive_goes_on_by_value_iteration() -> None:
-    posed, planner = wide_bar(18.0), NearOptimal()
-    state = planner.init(posed, generator())
+    solved = solved_wide_bar(16.5)
+    posed, planner, state = solved.state.problem, solved.planner, solved.state
     for x, on in ((2.25, True), (2.75, False)):
         pose = torch.tensor([[x, 6.25, 0.2 * (not on)]])
         step = replace(first(posed, draw=True), state=pose)
@@ -626,18 +657,18 @@ def test_where_there_is_no_way_the_world_ends_the_episode() -> None:
         immobile=Immobile(),
         distribution=factories.certain(ground),
     )
-    planner = NearOptimal()
+    solved = Solved(NearOptimal(), posed)
     # On its drive, and off it.
     for turned in (0.0, 0.1):
         step = step_at(posed.start + torch.tensor([0.0, 0.0, turned]))
-        action, _, plan = planner.plan(step, planner.init(posed, generator()))
+        action, _, plan = solved.plan(step, solved.state)
         assert plan.status.tolist() == [
             PlanStatus.PARTIAL,
             PlanStatus.OK,
             PlanStatus.PARTIAL,
         ]
         assert torch.equal(action[[0, 2]], Straight().plan(step, posed)[0][[0, 2]])
-    done = drive(planner, posed, world=known_world(posed))
+    done = drive(solved, posed, world=known_world(posed))
     assert done.outcome[1:].tolist() == [Outcome.SUCCESS, Outcome.IMMOBILISED]
     assert done.outcome[0] != Outcome.SUCCESS
     assert 0.1 * int(done.steps[2]) == pytest.approx(Immobile().for_s)
@@ -653,7 +684,9 @@ def test_other_robots_and_maps_that_change_are_refused(kind: type[Optimal]) -> N
         ):
             kind().init(factories.problem(ground, robot=robot), generator())
     uneven = Unicycle(turn_rate_radps=(-1.0, 0.5))
-    with pytest.raises(ConfigError, match=f"to both sides for planner '{kind.name}'"):
+    with pytest.raises(
+        ConfigError, match=f"left and right turns with planner '{kind.name}'"
+    ):
         kind().init(factories.problem(ground, robot=uneven), generator())
     backward = Unicycle(speed_mps=(-1.0, 1.0))
     with pytest.raises(
@@ -664,11 +697,11 @@ def test_other_robots_and_maps_that_change_are_refused(kind: type[Optimal]) -> N
     posed = factories.problem(ground, rules=replace(RULES, goal_radius_m=0.35))
     with pytest.raises(
         ConfigError,
-        match=r"`goal_radius_m` of at least 0\.35, half of a cell's diagonal",
+        match=r"`goal_radius_m` ≥ 0\.35 m .half a cell's diagonal",
     ):
         kind().init(posed, generator())
     posed = factories.problem(ground)
-    with pytest.raises(ConfigError, match="which plans once"):
+    with pytest.raises(ConfigError, match="plans only once"):
         kind().revise(kind().init(posed, generator()), posed)
 
 

@@ -389,7 +389,7 @@ def test_episodes_are_kept_and_take_the_places_of_others() -> None:
 def test_without_statistics_nothing_is_known_of_unseen_ground() -> None:
     with pytest.raises(
         ConfigError,
-        match=r"`CovarianceModel\.statistics`, which a sensor that does not observe the whole map needs, got None",
+        match=r"`CovarianceModel\.statistics` for a sensor that does not observe the whole map, got None",
     ):
         begin(learner(covariance=made.covariance(SIZE, SIZE)))
 
@@ -409,7 +409,9 @@ def test_a_belief_whose_distribution_is_none_is_to_blame(said: str | None) -> No
 
     how = learner(belief=Odd())
     known = begin(how)
-    with pytest.raises(KnowledgeError, match="from `distribution`, got") as error:
+    with pytest.raises(
+        KnowledgeError, match="Expected `distribution` of the belief to return"
+    ) as error:
         how.distribution(known)
     assert error.value.outcome == Outcome.BELIEF_ERROR
 

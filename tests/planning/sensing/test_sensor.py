@@ -127,7 +127,7 @@ def test_what_many_looks_of_a_probe_say_of_the_cells_around_holds_as_often_as_it
     terrain, belief = made.terrain(truth, field), Copula()
     states = torch.tensor([[3.25, 3.25, 0.0]] * batch, dtype=torch.float64)
     known = belief.init(truth, covariance)
-    for step in range(30):
+    for step in range(12):
         sensed = Probe(1.0, 0.1).sense(
             terrain, field, states, NoiseKey(range(batch), step)
         )

@@ -396,7 +396,7 @@ def test_start_is_x_and_y_and_not_row_and_column() -> None:
 def test_a_correlation_longer_than_a_quarter_of_the_map_is_refused_in_metres() -> None:
     draw_frozen(ground(1, *SOFT), replace(FREE, correlation_m=2.0), across(1), KEY, [0])
     with pytest.raises(
-        ConfigError, match=r"`world.correlation_m` of at most 2 m, .* got 2.1 m"
+        ConfigError, match=r"`world.correlation_m` of at most 2 m .* got 2.1 m"
     ):
         draw_frozen(
             ground(1, *SOFT), replace(FREE, correlation_m=2.1), across(1), KEY, [0]

@@ -112,7 +112,7 @@ def test_a_time_budget_that_is_none_is_refused(budget: float) -> None:
 
 
 def test_a_time_budget_without_a_step_is_refused() -> None:
-    with pytest.raises(ConfigError, match=r"at least one time step, 0.1 s, got 0.01"):
+    with pytest.raises(ConfigError, match=r"at least 0.1 s .one time step., got 0.01"):
         World().steps(torch.tensor([9.0, 0.01]), 0.1)
 
 

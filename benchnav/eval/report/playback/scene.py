@@ -338,7 +338,7 @@ def _log_plans(stage: Stage, driver: Driver) -> None:
         for name, style in STYLES.items():
             lines = list(plan.lines.get(name, ()))
             content = [line.tobytes() for line in lines]
-            # An empty layer is logged, since it replaces that of the earlier plan.
+            # An empty layer is logged, since it replaces the layer of the earlier plan.
             # Unchanged layers are skipped.
             if (driver.name and name != "path") or logged.get(name) == content:
                 continue

@@ -35,7 +35,7 @@ from benchnav.viz.style import bytes_of, condition_colours
 
 APPLICATION = "benchnav"
 
-_SINGLE_COLOUR = "#00aa00"  # of a single robot
+_SINGLE_COLOUR = "#00aa00"  # colour of a single robot
 # Titles of views of a learning robot's maps, by name of the map.
 _LEARNT = {
     "mean": "Belief: mean of λ",

@@ -199,7 +199,7 @@ class _Severity(Figure):
         "intervals over maps."
     )
 
-    def needs(self, data: Comparison) -> bool:
+    def is_available(self, data: Comparison) -> bool:
         return bool(find_series(data.splits))
 
     def draw(self, data: Comparison) -> Drawing:

@@ -29,7 +29,7 @@ from benchnav.stats.tables import (
 # Costs of a model, shown in the table next to its scores: heading and meaning.
 COSTS = {
     "prediction_ms": (
-        "ms a\nmap",
+        "ms per\nmap",
         "median time to predict one map, in milliseconds.",
     ),
     "parameters": ("parameters\n", "number of weights of all networks of the model."),
@@ -198,26 +198,26 @@ def difference_table(comparison: Comparison) -> Table:
         Column(
             "difference",
             lambda row: signed(row["difference"], 4),
-            "measure of the model minus that of the best model; for “in 90 %”, the "
-            "difference between their distances from 0.9.",
+            "measure of the model minus that of the best model; for “in 90 %” "
+            "(coverage), the model's distance from 0.9 minus that of the best model.",
         ),
         Column(
             "95 % interval",
             lambda row: signed_interval(row["low"], row["high"], 4),
-            f"bootstrap over maps; no interval under {LEAST_MAPS} maps.",
+            f"bootstrap over maps; none with fewer than {LEAST_MAPS} maps.",
         ),
         Column(
             "p (Holm)",
             p_cell,
-            "permutation test by map, which exchanges the two models; corrected over "
-            "all pairs of competing models, within measure and split (Holm).",
+            "permutation test that swaps the two models' scores map by map; corrected "
+            "over all pairs of competing models, within measure and split (Holm).",
         ),
     ]
     note = "" if rows["alike"].all() else f"p < {ALPHA}."
     return table_of(
         rows.to_dict("records"),
         columns,
-        title="Differences to the best",
+        title="Differences from the best model",
         n_labels=4,
         bold_note=note,
     )

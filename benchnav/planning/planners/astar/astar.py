@@ -5,10 +5,10 @@ compiled Dijkstra search backward from the goal. A* with h* as its heuristic exp
 only the cells of a cheapest path. Hence each cell stores the next cell of its path, and
 replanning only reads these cells.
 
-An edge connects the centres of two neighbouring cells, and half of it lies in each. A
-half in a non-free cell costs the penalty per metre in addition, so that every cell has
-a path. A diagonal edge between two non-free cells that touch at its middle costs the
-penalty on its whole length (`gridgraph.squeezes`).
+An edge connects the centres of two neighbouring cells; half of the edge lies in each
+cell. A half in a non-free cell costs the penalty per metre in addition, so that every
+cell has a path. A diagonal edge between two non-free cells that touch at its middle
+costs the penalty on its whole length (`gridgraph.squeezes`).
 
 Sources: Hart, Nilsson and Raphael (1968); paper IV-A1. Letters in shapes: B episodes,
 H×W cells, N cells of a padded map or points of a path, E edges, J positions.
@@ -132,7 +132,7 @@ def _costs(
         free_of: function of cells that returns whether they are free.
 
     Returns:
-        Costs, float64; their shape is that of the functions' results.
+        Costs, float64, of the shape of the functions' results.
     """
     rise_m = elevation_of(target).double() - elevation_of(source).double()
     grade = rise_m / length_m
@@ -162,8 +162,8 @@ def _cost_per_m(problem: Problem, traversability: Tensor, grade: Tensor) -> Tens
     shape = list(cost.shape) if isinstance(cost, Tensor) else type(cost).__name__
     expect(
         shape == list(grade.shape),
-        f"{name} to return a tensor of the same shape as λ̂ and grade, "
-        f"{list(grade.shape)}, got {shape}. Return a cost for each segment of a path.",
+        f"{name} to return a tensor of shape {list(grade.shape)} (like λ̂), got "
+        f"{shape}. Return a cost for each segment of a path.",
     )
     min_cost, max_cost = torch.stack(cost.aminmax())
     if not 0 < min_cost <= max_cost < torch.inf:
@@ -254,8 +254,9 @@ def cost_at(grid: Grid, costs: Tensor, x_m: Tensor, y_m: Tensor) -> Tensor:
     A path leads straight from the position to the centre of its cell or of a
     neighbouring cell, and from that centre to the goal. The cost to go is the minimum
     over these centres. As for an edge, the cost per metre of the straight line is the
-    mean of those of its first and its last cell. Hence the cost to go at a centre is
-    that of the cell (if grades cost nothing), and has no large jumps between centres.
+    mean of the costs per metre of its first and last cell. Hence the cost to go at a
+    centre equals the cost to go of the cell (if grades cost nothing), and has no large
+    jumps between centres.
     In the goal region it is 0.
 
     Args:

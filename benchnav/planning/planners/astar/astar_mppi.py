@@ -28,8 +28,8 @@ class AStarMPPIConfig(GuideConfig):
         expect(
             self.explore == 0 or self.mppi.cost_to_go == "objective",
             f"`explore` = 0 for A*+MPPI with `cost_to_go` {self.mppi.cost_to_go!r}, "
-            f"since MPPI then does not drive to waypoints of A*, got {self.explore}. "
-            "Set `explore` to 0, or `cost_to_go` to 'objective'.",
+            f"got {self.explore}. With this `cost_to_go`, MPPI does not drive to "
+            "waypoints of A*. Set `explore` to 0, or `cost_to_go` to 'objective'.",
         )
 
 

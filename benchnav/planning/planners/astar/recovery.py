@@ -40,9 +40,9 @@ class Recovery(Batch):
     """Standing times of robots, and the recoveries in progress.
 
     Args:
-        anchor_m: position (x, y) in metres that the robot has not left since, shape
-            [B, 2].
-        steps: number of steps since then, int64, shape [B].
+        anchor_m: position (x, y) in metres that the robot has not left for `steps`
+            steps, shape [B, 2].
+        steps: number of these steps, int64, shape [B].
         driven_m: commanded distance in these steps in metres, shape [B].
         active: mask of robots in recovery, bool, shape [B].
         target_m: target (x, y) of the recovery in metres, shape [B, 2].

@@ -19,15 +19,13 @@ loop of the source, algorithm 2, which decides when to plan, and from which stat
 - References are Dubins paths; the source draws straight lines and uses Dubins lengths
   only in its heuristics.
 - λ̂ may decrease along a path to the goal. If the remaining path then costs over a
-tenth
-  more than on the map on which it was chosen, the path is doubted: a new tree is grown,
-  and the robot drives the cheaper of the old and the new path. Both costs are times
-  along the predicted positions under the new λ̂. If no new path is found, the next
-  steps try again, up to `most_failures` times. A partial path is left at once. Hence a
-  constant map needs no further tree, and a slowly changing map only a few.
+  tenth more than on the map on which it was chosen, the path is doubted: a new tree is
+  grown, and the robot drives the cheaper of the old and the new path. Both costs are
+  times along the predicted positions under the new λ̂. If no new path is found, the
+  next steps try again, up to `most_failures` times. A partial path is left at once.
+  Hence a constant map needs no further tree, and a slowly changing map only a few.
 - Sampled points have no heading, so a reference is the shortest path to a point with
-any
-  final heading. Hence no random heading causes a detour.
+  any final heading. Hence no random heading causes a detour.
 - After a plan without a path to the goal, the robot follows the best partial path. The
   next steps plan again. Each plan halves the radius of the references, down to the
   robot's tightest turn or the spacing of their points. With the full radius, a robot
@@ -43,8 +41,8 @@ any
 - Edges are added in rounds: all edges of a round, in all episodes, are simulated at
   once. Samples are a pure function of the plan state's seed and step, and the same for
   all episodes of a batch.
-- A path has at most one edge per round, so its maximum length is that of `rounds` edges
-  (100 m by default). A goal farther away is approached along partial paths.
+- A path has at most one edge per round, so its maximum length is the length of `rounds`
+  edges (100 m by default). A goal farther away is approached along partial paths.
 
 Letters in shapes: B episodes, M episodes that plan, D edges of a path, K segments of a
 path, N cells of a padded map, R edges of a round, S state dimensions.
@@ -174,8 +172,8 @@ class CLRRT(Planner[CLRRTState]):
         follower = PathFollower(config.follower, problem.robot)
         expect(
             config.turning_radius_m >= follower.tightest_m,
-            f"`turning_radius_m` ≥ {follower.tightest_m:g}, the radius of the robot's "
-            f"tightest turn, for CL-RRT, got {config.turning_radius_m}.",
+            f"`turning_radius_m` ≥ {follower.tightest_m:g} (the radius of the robot's "
+            f"tightest turn) for CL-RRT, got {config.turning_radius_m}.",
         )
         zero_m = torch.zeros_like(problem.start[:, 0])
         zero = torch.zeros_like(zero_m, dtype=torch.int64)
@@ -256,7 +254,7 @@ class CLRRT(Planner[CLRRTState]):
         chosen_cost = self._cost(plan_state, chosen_ground, length_m)
         dearer = cost > (1 + _RISE) * chosen_cost
         leads = route.status == PlanStatus.OK
-        # A robot at the end of its path searches for another.
+        # A robot at the end of its path searches for another path.
         is_left = closed | (dearer & ~leads)
         edge = torch.where(is_left, route.depth, plan_state.edge)
         doubted = plan_state.doubted | (dearer & leads)

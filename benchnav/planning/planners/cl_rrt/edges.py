@@ -10,8 +10,7 @@ collides.
   that begins in a non-free cell, because λ differs from the prediction, may leave the
   cell and continue.
 - If edges may cross non-free cells (`ClosedLoop.crossing`), they do not collide with
-such
-  cells. Each metre of an edge in or between such cells has a penalty.
+  such cells. Each metre of an edge in or between such cells has a penalty.
 - If an edge collides, the first half of its free part is kept, since in narrow passages
   no edge of full length is free. The source likewise keeps feasible nodes along a path.
 

@@ -7,7 +7,7 @@ speed. If an arc needs a turn rate out of bounds, the speed is reduced and the a
 kept. Hence traversability, which scales both velocities by the same factor, affects the
 time at which a robot reaches a point of the path, but hardly its route.
 
-The actions of the robot are (v, ω), as those of a unicycle. If its angular acceleration
+The actions of the robot are (v, ω), as for a unicycle. If its angular acceleration
 is limited, a short look-ahead would make it oscillate about the path. Hence the
 look-ahead distance is at least the distance that it drives while its turn rate builds
 up.

@@ -1,9 +1,9 @@
 """The tree of CL-RRT and the search that grows it.
 
 `search` computes a whole plan. It begins with a root and grows the tree in rounds. A
-round chooses nodes and a target for each, simulates the robot along references to the
-targets (`edges`), and adds the ends of the edges as nodes. Finally the best route is
-selected. A tree is an immutable table of nodes; each round returns a longer table.
+round chooses nodes and a target for each node, simulates the robot along references to
+the targets (`edges`), and adds the ends of the edges as nodes. Finally the best route
+is selected. A tree is an immutable table of nodes; each round returns a longer table.
 
 - Nodes are chosen by Kuwata's mix of two heuristics: the nearest node in Dubins length
   (explore), or the node through which the point is reached soonest (optimise). 70 % of
@@ -49,7 +49,7 @@ _PARTIAL_GAIN_M = 0.5  # minimum gain of a partial path toward the goal, in metr
 # A partial path is left at this distance from its end in metres, since the end may be
 # close to non-free cells.
 _MARGIN_M = 0.3
-_FAR_M = 1e4  # length in metres that exceeds that of any path on a map
+_FAR_M = 1e4  # length in metres; every path on a map is shorter
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -143,8 +143,8 @@ class Optimal(Planner[OptimalState]):
         radius = problem.goal_radius_m
         expect(
             radius >= min_radius,
-            f"`goal_radius_m` of at least {min_radius:.2f}, half of a cell's diagonal, for "
-            f"planner {self.name!r}, got {radius:g}. Raise it, or raise `refine`.",
+            f"`goal_radius_m` ≥ {min_radius:.2f} m (half a cell's diagonal) for planner "
+            f"{self.name!r}, got {radius:g} m. Raise the radius or `refine`.",
         )
         costs = self.costs_of(problem, grid)
         moves = Moves.of(robot, grid.resolution_m, headings)
@@ -165,8 +165,8 @@ class Optimal(Planner[OptimalState]):
         _, high = robot.action_high
         expect(
             low == -high,
-            "`turn_rate_radps` with the same maximum to both sides for planner "
-            f"{self.name!r}, got {low:g} to {high:g}.",
+            "the same maximum of `turn_rate_radps` for left and right turns with "
+            f"planner {self.name!r}, got a range of {low:g} to {high:g}.",
         )
         expect(
             min_speed == 0,
@@ -221,8 +221,8 @@ class Optimal(Planner[OptimalState]):
             ConfigError: Always.
         """
         raise ConfigError(
-            f"Expected a constant map for planner {self.name!r}, which plans once, got "
-            "an updated map. Use belief 'static' and sensor 'full'."
+            f"Expected a constant map for planner {self.name!r}, got an updated map. "
+            "This planner plans only once. Use belief 'static' and sensor 'full'."
         )
 
     def no_path_cost(self, costs: Costs) -> Tensor:
@@ -313,7 +313,7 @@ class NearOptimal(Optimal):
     def plan(
         self, step: Step, plan_state: OptimalState
     ) -> tuple[Tensor, OptimalState, Plan]:
-        """Return the drive's actions, or those of value iteration off the drive."""
+        """Return the drive's actions; off the drive, those of value iteration."""
         drive = plan_state.drive
         n_steps = plan_state.n_steps
         assert drive is not None
@@ -354,8 +354,8 @@ class NearOptimal(Optimal):
             is_certain = bool((distribution.stds == 0).all())
         if not is_certain:
             raise ConfigError(
-                f"Expected model 'clairvoyant' for planner {self.name!r}, which needs λ "
-                "itself, got a model that predicts uncertain λ."
+                f"Expected model 'clairvoyant' for planner {self.name!r}, got a model "
+                "that predicts uncertain λ. This planner needs the true λ."
             )
         field = distribution.mean()
         rate = 1 / field.clamp(min=_MIN_TRAVERSABILITY)

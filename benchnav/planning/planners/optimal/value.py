@@ -263,8 +263,8 @@ def _solve(costs: Costs, arcs: list[_Arc], grid: Grid) -> CostToGo:
     scales = []
     dwells = []
     survivals: list[Tensor | None] = []
-    # Off the map, the cost per second is that of a missing path, and the interpolation
-    # weights are those of the map's border.
+    # Off the map, the cost per second is the cost of a missing path, and the
+    # interpolation weights are those of the map's border.
     rate = pad(costs.rate[:, None], frame, value=UNREACHED)
     framed = pad(weights, frame, mode="replicate")
     for arc in arcs:

@@ -156,7 +156,7 @@ def test_a_folder_holds_numbers_differences_page_and_figures(
         if line.startswith("- **")
     ]
     assert headings == explained[: len(headings)]
-    assert "## Differences to the best" in page
+    assert "## Differences from the best model" in page
     (row,) = [
         line for line in page.splitlines() if line.startswith("| train | colours")
     ]
