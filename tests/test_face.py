@@ -21,7 +21,7 @@ FACES = {
     "benchnav.datagen": "DrawnMaps Layer Recipe Streams TerrainClass TerrainDataset TerrainMaps create_dataset "
     "find_dataset generate load_recipe recipe_from_dict shipped_recipes",
     "benchnav.env": "EgocentricEnv EgocentricVectorEnv OffRoadEnv OffRoadVectorEnv PolicyPlanner",
-    "benchnav.eval": "Comparison Condition Results Suite compare_runs evaluate open_run read_report read_steps "
+    "benchnav.eval": "Between Comparison Condition Results Suite compare_runs evaluate open_run read_report read_steps "
     "run_suite write_report",
     "benchnav.eval.figures": "RunData figures_of",
     "benchnav.metrics": "Energy Episode LearningRecord Metric MetricError SHIPPED",
