@@ -7,6 +7,7 @@ import pytest
 
 from benchnav.core.errors import ConfigError
 from benchnav.eval import evaluate
+from benchnav.eval.figures import Waterfall
 from benchnav.eval.results import Results
 from benchnav.planning import AStarDWA, CVaR, Mean, Straight, Unicycle, World
 from tests.commands import call
@@ -138,9 +139,11 @@ def test_runs_of_one_world_each_are_compared(
 def test_the_report_has_a_section_only_with_several_worlds(
     run: Results, tmp_path: Path
 ) -> None:
-    page = run.report(tmp_path)
+    contrast = Waterfall({"planner": "straight"}, {"risk": "mean"}, name="contrast")
+    page = run.report(tmp_path, [contrast])
     assert '<h2 id="worlds">Between worlds</h2>' in page.read_text()
     summary = (tmp_path / "summary.md").read_text()
     assert "Agreement between worlds:\n\n|" in summary
     names = ("worlds.csv", "worlds-agreement.csv", "worlds-hypotheses.csv")
-    assert all((tmp_path / name).is_file() for name in names)
+    figures = ("figures/between-worlds.png", "figures/contrast.png")
+    assert all((tmp_path / name).is_file() for name in (*names, *figures))

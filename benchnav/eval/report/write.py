@@ -18,7 +18,7 @@ from benchnav.core.tables import Table, markdown, print_table, to_latex, to_mark
 from benchnav.eval.experiment.metrics import further_quantities, quantities
 from benchnav.eval.failures import RecordDriven, collect_sheets, failures_table
 from benchnav.eval.figures.data import RunData
-from benchnav.eval.figures.shipped import SHIPPED, figures_of
+from benchnav.eval.figures.shipped import figures_of, is_shipped
 from benchnav.eval.folder.checksums import note_checksums
 from benchnav.eval.folder.provenance import command_lines
 from benchnav.eval.folder.results import read_results
@@ -317,7 +317,7 @@ def _draw_figures(
             name = spec["part"]
         try:
             figure = registry.take("figure", spec)
-            if type(figure) not in SHIPPED:
+            if not is_shipped(figure):
                 _save_figures(report, figure.variants(report), folder, captions)
         except Exception as error:
             faults.append(f"warning: the figure {name} is missing: {one_line(error)}")

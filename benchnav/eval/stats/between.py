@@ -33,6 +33,7 @@ from benchnav.stats.between import (
     spearman,
 )
 from benchnav.stats.episodes import Interval
+from benchnav.stats.intervals import success_interval
 
 # Attributes in which hypotheses differ in addition to their settings.
 _CLAIM = ("metric", "kind", "direction", "margin")
@@ -142,7 +143,8 @@ def _settings_of(
             rate, low, high = np.nan, np.nan, np.nan
             if not episodes.empty:
                 rate, low, high = success_mean(episodes)
-            row = {**setting.labels, "world": world, "condition": condition}
+            row: dict[str, Any] = {**setting.labels, "world": world}
+            row["condition"] = condition
             row["n_episodes"] = len(episodes)
             row["n_maps"] = episodes["group"].nunique()
             row |= {"success_rate": rate, "success_low": low, "success_high": high}
@@ -327,6 +329,52 @@ def _tests_in_worlds(
 
 def _claim_of(test: Mapping[str, Any]) -> tuple[Any, ...]:
     return tuple(test[name] for name in _CLAIM)
+
+
+def contrast_by_world(
+    settings: tuple[Setting, Setting],
+    worlds: Sequence[str],
+    rows: Mapping[str, pd.DataFrame],
+) -> pd.DataFrame:
+    """Return the difference in success of two settings in each world, and its changes.
+
+    Args:
+        settings: the first setting, and the one that is subtracted; both were run in
+            all worlds.
+        worlds: labels of the worlds, in the order of a series.
+        rows: rows of episodes by id of the condition.
+
+    Returns:
+        One row per world: `world`; `n_episodes` and `n_maps`, common to all worlds;
+        `difference` with its 95 % interval `difference_low`, `difference_high`; and
+        `change`, the difference minus that in the world before, with its interval
+        `change_low`, `change_high`; NaN in the first world. All intervals are those of
+        `intervals.success_interval`. Empty without common episodes.
+    """
+    wins, sizes = _wins(settings, worlds, rows)
+    if not len(sizes):
+        return pd.DataFrame()
+    gains = wins[:, 0] - wins[:, 1]
+    table_rows = []
+    change = (np.nan, np.nan, np.nan)
+    for index, world in enumerate(worlds):
+        difference = _success_difference(gains[index], sizes)
+        if index:
+            change = _success_difference(gains[index] - gains[index - 1], sizes)
+        row: dict[str, Any] = {"world": world, "n_episodes": int(sizes.sum())}
+        row["n_maps"] = len(sizes)
+        row |= _named("difference", difference)
+        row |= _named("change", change)
+        table_rows.append(row)
+    return pd.DataFrame(table_rows)
+
+
+def _success_difference(gains: np.ndarray, sizes: np.ndarray) -> Interval:
+    """Return a difference in success with its interval, NaN if there is only one map."""
+    if len(sizes) < 2:
+        return float(gains.sum() / sizes.sum()), np.nan, np.nan
+    mean, low, high = success_interval(gains, sizes)
+    return float(mean), float(low), float(high)
 
 
 def _named(name: str, interval: Interval) -> dict[str, float]:
