@@ -159,7 +159,7 @@ def _draw_pair(
         face = look["color"] if row["robust"] and is_filled else "white"
         panel.plot(x, y, ls="none", ms=4.5, mfc=face, zorder=3, **look)
     step = 10 if limits[1] - limits[0] < 50 else 20
-    ticks = np.arange(step * np.ceil(limits[0] / step), 101, step)
+    ticks = np.arange(step * np.ceil(limits[0] / step), limits[1], step)
     panel.set(xlim=limits, ylim=limits, aspect="equal", xticks=ticks, yticks=ticks)
     panel.grid(color=GRID)
     panel.set_axisbelow(True)
