@@ -188,9 +188,9 @@ def same_sign(wins: np.ndarray, episodes: np.ndarray) -> SameSign:
     """Compare the signs of significant differences with those in another world.
 
     The pairs are those that are significant in the reference world (sign-flip tests per
-    map, Holm's correction). Bootstrap samples keep these pairs. In a sample, a pair has
-    the same sign if the differences of both worlds have the same sign, other than 0.
-    Pairs that share settings are dependent; the samples contain this dependence.
+    map, Holm's correction). Bootstrap samples keep these pairs. A pair without a
+    difference in the other world has another sign. Pairs that share settings are
+    dependent; the samples contain this dependence.
 
     Args:
         wins: numbers of successes in the reference world and in the other world, shape
@@ -207,8 +207,7 @@ def same_sign(wins: np.ndarray, episodes: np.ndarray) -> SameSign:
     if len(episodes) < LEAST_MAPS:
         return SameSign(pairs=len(pairs), fraction=fraction)
     signs = np.sign(gains @ bootstrap_counts(len(episodes)).T)
-    is_same = (signs[0] == signs[1]) & (signs[0] != 0)
-    fractions = is_same.mean(0)
+    fractions = (signs[0] == signs[1]).mean(0)
     n_low = int((fractions <= 0.5).sum())
     return SameSign(
         pairs=len(pairs),

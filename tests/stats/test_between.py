@@ -118,6 +118,13 @@ def test_maps_count_by_their_episodes() -> None:
     uneven = np.concatenate([grouped[..., :5], wins[..., 20:]], axis=-1)
     sizes = np.repeat([4 * DRAWS, DRAWS], [5, 20])
     assert estimate(pearson, uneven, sizes)[0] == pytest.approx(value)
+    regret, low, high = regret_intervals(uneven, sizes)
+    sampled = []
+    for counts in bootstrap_counts(25):
+        rates = (uneven * counts).sum(-1) / (sizes * counts).sum()
+        sampled.append((rates.max(1, keepdims=True) - rates).max(0))
+    assert regret == pytest.approx(regret_intervals(wins, np.full(40, DRAWS))[0])
+    assert [low, high] == pytest.approx(np.quantile(sampled, [0.025, 0.975], axis=0))
 
 
 def test_few_maps_have_no_interval() -> None:
@@ -146,7 +153,7 @@ def test_kappa_by_hand() -> None:
 
 
 def test_significant_pairs_are_holms_of_exact_tests() -> None:
-    wins = wins_of([[0.5, 0.52, 0.9, 0.75]])[0]
+    wins = wins_of([[0.5, 0.6, 0.75, 0.68]])[0]
     pairs = list(combinations(range(4), 2))
     p = []
     for i, j in pairs:
@@ -159,7 +166,7 @@ def test_significant_pairs_are_holms_of_exact_tests() -> None:
         if p[index] * (len(p) - step) >= 0.05:
             break
         expected.add(pairs[index])
-    assert 0 < len(expected) < len(pairs)
+    assert 0 < len(expected) < sum(value < 0.05 for value in p)
     assert set(map(tuple, significant_pairs(wins).tolist())) == expected
     assert significant_pairs(wins[:1]).shape == (0, 2)
 
@@ -188,6 +195,7 @@ def test_same_sign_of_one_pair_is_a_one_sided_test() -> None:
     """If the pair is certain in the first world, p is that of the second world."""
     episodes = np.full(200, DRAWS)
     first = wins_of([[0.3, 0.9]], 200)
+    p_values = []
     for seed in range(6):
         second = wins_of([[0.60, 0.64]], 200, seed)
         agreement = same_sign(np.concatenate([first, second]), episodes)
@@ -196,6 +204,17 @@ def test_same_sign_of_one_pair_is_a_one_sided_test() -> None:
         assert agreement.p == pytest.approx(
             stats.norm.sf(gains.mean() / error), abs=0.04
         )
+        assert agreement.low == float(agreement.p < 0.05)
+        p_values.append(agreement.p)
+    assert min(p_values) < 0.05 < max(p_values) < 0.5
+
+
+def test_same_sign_of_half_of_the_pairs_is_not_significant() -> None:
+    first = np.repeat([[DRAWS], [DRAWS], [0]], 40, axis=1)
+    second = np.repeat([[2], [0], [1]], 40, axis=1)
+    agreement = same_sign(np.stack([first, second]), np.full(40, DRAWS))
+    assert agreement.pairs == 2
+    assert (agreement.fraction, agreement.low, agreement.p) == (0.5, 0.5, 1)
 
 
 def test_regret_is_the_largest_over_worlds() -> None:

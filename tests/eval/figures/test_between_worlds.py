@@ -24,7 +24,7 @@ from tests.eval.stats.test_between_worlds import (
     episodes,
 )
 
-RATES = np.array([[0.6, 0.8, 0.9, 0.3], [0.5, 0.6, 0.9, 0.2], [0.8, 0.6, 0.7, 0.1]])
+RATES = np.array([[0.86, 0.8, 0.9, 0.3], [0.5, 0.6, 0.9, 0.2], [0.8, 0.6, 0.7, 0.1]])
 CHOSEN = {"one": {"risk": "cvar:0.8"}, "other": {"risk": "mean"}}
 
 
@@ -40,7 +40,8 @@ def run_data(worlds: tuple[str, ...] = WORLDS, **labels: str) -> RunData:
     test |= {"margin": 0.0, "names": ["a", "b"], "claim": "c"}
     test["one"] = condition_id(worlds[0], "cvar:0.8")
     test["other"] = condition_id(worlds[0], "mean")
-    between = compare_worlds(about["conditions"], rows, {"tests": [test]})
+    of_time = test | {"metric": "T_total", "one": condition_id(worlds[0], "low")}
+    between = compare_worlds(about["conditions"], rows, {"tests": [test, of_time]})
     return made.run_data(about=about, episodes=rows, between=between)
 
 
@@ -77,7 +78,7 @@ def test_filled_points_are_the_robust_set(data: RunData) -> None:
     (panel, *_) = WorldAgreement().draw(data).axes
     settings = data.between.settings
     first = settings[settings["world"] == WORLDS[0]]
-    assert 0 < first["robust"].sum() < 4
+    assert 0 < first["robust"].sum() < first["in_best"].sum() < 4
     faces = {}
     for line in panel.lines:
         if line.get_marker() not in ("", "None"):
