@@ -21,9 +21,9 @@ FACES = {
     "benchnav.datagen": "DrawnMaps Layer Recipe Streams TerrainClass TerrainDataset TerrainMaps create_dataset "
     "find_dataset generate load_recipe recipe_from_dict shipped_recipes",
     "benchnav.env": "EgocentricEnv EgocentricVectorEnv OffRoadEnv OffRoadVectorEnv PolicyPlanner",
-    "benchnav.eval": "Comparison Condition Results Suite compare_runs evaluate open_run read_report read_steps "
+    "benchnav.eval": "Between Comparison Condition Results Suite compare_runs evaluate open_run read_report read_steps "
     "run_suite write_report",
-    "benchnav.eval.figures": "RunData figures_of",
+    "benchnav.eval.figures": "RunData Waterfall figures_of",
     "benchnav.metrics": "Energy Episode LearningRecord Metric MetricError SHIPPED",
     "benchnav.viz": "Curves Drive Figure condition_colours draw_drive draw_estimates draw_interval draw_path "
     "legend_outside line_looks mark panel_grid planner_colours planner_name risk_name save_twice show_map stack_panels "

@@ -5,6 +5,7 @@ from benchnav.core.public_names import face
 __getattr__, __dir__, __all__ = face(
     __name__,
     {
+        "benchnav.eval.between": ("Between",),
         "benchnav.eval.compare": ("compare_runs",),
         "benchnav.eval.experiment.condition": ("Condition",),
         "benchnav.eval.evaluation": ("evaluate",),

@@ -1,3 +1,4 @@
+from benchnav.eval.between import Between
 from benchnav.eval.compare import compare_runs
 from benchnav.eval.evaluation import evaluate
 from benchnav.eval.experiment.condition import Condition
@@ -9,6 +10,7 @@ from benchnav.eval.results import open_results as open_run
 from benchnav.eval.run.runner import run_suite
 
 __all__ = [
+    "Between",
     "Comparison",
     "Condition",
     "Results",

@@ -209,7 +209,7 @@ def compare(
         by: Column in which the conditions of a pair differ: risk, planner, model,
             objective, robot, sensor, ground, belief, world or run. If empty, the column
             of `against`; without `against`, run if the runs have common conditions,
-            otherwise risk.
+            otherwise risk. world also compares the ranking of settings between worlds.
         points: Difference in success rate, in percentage points. A note states the
             number of maps that is required to detect it.
         metric: Name of the metric to compare, such as path_length or energy; if empty,
@@ -219,6 +219,7 @@ def compare(
         out: Path without a suffix, to which .csv, .md and .tex are added.
     """
     from benchnav.core.tables import print_table
+    from benchnav.eval.between import between_runs
     from benchnav.eval.compare import compare_runs, write_comparison
 
     if out and (out.endswith(os.sep) or Path(out).name in ("", "..")):
@@ -232,8 +233,17 @@ def compare(
         runs, by, against, labels.selected, points / 100, different, metric
     )
     print_table(shown)
+    paths: list[Path] = []
     if out:
         paths = write_comparison(Path(out), table, shown)
+    if by == "world":
+        between = between_runs(runs, labels.selected)
+        print("\n".join(between.findings))
+        for between_table in between.tables:
+            print_table(between_table)
+        if out:
+            paths += between.save(f"{out}-worlds")
+    if paths:
         print("written:", ", ".join(map(str, paths)))
     else:
         print("columns: --out NAME writes NAME.md, which explains them")

@@ -95,11 +95,11 @@ def compare_runs(
         )
     runs = [open_run(folder) for folder in folders]
     quantity = _find_quantity(runs, metric) if metric else None
-    conditions = _select(read_conditions(runs), labels)
+    conditions = select_conditions(read_conditions(runs), labels)
     check_one_value_each(conditions)
     by = by_what(conditions, by, against)
     if by != "run":
-        conditions = _merge_runs(conditions)
+        conditions = merge_runs(conditions)
     _announce(conditions, by, against, difference)
     pairs = find_pairs(conditions, by, against)
     code_by_pair = [_unlike_code(pair.members) for pair in pairs]
@@ -250,9 +250,10 @@ def _names(folders: Sequence[Path]) -> list[str]:
     return ["/".join(path.parts[-n_parts:]) for path in paths]
 
 
-def _select(
+def select_conditions(
     conditions: list[Compared], labels: Mapping[str, Sequence[str]]
 ) -> list[Compared]:
+    """Return the conditions with some labels; a missing column selects all."""
     for name, values in labels.items():
         known_labels = dict.fromkeys(condition.labels[name] for condition in conditions)
         for value in values:
@@ -286,7 +287,7 @@ def _unlike_code(conditions: Iterable[Compared], only_parts: bool = False) -> li
     return lines
 
 
-def _merge_runs(conditions: Iterable[Compared]) -> list[Compared]:
+def merge_runs(conditions: Iterable[Compared]) -> list[Compared]:
     """Merge each condition that several runs contain, with the episodes of all runs.
 
     Raises:

@@ -2,7 +2,7 @@
 
 import shutil
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -14,6 +14,7 @@ from matplotlib.figure import Figure as Drawing
 from benchnav.core.errors import ConfigError, expect
 from benchnav.core.settings import hint
 from benchnav.core.tables import Table, to_markdown, to_terminal
+from benchnav.eval.between import Between, between_results
 from benchnav.eval.compare import compare_runs, write_comparison
 from benchnav.eval.experiment.condition import LABELS
 from benchnav.eval.figures.shipped import figures_of
@@ -153,14 +154,25 @@ class Results:
         Raises:
             ConfigError: If there is nothing to compare, or conditions cannot be paired.
         """
-        selected = {}
-        for name, value in labels.items():
-            expect(name in LABELS, f"labels among {', '.join(LABELS)}, got {name!r}.")
-            selected[name] = [value] if isinstance(value, str) else list(value)
         numbers, table = compare_runs(
-            [self.folder], by, against, selected, points / 100
+            [self.folder], by, against, _selected(labels), points / 100
         )
         return Comparison(numbers, table)
+
+    def between(self, **labels: str | Sequence[str]) -> Between:
+        """Compare the results of the same settings in several worlds.
+
+        A setting is a condition without its world. The episodes that it has in all
+        worlds are compared; see docs/how-to/compare-conditions.md.
+
+        Args:
+            **labels: labels of the compared conditions, one or several for each column,
+                such as planner="mppi".
+
+        Raises:
+            ConfigError: If no setting was run in two worlds.
+        """
+        return between_results(self._rows, _selected(labels))
 
     @property
     def plot(self) -> "Plots":
@@ -224,8 +236,8 @@ class Results:
             f"conditions on {n_maps} maps",
             f"success {rate:.1f} % over all; folder {self.folder}",
             *([self._rows.mark] if self._rows.mark else []),
-            ".episodes .summary .conditions .notes; .best() .compare(by=…) .plot.… "
-            ".report() .save(folder)",
+            ".episodes .summary .conditions .notes; .best() .compare(by=…) "
+            ".between() .plot.… .report() .save(folder)",
         ]
         return "\n".join(lines)
 
@@ -291,6 +303,19 @@ class Plots:
     def _draw_all(self, figures: Sequence[Figure]) -> Drawing | list[Drawing]:
         drawings = [figure(self._results._report) for figure in figures]
         return drawings[0] if len(drawings) == 1 else drawings
+
+
+def _selected(labels: Mapping[str, str | Sequence[str]]) -> dict[str, list[str]]:
+    """Return lists of labels by column.
+
+    Raises:
+        ConfigError: If a column does not exist.
+    """
+    selected = {}
+    for name, value in labels.items():
+        expect(name in LABELS, f"labels among {', '.join(LABELS)}, got {name!r}.")
+        selected[name] = [value] if isinstance(value, str) else list(value)
+    return selected
 
 
 def open_results(folder: str | Path) -> Results:

@@ -20,6 +20,8 @@ _NAME_OF_LABEL = {"planner": planner_name, "risk": risk_name}
 NOT_YET = "not yet a test"  # instead of p-values while the run is not finished
 # Columns whose labels distinguish conditions on one map.
 NAMING = ("planner", "risk", "model", *KNOWLEDGE, "robot", "objective", "world")
+# Column of conditions without their world: changes of the rules of its preset.
+_RULES = "rules"
 
 
 def differ(labels: Iterable[str]) -> bool:
@@ -93,9 +95,11 @@ def episode_names(labels: Sequence[Mapping[str, str]]) -> list[str]:
 
 
 def _differing(labels: Sequence[Mapping[str, str]]) -> list[str]:
-    """Return the columns of `NAMING` in which conditions differ."""
+    """Return the columns in which conditions differ."""
     return [
-        name for name in NAMING if differ(row.get(name, NOT_USED) for row in labels)
+        name
+        for name in (*NAMING, _RULES)
+        if differ(row.get(name, NOT_USED) for row in labels)
     ]
 
 
@@ -119,6 +123,25 @@ def contender_names(labels: Sequence[Mapping[str, str]]) -> list[str]:
         name = joined(shown.get(column, NOT_USED) for column in differing)
         names.append(name or shown["planner"])
     return names
+
+
+def world_names(worlds: Sequence[str]) -> dict[str, str]:
+    """Return short names of worlds by label, without `shared_words`.
+
+    A label that has only these words keeps its first word, the preset.
+    """
+    shared = shared_words(worlds).split()
+    names = {}
+    for world in worlds:
+        differing = [word for word in world.split() if word not in shared]
+        names[world] = " ".join(differing or world.split()[:1])
+    return names
+
+
+def shared_words(worlds: Sequence[str]) -> str:
+    """Return the words that the labels of all worlds share."""
+    first, *others = [world.split() for world in worlds]
+    return " ".join(word for word in first if all(word in other for other in others))
 
 
 def joined(labels: Iterable[str]) -> str:

@@ -32,7 +32,7 @@ from benchnav.models.predictor import ModelPart, find_ground_statistics
 from benchnav.planning.free_space import Rules
 from benchnav.planning.planners.planner import INPUTS
 from benchnav.planning.problem import Task
-from benchnav.planning.world.world import World, read_world
+from benchnav.planning.world.world import World, read_world, split_label
 
 # Default parts of sensing and belief. Ids leave them out, so that conditions of runs
 # from before these parts existed keep their ids.
@@ -312,7 +312,8 @@ def _with_clearance(condition: Condition, clearance_m: float) -> Condition:
     world = condition.world.with_clearance(clearance_m)
     if world == condition.world:
         return condition
-    label = f"{condition.world_label} clearance_m={clearance_m:.3g}"
+    name, changes = split_label(condition.world_label, condition.rules)
+    label = f"{name} clearance_m={clearance_m:.3g} {changes}".strip()
     return replace(condition, world=world, world_label=label)
 
 

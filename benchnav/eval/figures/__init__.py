@@ -10,5 +10,6 @@ __getattr__, __dir__, __all__ = face(
     {
         "benchnav.eval.figures.data": ("RunData",),
         "benchnav.eval.figures.shipped": ("figures_of",),
+        "benchnav.eval.figures.waterfall": ("Waterfall",),
     },
 )

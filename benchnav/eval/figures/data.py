@@ -13,6 +13,7 @@ from benchnav.core.errors import BenchnavError
 from benchnav.eval.failures import RecordDriven, Sheets
 from benchnav.eval.folder.steps import STEPS, read_steps
 from benchnav.eval.recording import GROUND, RecordedMap, Recording, read_recordings
+from benchnav.eval.stats.between import BetweenWorlds
 
 MAX_PANELS = 4  # maximum number of recordings in a figure
 _EPISODE = ("condition", "seed", "realisation", "map")
@@ -54,6 +55,8 @@ class RunData:
             hypotheses.
         regret: one row per step of a chain, from `regret.split_regret`; empty without a
             chain.
+        between: comparison of the run's worlds, from `between.compare_worlds`; its
+            tables are empty if the run has only one world.
         failures: one row per failed episode, from `failures.failures_table`.
         sheets: sheets of failures.
         folder: the run folder; None if the run was not saved, so that it has no steps
@@ -67,6 +70,7 @@ class RunData:
     episodes: pd.DataFrame
     tests: pd.DataFrame = field(default_factory=pd.DataFrame)
     regret: pd.DataFrame = field(default_factory=pd.DataFrame)
+    between: BetweenWorlds = field(default_factory=BetweenWorlds)
     failures: pd.DataFrame = field(default_factory=pd.DataFrame)
     sheets: Sheets = field(
         default_factory=lambda: Sheets(shown=(), predicted={}, left_out="")

@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 
+from benchnav.core.specified import arguments_of
+from benchnav.eval.figures.between_worlds import WorldAgreement
 from benchnav.eval.figures.data import RunData
 from benchnav.eval.figures.distributions import Distributions
 from benchnav.eval.figures.driven import DrivenPaths
@@ -14,10 +16,12 @@ from benchnav.eval.figures.over import Over
 from benchnav.eval.figures.regret import Regret
 from benchnav.eval.figures.success import Success
 from benchnav.eval.figures.trajectories import Trajectories
+from benchnav.eval.figures.waterfall import Waterfall
 from benchnav.viz.figure import Figure, applicable
 
 SHIPPED: tuple[type[Figure], ...] = (
-    *(Forest, Success, Regret, DrivenPaths, Over, Outcomes, Distributions),
+    *(Forest, Success, WorldAgreement, Waterfall, Regret, DrivenPaths, Over),
+    *(Outcomes, Distributions),
     *(Failures, Learning, KnowledgeMaps, Trajectories),
 )
 
@@ -27,12 +31,17 @@ def figures_of(data: RunData, more: Sequence[Figure] = ()) -> list[Figure]:
 
     Args:
         data: data of the run.
-        more: custom figures, after the shipped ones; figures of shipped classes are
-            ignored.
+        more: further figures, after the shipped ones; shipped figures without
+            arguments are ignored.
 
     Returns:
         Figures whose data the run has.
     """
     figures: list[Figure] = [cls() for cls in SHIPPED]
-    figures += [figure for figure in more if type(figure) not in SHIPPED]
+    figures += [figure for figure in more if not is_shipped(figure)]
     return applicable(figures, data)
+
+
+def is_shipped(figure: Figure) -> bool:
+    """Return whether a figure is drawn for every run: shipped, and without arguments."""
+    return type(figure) in SHIPPED and not any(arguments_of(figure) or ())

@@ -18,11 +18,16 @@ from benchnav.core.tables import Table, markdown, print_table, to_latex, to_mark
 from benchnav.eval.experiment.metrics import further_quantities, quantities
 from benchnav.eval.failures import RecordDriven, collect_sheets, failures_table
 from benchnav.eval.figures.data import RunData
-from benchnav.eval.figures.shipped import SHIPPED, figures_of
+from benchnav.eval.figures.shipped import figures_of, is_shipped
 from benchnav.eval.folder.checksums import note_checksums
 from benchnav.eval.folder.provenance import command_lines
 from benchnav.eval.folder.results import read_results
 from benchnav.eval.folder.run_folder import ERRORS, caveats
+from benchnav.eval.report.between_tables import (
+    TITLE,
+    between_findings,
+    between_tables,
+)
 from benchnav.eval.report.findings import findings
 from benchnav.eval.report.header import header_lines, provenance_lines
 from benchnav.eval.report.hypotheses import hypothesis_findings, hypothesis_table
@@ -33,6 +38,7 @@ from benchnav.eval.report.result_tables import (
     result_table,
 )
 from benchnav.eval.stats.best import against_best, privileged_models
+from benchnav.eval.stats.between import compare_worlds
 from benchnav.eval.stats.hypotheses import test_hypotheses
 from benchnav.eval.stats.regret import split_regret
 from benchnav.eval.stats.summary import summarise
@@ -79,6 +85,16 @@ class Report(RunData):
         all_quantities = quantities(further_quantities(self.about))
         unit = unit_of_statistics(self.summary)
         return self.marked(hypothesis_table(self.tests, unit, all_quantities))
+
+    @property
+    def worlds(self) -> tuple[Table, ...]:
+        """The tables that compare worlds; empty if the run has only one world."""
+        if self.between.settings.empty:
+            return ()
+        unit = unit_of_statistics(self.summary)
+        all_quantities = quantities(further_quantities(self.about))
+        tables = between_tables(self.between, unit, all_quantities)
+        return tuple(self.marked(table) for table in tables)
 
     def marked(self, table: Table) -> Table:
         """Return a table with a note if the run is not finished."""
@@ -130,9 +146,19 @@ def read_report(
     best = against_best(episodes, summary, privileged_models(manifest["conditions"]))
     summary = summary.merge(best, on="condition", how="left", validate="1:1")
     summary = summary.join(_latencies(summary, manifest["conditions"]))
+    between = compare_worlds(
+        results.conditions,
+        episodes,
+        manifest.get("hypotheses"),
+        not results.is_partial,
+        quantities(further),
+    )
     failures = failures_table(folder, episodes)
     sheets = collect_sheets(summary, failures, record_driven)
     findings_by_title = findings(summary, failures, sheets.predicted)
+    world_sentences = between_findings(between)
+    if world_sentences:
+        findings_by_title[TITLE] = world_sentences
     if not tests.empty:
         # Findings are exploratory if they do not test the hypotheses of the run.
         exploratory = _prefixed("Exploratory: ", findings_by_title)
@@ -162,6 +188,7 @@ def read_report(
         summary=summary,
         tests=tests,
         regret=split_regret(manifest["conditions"], episodes, worlds),
+        between=between,
         episodes=episodes,
         failures=failures,
         sheets=sheets,
@@ -217,6 +244,9 @@ def write_report(
         "summary": report.summary,
         "hypotheses": report.tests,
         "regret": report.regret,
+        "worlds": report.between.settings,
+        "worlds-agreement": report.between.agreement,
+        "worlds-hypotheses": report.between.hypotheses,
     }
     texts = {
         f"{name}.csv": report.csv(table)
@@ -256,6 +286,8 @@ def print_report(report: Report) -> None:
     print_table(report.table)
     if report.learning:
         print_table(report.learning)
+    for table in report.worlds:
+        print_table(table)
     lines = list(report.warnings)
     for title, sentences in report.findings.items():
         lines += [f"{title}:", *sentences]
@@ -285,7 +317,7 @@ def _draw_figures(
             name = spec["part"]
         try:
             figure = registry.take("figure", spec)
-            if type(figure) not in SHIPPED:
+            if not is_shipped(figure):
                 _save_figures(report, figure.variants(report), folder, captions)
         except Exception as error:
             faults.append(f"warning: the figure {name} is missing: {one_line(error)}")

@@ -6,6 +6,7 @@ run.
 """
 
 from collections.abc import Mapping
+from dataclasses import fields
 from functools import partial
 from typing import Any
 
@@ -20,6 +21,8 @@ from benchnav.metrics.shipped import QUANTITIES
 from benchnav.stats.episodes import Interval, difference_p, interval_of
 from benchnav.stats.holm import ALPHA, holm
 from benchnav.stats.margins import margin_p
+
+_FIELDS = tuple(item.name for item in fields(Hypothesis))
 
 
 def test_hypotheses(
@@ -40,7 +43,7 @@ def test_hypotheses(
         quantities: quantities by which conditions are compared, by name.
 
     Returns:
-        One row per hypothesis: all fields of `Hypothesis`, `names` and `claim`; `unit`
+        One row per hypothesis: all keys of its entry in `tests`; `unit`
         of the following columns; `n_maps`, the number of maps, or of groups of maps;
         `n_episodes` of each condition; `mean_one`, `mean_other`; `difference`, `one`
         minus `other`; the limits `low`, `high` of its 95 % interval and `low_90`,
@@ -51,10 +54,8 @@ def test_hypotheses(
     rows = dict(list(episodes.groupby("condition", sort=False)))
     table_rows = []
     for entry in fixed["tests"]:
-        fields = dict(entry)
-        fields.pop("names", None)
-        fields.pop("claim", None)
-        test = Hypothesis(**fields)
+        stated = {field: entry[field] for field in _FIELDS if field in entry}
+        test = Hypothesis(**stated)
         sides = []
         for condition in (test.one, test.other):
             side_rows = rows.get(condition, episodes.iloc[:0])

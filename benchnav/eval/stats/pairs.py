@@ -209,7 +209,7 @@ def _other_differences(conditions: Sequence[Compared], by: str) -> str:
     """Describe differences of conditions that prevent pairs by a column."""
     fields: dict[str, dict[str, Any]] = {}
     for condition in conditions:
-        field_ = _field(condition)
+        field_ = drawn_field(condition.value["world"])
         fields[repr(field_)] = field_
     if by == "world" and len(fields) > 1:
         first, second, *_ = fields.values()
@@ -242,15 +242,20 @@ def _differ_in(a: Compared, b: Compared, by: str) -> bool:
     differing = {key for key in keys if a.value.get(key) != b.value.get(key)}
     by_keys = set(_KEYS[by])
     is_only_difference = differing - set(unused) <= by_keys
-    return is_only_difference and bool(differing & by_keys) and _field(a) == _field(b)
+    if not is_only_difference or not differing & by_keys:
+        return False
+    return drawn_field(a.value["world"]) == drawn_field(b.value["world"])
 
 
-def _field(condition: Compared) -> dict[str, Any]:
+def drawn_field(world: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings of a world that determine the drawn λ.
 
-    If λ is frozen, they include the threshold of immobilising terrain.
+    If λ is frozen, they include the threshold of immobilising terrain and the clearance
+    of accepted draws.
+
+    Args:
+        world: world of a condition, as in `run.json`.
     """
-    world = condition.value["world"]
     if world["noise"] != "frozen":
         return {"noise": world["noise"]}
     immobile = world.get("immobile") or {}
@@ -259,6 +264,7 @@ def _field(condition: Compared) -> dict[str, Any]:
         "correlation_m": world.get("correlation_m"),
         "kernel": world.get("kernel"),
         "immobile.below": immobile.get("below"),
+        "clearance_m": world.get("clearance_m"),
     }
 
 

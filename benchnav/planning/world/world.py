@@ -359,6 +359,26 @@ def read_world(world: Any, task: Any = None) -> tuple[World, Rules, str]:
     return changed_world, rules, label
 
 
+def split_label(label: str, rules: Rules) -> tuple[str, str]:
+    """Split the label of a world and its rules.
+
+    Args:
+        label: label from `read_world`.
+        rules: rules of the label.
+
+    Returns:
+        Label of the world without rules, and the changes of the preset's rules; the
+        second is empty if the rules are those of the preset.
+    """
+    name = label.split()[0]
+    if name not in PRESETS:
+        return label, ""
+    changes = " ".join(_differences(PRESETS[name].rules, rules))
+    if not changes or not label.endswith(f" {changes}"):
+        return label, ""
+    return label.removesuffix(f" {changes}"), changes
+
+
 def _differences(preset: Any, value: Any) -> list[str]:
     """Return the fields that differ from the preset, as `name=value` for tables."""
     changed = []

@@ -14,6 +14,7 @@ from benchnav.eval.run.check import check_suite
 from benchnav.eval.run.knowledge import KnowledgeTracker
 from benchnav.eval.run.runner import run_suite
 from benchnav.eval.run.unit import Settings, UnitInputs, build, read_block
+from benchnav.eval.stats.pairs import drawn_field
 from benchnav.planning.footprint import minimum_over_footprint
 from benchnav.planning.robots import SkidSteer
 from benchnav.planning.sensing.sensor import Contact
@@ -92,6 +93,14 @@ def test_the_clearance_is_that_of_the_largest_footprint(dataset_path: Path) -> N
     worlds = tuple(world | clearances for world in WORLDS)
     for condition in conditions_of(suite_of(dataset_path, world=worlds)):
         assert condition.world.clearance_m == 0.6
+    for condition in conditions_of(
+        suite_of(dataset_path, task={"inflation": "none", "goal_radius_m": 1.5})
+    ):
+        # Changes of rules come last, so that worlds are compared without them.
+        assert condition.world_label.endswith(
+            " clearance_m=0.43 goal_radius_m=1.5 inflation=none"
+        )
+    assert drawn_field(conditions[0].value["world"])["clearance_m"] == RADIUS_M
     paper = conditions_of(suite_of(dataset_path, world=("paper",)))
     assert {condition.world.clearance_m for condition in paper} == {None}
 

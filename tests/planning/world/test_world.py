@@ -6,7 +6,7 @@ import torch
 from benchnav.core.errors import ConfigError
 from benchnav.core.settings import of, read
 from benchnav.planning.free_space import FreeSpace, Immobile, Rules
-from benchnav.planning.world.world import PRESETS, World, read_world
+from benchnav.planning.world.world import PRESETS, World, read_world, split_label
 
 
 def test_the_papers_world() -> None:
@@ -131,3 +131,19 @@ def test_noise_of_another_name_and_numbers_out_of_range_are_refused() -> None:
     ):
         with pytest.raises(ConfigError, match=f"immobile.{next(iter(wrong))}"):
             Immobile(**wrong)
+
+
+def test_a_label_is_split_into_world_and_rules() -> None:
+    for world in ("stakes", {"preset": "stakes", "correlation_m": 3.0}):
+        plain_label = read_world(world)[2]
+        for task, changes in (
+            ({}, ""),
+            ({"goal_radius_m": 2.0}, "goal_radius_m=2"),
+            (
+                {"free_space": {"by": "risk", "above": 0.2}, "replan_every_s": 1.0},
+                "by=risk above=0.2 replan_every_s=1",
+            ),
+        ):
+            _, rules, label = read_world(world, task)
+            assert split_label(label, rules) == (plain_label, changes)
+    assert split_label("a label of a user", read_world("stakes")[1])[1] == ""
