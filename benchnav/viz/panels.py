@@ -1,6 +1,7 @@
 """Panels that show numbers: grids of panels, curves over a swept value, intervals."""
 
 import itertools
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -21,6 +22,8 @@ from benchnav.viz.style import (
 
 Looks = Mapping[str, Mapping[str, Any]]
 GRID = "0.9"  # colour of grid lines
+_LETTER_IN = 0.064  # mean width of a letter of a title
+_LINE_IN = 0.13  # height of a line of a title
 
 
 def line_looks(
@@ -58,7 +61,7 @@ def panel_grid(
     """Create a figure with a titled stack of panels for each title, row by row.
 
     Args:
-        titles: titles of the stacks.
+        titles: titles of the stacks, which are broken into lines that fit.
         across: maximum number of stacks next to each other.
         high_in: height of a stack in inches.
         ends_in: height of everything except the stacks, such as the legend, in inches.
@@ -74,6 +77,10 @@ def panel_grid(
     if not width_in:
         width_in = ONE_COLUMN_IN if across == 1 else TWO_COLUMNS_IN
     n_rows = -(-len(titles) // across)
+    letters = int(width_in / across / _LETTER_IN)
+    titles = [textwrap.fill(title, letters) for title in titles]
+    more_lines = max(title.count("\n") for title in titles)
+    high_in += _LINE_IN * more_lines
     size = (width_in, high_in * n_rows + ends_in)
     figure = Figure(figsize=size, layout="constrained")
     stacks = stack_panels(figure, len(titles), across, layers, **shared)
