@@ -256,6 +256,6 @@ def _named_errors(argument: str, name: str) -> Iterator[None]:
     except load_rasterio().errors.RasterioError as error:
         reason = " ".join(str(error.__cause__ or error).split())
         raise DatasetError(
-            f"Expected `{argument}` as a raster that GDAL can read, got {name}: "
+            f"Expected `{argument}` to be a raster that GDAL can read, got {name}: "
             f"{reason}"
         ) from error

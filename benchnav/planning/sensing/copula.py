@@ -94,7 +94,7 @@ class Copula(Belief[CopulaState]):
             is_valid = 0 <= length < math.inf
         expect(
             is_valid,
-            "`correlation_m` as a finite number ≥ 0, 'world' or 'estimated', got "
+            "`correlation_m` to be a finite number ≥ 0, 'world' or 'estimated', got "
             f"{length!r}.",
         )
         expect(self.window >= 1, f"`window` ≥ 1, got {self.window}.")
