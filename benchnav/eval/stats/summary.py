@@ -129,8 +129,8 @@ def summarise(
 
         - `condition` and its labels; `n_episodes`; `n_maps`; `n_groups`, which is
           `n_maps` if the dataset has no groups.
-        - `success_rate` with its interval `success_low`, `success_high`, and
-          `design_effect`; see `success_mean`.
+        - `success_rate`, with the limits `success_low` and `success_high` of its
+          interval, and `design_effect`; see `success_mean`.
         - `NAME_mean`, `NAME_std`, and `NAME_n`, the number of episodes with a value,
           for the total time (a failure counts as T), the time of successes only,
           observed λ, the time divided by the reference time, the score, the path
@@ -198,7 +198,7 @@ def _summarise_condition(
 
 
 def _spread(quantity: Quantity, values: pd.Series) -> dict[str, object]:
-    """Return mean, standard deviation and number of values of a quantity, by column."""
+    """Return mean, standard deviation and number of values, keyed by column name."""
     stem = quantity.column.removesuffix(quantity.suffix)
     return {
         quantity.summary_column("mean"): values.mean(),
