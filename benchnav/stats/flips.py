@@ -4,7 +4,7 @@ Under H₀ the two contestants are exchangeable on each map. An assignment excha
 on some of the maps. With up to 13 maps, all assignments are enumerated; with more,
 9 999 are drawn at random with a fixed seed. Maps are first sorted by their differences,
 so that p depends neither on the order of maps nor on the order of the contestants. Maps
-without a difference do not count.
+without a difference do not affect p.
 Sources: Fisher (1935), "The Design of Experiments", section 21; Phipson and Smyth
 (2010), "Permutation p-values should never be zero", for counting the observed
 assignment.
