@@ -174,7 +174,7 @@ except benchnav.ConfigError as error:
             "FusedModel",
         ),
         "Expected_the_checkpoint_paper-v1_in_checkpoints/,_got_no_such_folder."
-        "_The_wheel_leaves_it_out_for_its_size.",
+        "_The_wheel_does_not_contain_this_checkpoint,_because_it_is_too_large.",
     ]
 
 

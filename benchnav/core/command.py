@@ -363,8 +363,8 @@ def _read_config(command: Command, value: str) -> dict[str, Any]:
         for sibling in path.parent.glob("*.y*ml"):
             candidates.append(str(path.parent / sibling.name))
         raise ConfigError(
-            f"Expected --config as a YAML file{among}, got {value!r}, which does not "
-            f"exist.{hint(str(path), candidates)}"
+            f"Expected --config to be an existing YAML file{among}, got {value!r}."
+            f"{hint(str(path), candidates)}"
         )
     content = read_yaml(path)
     if not isinstance(content, dict | None):

@@ -70,12 +70,12 @@ def squared_integral(weights: Tensor, means: Tensor, stds: Tensor) -> Tensor:
     stds = stds.clamp(min=MIN_STD)
     narrow = stds < _NARROW_STD
     narrowness = 1 / (stds * math.sqrt(2))
-    wide = torch.where(narrow, 0, weights)
+    wide_weights = torch.where(narrow, 0, weights)
     squared = torch.zeros_like(weights[0])
-    total = wide.sum(0)
+    total = wide_weights.sum(0)
     for node, weight in _legendre(_CRPS_NODES):
         z = (node - means) * narrowness
-        weighted = torch.erf_(z).mul_(wide)
+        weighted = torch.erf_(z).mul_(wide_weights)
         cdf = 0.5 * (total + weighted.sum(0))
         squared += weight * cdf**2
     squared = squared.double()

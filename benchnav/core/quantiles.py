@@ -56,9 +56,14 @@ class QuantileDistribution(TraversabilityDistribution):
         spans = bool(levels) and levels[0] == 0 and levels[-1] == 1
         is_ascending = bool(steps) and min(steps) > 0
         expect(
-            len(levels) >= _MIN_LEVELS and spans and is_ascending,
-            f"at least {_MIN_LEVELS} `levels` that ascend from 0 to 1, got "
-            f"{len(levels)} levels. Use `benchnav.core.quantiles.LEVELS`.",
+            len(levels) >= _MIN_LEVELS,
+            f"at least {_MIN_LEVELS} `levels`, got {len(levels)}. Use "
+            "`benchnav.core.quantiles.LEVELS`.",
+        )
+        expect(
+            spans and is_ascending,
+            f"`levels` that ascend from 0 to 1, got {levels}. Use "
+            "`benchnav.core.quantiles.LEVELS`.",
         )
         # Steps that start in the tail. Rounding must not add the step from level 0.1.
         n_tail_steps = bisect_left(levels, _TAIL - 1e-9)

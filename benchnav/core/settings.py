@@ -226,8 +226,8 @@ def _check_size(value: Any, what: str) -> None:
     """Reject integers of more than 64 bits, which arrays and generators cannot store."""
     if type(value) is int and abs(value) >= 2**64:
         raise ConfigError(
-            f"Expected {what} as a whole number of at most 64 bits, got one of "
-            f"{value.bit_length()} bits."
+            f"Expected {what} as a whole number of at most 64 bits, got a "
+            f"number of {value.bit_length()} bits."
         )
 
 

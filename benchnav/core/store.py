@@ -58,27 +58,27 @@ def check_output(name: str, option: str = "out") -> None:
             that is not a folder, or is an address, such as s3://bucket/name. If
             `option` is not `out`, also if `name` is a folder.
     """
-    expect(name, f"`{option}` as a path, got ''.")
+    expect(name, f"`{option}` to be a path, got ''.")
     expect(
         name.isprintable(),
-        f"`{option}` as a path of printable characters, got {name!r}.",
+        f"`{option}` to be a path of printable characters, got {name!r}.",
     )
     expect(
         not re.match(r"[A-Za-z][A-Za-z0-9+.-]*:/", name),
-        f"`{option}` as a path on this machine, got the address {name!r}. Write to a "
-        "local folder, and copy it.",
+        f"`{option}` to be a path on this machine, got the address {name!r}. Write to "
+        "a local folder, and copy it.",
     )
     path = Path(os.path.expanduser(name))
     existing = filter(os.path.lexists, path.absolute().parents)
     nearest = next(existing, path)
     expect(
         nearest.is_dir(),
-        f"`{option}` as a path in a folder, got {name!r}, but {nearest} is not a "
+        f"`{option}` to be a path in a folder, got {name!r}, but {nearest} is not a "
         f"folder. Choose another `{option}`.",
     )
     expect(
         option == "out" or not path.is_dir(),
-        f"`{option}` as a file, got the folder {name!r}. Name a file in it.",
+        f"`{option}` to be a file, got the folder {name!r}. Name a file in it.",
     )
 
 

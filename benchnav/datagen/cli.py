@@ -238,8 +238,8 @@ def ground(file: str, out: str = "", overwrite: bool = False) -> None:
     may_write = overwrite or not path.exists()
     expect(
         may_write,
-        f"`out` as a new file, got {path}, which exists. Pass --overwrite to replace "
-        "it.",
+        f"`out` to be a new file, got {path}, which exists. Pass --overwrite to "
+        "replace it.",
     )
     statistics = fit_ground(dataset)
     write_text(path, statistics.to_json())
@@ -295,10 +295,10 @@ def export(
     has_origin = bool(license and creator) or is_ours(dataset, chosen)
     expect(
         has_origin,
-        f"both `license` and `creator` for {dataset.id}, whose maps do not come from a "
-        f"shipped recipe, got {license!r} and {creator!r}. Pass your licence and name. "
-        "For imported maps, pass the licence and creator of the elevation model, "
-        "classes and photo.",
+        f"both `license` and `creator` for {dataset.id}, got {license!r} and "
+        f"{creator!r}. The maps do not come from a shipped recipe. Pass your licence "
+        "and name. For imported maps, pass the licence and creator of the elevation "
+        "model, classes and photo.",
     )
     license = license or "MIT"
     creator = creator or AUTHORS

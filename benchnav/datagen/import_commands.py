@@ -140,8 +140,8 @@ def import_drives(
 
     expect(
         photo or classes,
-        "`photo` or `classes` with `drives`, got neither, so that models have no input "
-        "that shows where λ is low. Pass --photo RASTER.",
+        "`photo` or `classes` with `drives`, got neither. Without both, models have no "
+        "input that shows where λ is low. Pass --photo RASTER.",
     )
     rasters = Rasters(
         photo=photo,

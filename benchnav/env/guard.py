@@ -95,7 +95,7 @@ def read_options(options: Any, names: Collection[str], maps: int) -> dict[str, A
         is_index = is_integer and not isinstance(index, bool) and 0 <= index < maps
         expect(
             is_index,
-            f"option `map` as an integer from 0 to {maps - 1}, got {index!r}.",
+            f"option `map` to be an integer from 0 to {maps - 1}, got {index!r}.",
         )
         checked["map"] = int(index)
     return checked

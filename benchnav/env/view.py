@@ -67,7 +67,7 @@ class View:
         is_count = is_integer and not isinstance(self.cells, bool)
         expect(
             is_count and self.cells >= 2,
-            f"`crop_cells` as an integer ≥ 2, got {self.cells!r}.",
+            f"`crop_cells` to be an integer ≥ 2, got {self.cells!r}.",
         )
         expect(0 <= self.behind < 1, f"`crop_behind` in [0, 1), got {self.behind}.")
 

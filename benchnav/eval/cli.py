@@ -224,7 +224,7 @@ def compare(
 
     if out and (out.endswith(os.sep) or Path(out).name in ("", "..")):
         raise ConfigError(
-            "Expected `out` as a file path without a suffix, got the folder "
+            "Expected `out` to be a file path without a suffix, got the folder "
             f"{out}. Append a file name."
         )
     runs = [Path(folder) for folder in folders]

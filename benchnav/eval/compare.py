@@ -44,7 +44,7 @@ from benchnav.eval.stats.pairs import (
     matches,
 )
 from benchnav.eval.stats.summary import time_budgets
-from benchnav.eval.words import reading_name
+from benchnav.eval.words import display_name
 
 _CAPTION = "Differences between conditions on the same maps with the same draws of λ."
 _MAX_LISTED = 8  # maximum number of lines of a note
@@ -110,7 +110,8 @@ def compare_runs(
         raise ConfigError(
             f"Expected conditions that differ only in their {by}, got conditions that "
             f"were run with different code: {'; '.join(code_lines)}. Run them with the "
-            "same code, or pass --allow-different code, which adds a note to the table."
+            "same code, or pass `--allow-different code`, which adds a note to the "
+            "table."
         )
     if quantity is None:
         table = compare(pairs, difference)
@@ -338,7 +339,7 @@ def _common(table: pd.DataFrame) -> list[str]:
             continue
         label = table[name].iloc[0]
         if label != NOT_USED:
-            words.append(f"{name} {reading_name(name, label)}")
+            words.append(f"{name} {display_name(name, label)}")
     counts = table[["n_maps", "n_groups", "n_episodes"]].drop_duplicates()
     if len(counts) == 1:
         maps, groups, episodes = counts.iloc[0]
@@ -354,8 +355,8 @@ def _left_out(pairs: Sequence[Pair], by: str) -> list[str]:
     """Return lines on episodes that only one condition of a pair has."""
     lines: dict[str, None] = {}
     for pair in pairs:
-        first = reading_name(by, pair.one)
-        second = reading_name(by, pair.other)
+        first = display_name(by, pair.one)
+        second = display_name(by, pair.other)
         sides = (first, second), (second, first)
         for condition, (name, partner) in zip(pair.members, sides, strict=True):
             merged = condition.episodes[DRAW].merge(
@@ -437,7 +438,7 @@ def _unpaired(
 
 
 def _as_read(labels: Mapping[str, str]) -> dict[str, str]:
-    return {name: reading_name(name, label) for name, label in labels.items()}
+    return {name: display_name(name, label) for name, label in labels.items()}
 
 
 def _first_of(lines: list[str], noun: str) -> list[str]:

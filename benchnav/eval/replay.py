@@ -52,7 +52,7 @@ def replay(
     from benchnav.eval.find_episodes import find_episodes
 
     if video and Path(video).suffix != VIDEO:
-        raise ConfigError(f"Expected `video` as a {VIDEO} file, got {video!r}.")
+        raise ConfigError(f"Expected `video` to be a {VIDEO} file, got {video!r}.")
     if video and web:
         raise ConfigError("Expected `video` or `web`, got both. Leave one out.")
     run = Path(folder)
@@ -122,7 +122,7 @@ def other_folder(run: str, out: str) -> Path:
     is_run = (out_folder / "run.json").exists()
     if is_run and out_folder.resolve() != Path(run).resolve():
         raise ConfigError(
-            f"Expected `out` as a folder without another run, got {out}. Choose "
+            f"Expected `out` to be a folder without another run, got {out}. Choose "
             "another folder."
         )
     return out_folder
@@ -138,7 +138,7 @@ def _recordings(
 
 def _viewer_file(folder: Path, episodes: "list[tuple[Unit, int]]", out: Path) -> Path:
     """Return the path of the episodes' viewer file; create the file if necessary."""
-    from benchnav.eval.folder.checksums import is_as_noted, note_checksums
+    from benchnav.eval.folder.checksums import matches_checksum, note_checksums
     from benchnav.eval.report.playback.viewer_file import write_rerun
 
     unit, index = episodes[0]
@@ -154,7 +154,7 @@ def _viewer_file(folder: Path, episodes: "list[tuple[Unit, int]]", out: Path) ->
             f"{unit.maps[index]:05d}",
         )
         path = path.with_name(f"together-{'-'.join(map(str, words))}.rrd")
-    if len(episodes) > 1 or not path.exists() or not is_as_noted(out, path):
+    if len(episodes) > 1 or not path.exists() or not matches_checksum(out, path):
         write_rerun(_recordings(folder, episodes, out), path)
         note_checksums(out, [path])
     return path

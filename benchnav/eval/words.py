@@ -29,7 +29,7 @@ def differ(labels: Iterable[str]) -> bool:
     return len(set(labels) - {NOT_USED}) > 1
 
 
-def reading_name(column: str, label: str) -> str:
+def display_name(column: str, label: str) -> str:
     """Return a label as papers write it, for tables and figures.
 
     Args:
@@ -40,7 +40,7 @@ def reading_name(column: str, label: str) -> str:
     return to_name(label) if to_name else label
 
 
-def reading_names(labels: str) -> str:
+def display_names(labels: str) -> str:
     """Rewrite the comma-separated labels of a hypothesis as papers write them."""
     return ", ".join(planner_name(risk_name(label)) for label in labels.split(", "))
 
@@ -119,7 +119,7 @@ def contender_names(labels: Sequence[Mapping[str, str]]) -> list[str]:
     differing = _differing(labels)
     names = []
     for row in labels:
-        shown = {name: reading_name(name, label) for name, label in row.items()}
+        shown = {name: display_name(name, label) for name, label in row.items()}
         name = joined(shown.get(column, NOT_USED) for column in differing)
         names.append(name or shown["planner"])
     return names
@@ -161,7 +161,7 @@ def maps_in_words(maps: int | str, groups: int | str) -> str:
 
 
 def rate_in_words(row: Mapping[Any, Any]) -> str:
-    """Return a success rate in per cent, with digits for 1 failure in 200 episodes."""
+    """Return a success rate in per cent that shows even 1 failure in 200 episodes."""
     return short(100 * row["success_rate"])
 
 

@@ -58,7 +58,7 @@ class TraversabilityModel(Specified, ABC):
 
 
 class ModelFamily(TraversabilityModel):
-    """Base class of models that checkpoints store, with the registered name of the class."""
+    """Base class of models that checkpoints store under the class's registered name."""
 
     @classmethod
     @abstractmethod

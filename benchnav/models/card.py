@@ -1,4 +1,4 @@
-"""README.md of a checkpoint, its card for hubs and readers: model, training data, use."""
+"""Card of a checkpoint (README.md), for hubs and readers: model, data and use."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any

@@ -43,8 +43,9 @@ def find_checkpoint(source: str | Path) -> Path:
     if str(source) == _ONLY_IN_REPOSITORY:
         raise ConfigError(
             f"Expected the checkpoint {source} in checkpoints/, got no such folder. "
-            f"The wheel leaves it out for its size. Copy checkpoints/{source} from the "
-            "repository to checkpoints/, or use another model, such as stakes-v1."
+            "The wheel does not contain this checkpoint, because it is too large. Copy "
+            f"checkpoints/{source} from the repository to checkpoints/, or use another "
+            "model, such as stakes-v1."
         )
     names = [folder.name for folder in list_checkpoints()]
     options = sorted({*registry.names("model"), *names})

@@ -26,8 +26,9 @@ class TrainOptions:
         workers: Number of processes that read maps ahead. It does not affect the result.
         in_memory: Store all maps in memory instead of reading them on demand.
         half_precision: Store the weights of networks as float16.
-        symmetries: Rotate and mirror training maps at random. If not given, all maps except
-            those with a photo, in which light has a fixed direction.
+        symmetries: Rotate and mirror training maps at random. If not given, this
+            applies to all maps except those with a photo, whose light has a fixed
+            direction.
         crop: Side in cells of the square cut from each training map, at a new random
             position each epoch; 0 for whole maps.
         resume: Resume an interrupted training from its finished parts and epochs.
@@ -107,7 +108,7 @@ class TrainingConfig:
         max_epochs: length of the schedule in epochs.
         patience: number of epochs without a lower validation loss after which training
             stops.
-        masking: settings of the masks of maps, which the input seen contains.
+        masking: settings of the masks of maps; the input seen contains the masks.
     """
 
     inputs: tuple[str, ...] = ("rgb", "slope_deg")

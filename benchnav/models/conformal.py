@@ -79,8 +79,8 @@ class ConformalTable:
         if len(levels) != len(values) or not ascends:
             raise CheckpointError(
                 "Expected the table `conformal` of the checkpoint to have one value in "
-                "[0, 1] per level, without a descent, got other values. Train the "
-                "model again."
+                "[0, 1] per level, and values that never decrease, got other values. "
+                "Train the model again."
             )
         return table
 

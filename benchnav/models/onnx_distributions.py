@@ -1,7 +1,7 @@
 """Mean and CVaR of predicted distributions, computed by operators of ONNX.
 
-F is the distribution function of λ, v the VaR, which 40 bisections of [0, 1] find, and
-p = 1 − α the probability of the tail:
+F is the distribution function of λ. v is the VaR, found by 40 bisections of [0, 1].
+p = 1 − α is the probability of the tail:
 
     E[λ] = 1 − ∫₀¹ F,    CVaR_α = v − 1/p ∫₀^v F   (see `benchnav.core.cvar`).
 
@@ -70,7 +70,8 @@ def parameters_of(
 ) -> dict[str, Tensor]:
     """Return the parameters of a distribution by name.
 
-    If several members do not form one mixture, the names are such as `member_1_weights`.
+    If several members do not form one mixture, the names have the form
+    `member_1_weights`.
 
     Args:
         distribution: prediction of a model, shape [B, H, W].
@@ -151,7 +152,7 @@ def _quantile(distribution: TraversabilityDistribution, level: Tensor) -> Tensor
 
 
 def _any_parameter(distribution: TraversabilityDistribution) -> Tensor:
-    """Return a tensor of the distribution's shape, dtype and device: a parameter."""
+    """Return a parameter; it has the distribution's shape, dtype and device."""
     return next(iter(parameters_of(distribution).values()))[:, 0]
 
 

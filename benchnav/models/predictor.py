@@ -63,9 +63,10 @@ class Oracle(PrivilegedModel):
 class Ideal(PrivilegedModel):
     """Predicts the best distribution given colours: the mixture over look-alike classes.
 
-    A model's difference from Ideal is the model's error. The difference between Ideal and
-    Oracle cannot be observed in images. Look-alike classes have equal weights, so the
-    single-class option selects the first of them in the class table.
+    The difference between a model and Ideal is the model's error. The difference
+    between Ideal and Oracle is due to what images do not show. Look-alike classes have
+    equal weights, so the single-class option selects the first of them in the class
+    table.
     """
 
     def predict_terrain(self, terrain: Terrain) -> TraversabilityMixture:
@@ -302,9 +303,9 @@ def find_family(name: str) -> Found:
     family = registry.find("model", name) if name in options else None
     if family is None or not is_family(family.target):
         raise CheckpointError(
-            f"Expected a checkpoint of a model among {', '.join(options)}, got one of "
-            f"{name!r}. Install the package that registers {name!r}, or give its class: "
-            f"path/to/file.py:{name}@CHECKPOINT."
+            f"Expected a checkpoint of a model among {', '.join(options)}, got a "
+            f"checkpoint of {name!r}. Install the package that registers {name!r}, or "
+            f"give the class of the model: path/to/file.py:{name}@CHECKPOINT."
         )
     return family
 

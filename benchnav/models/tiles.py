@@ -187,7 +187,7 @@ def measure_margin(model: TraversabilityModel, observation: Observation) -> int:
 
 
 def _cut_side(size: int, tile: int) -> list[slice]:
-    """Cut a side of a map at multiples of the stride into as few, equal parts as possible."""
+    """Cut a side of a map at multiples of the stride into few parts of similar size."""
     blocks = -(-size // _STRIDE)
     parts = -(-blocks // (tile // _STRIDE))
     edges = [blocks * part // parts * _STRIDE for part in range(parts)]

@@ -44,7 +44,7 @@ class Mean(RiskMeasure):
     """Mean E[λ], which is neutral to risk."""
 
     def __call__(self, distribution: TraversabilityDistribution) -> Tensor:
-        """Infer λ̂; see `RiskMeasure`."""
+        """Return λ̂; see `RiskMeasure`."""
         return distribution.mean()
 
 
@@ -59,7 +59,7 @@ class VaR(RiskMeasure):
     level: float = 0.9
 
     def __call__(self, distribution: TraversabilityDistribution) -> Tensor:
-        """Infer λ̂; see `RiskMeasure`."""
+        """Return λ̂; see `RiskMeasure`."""
         return distribution.var(self.level)
 
 
@@ -74,7 +74,7 @@ class CVaR(RiskMeasure):
     level: float = 0.9
 
     def __call__(self, distribution: TraversabilityDistribution) -> Tensor:
-        """Infer λ̂; see `RiskMeasure`."""
+        """Return λ̂; see `RiskMeasure`."""
         return distribution.cvar(self.level)
 
 
@@ -94,7 +94,7 @@ class ExpectedTime(RiskMeasure):
     floor: float = 0.05
 
     def __call__(self, distribution: TraversabilityDistribution) -> Tensor:
-        """Infer λ̂; see `RiskMeasure`."""
+        """Return λ̂; see `RiskMeasure`."""
         time = distribution.expected_time(self.floor)
         return (1 / time).clamp(self.floor, 1)
 
@@ -115,7 +115,7 @@ class TimeCVaR(RiskMeasure):
     floor: float = 0.05
 
     def __call__(self, distribution: TraversabilityDistribution) -> Tensor:
-        """Infer λ̂; see `RiskMeasure`."""
+        """Return λ̂; see `RiskMeasure`."""
         time = distribution.time_cvar(self.level, self.floor)
         return (1 / time).clamp(self.floor, 1)
 
@@ -131,7 +131,7 @@ class Chance(RiskMeasure):
     bound: float = 0.1
 
     def __call__(self, distribution: TraversabilityDistribution) -> Tensor:
-        """Infer λ̂; see `RiskMeasure`."""
+        """Return λ̂; see `RiskMeasure`."""
         expect(0 <= self.bound <= 1, f"`bound` in [0, 1], got {self.bound}.")
         return distribution.chance(self.bound)
 
@@ -147,7 +147,7 @@ class SingleClass(RiskMeasure):
     level: float = 0.9
 
     def __call__(self, distribution: TraversabilityDistribution) -> Tensor:
-        """Infer λ̂; see `RiskMeasure`."""
+        """Return λ̂; see `RiskMeasure`."""
         return distribution.most_likely().cvar(self.level)
 
 

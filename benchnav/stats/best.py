@@ -142,8 +142,8 @@ def _removal_order(
 def _canonical(wins: np.ndarray, episodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return wins and episodes by map, with maps in sorted order.
 
-    Both are divided by their greatest common divisor, so that repeated episodes count
-    once.
+    Both are divided by their greatest common divisor, so that repeating the same
+    episodes changes nothing.
     """
     table = np.column_stack([wins, episodes]).astype(np.int64)
     divisor = max(np.gcd.reduce(table, axis=None), 1)

@@ -1,13 +1,14 @@
 """Randomisation tests of paired differences, by sign flips or exchanges on each map.
 
 Under H₀ the two contestants are exchangeable on each map. An assignment exchanges them
-on some of the maps. With up to 13 maps, all assignments are counted; with more maps,
-9 999 random assignments with a fixed seed. Maps are first sorted by their values, so
-that p depends neither on the order of maps nor on the order of the contestants. Maps
-without a difference do not count.
-Sources: Fisher (1935), "The Design of Experiments", 21; Phipson and Smyth (2010),
-"Permutation p-values should never be zero", for counting the observed assignment.
-Letters in shapes: M maps; P parts of a difference; R assignments.
+on some of the maps. With up to 13 maps, all assignments are enumerated; with more,
+9 999 are drawn at random with a fixed seed. Maps are first sorted by their differences,
+so that p depends neither on the order of maps nor on the order of the contestants. Maps
+without a difference do not affect p.
+Sources: Fisher (1935), "The Design of Experiments", section 21; Phipson and Smyth
+(2010), "Permutation p-values should never be zero", for counting the observed
+assignment.
+Letters in shapes: M maps; P numbers per contestant and map; R assignments.
 """
 
 from collections.abc import Callable
@@ -28,9 +29,9 @@ _ROUNDING = 1e-9
 
 @lru_cache(maxsize=2)
 def _signs(maps: int) -> np.ndarray:
-    """Return signs ±1 of all assignments; of random assignments if maps are many.
+    """Return signs ±1 of assignments, float64, shape [R, M].
 
-    The shape is [R, M].
+    These are all assignments, or random ones if there are more than 13 maps.
     """
     if maps <= _MAX_EXACT_MAPS:
         assignments = np.arange(2**maps)[:, None]
@@ -47,16 +48,17 @@ def exchange_p(
     difference: Callable[..., np.ndarray],
     direction: str = "",
 ) -> float:
-    """Return the p-value of H₀: a function of sums over maps does not differ.
+    """Return the p-value of H₀: a function of the sums is equal for both contestants.
 
     p is the fraction of assignments whose difference is at least the observed value.
 
     Args:
-        first: parts of the first contestant by map, shape [M, P].
-        second: parts of the second contestant by map, shape [M, P].
+        first: values of the first contestant on each map, whose sums over maps
+            `difference` takes, shape [M, P].
+        second: such values of the second contestant, shape [M, P].
         difference: function of the sums of the first and of the second contestant, each
-            of shape [..., P], that returns their difference, shape [...]. It changes
-            only its sign if the contestants are exchanged.
+            of shape [..., P], that returns the difference of the contestants, shape
+            [...]. Exchanging them must change only the sign of the result.
         direction: `higher` or `lower`, the alternative for the first contestant in a
             one-sided test; two-sided if empty.
     """
@@ -122,7 +124,8 @@ def sign_flip_p(gains: np.ndarray, direction: str = "") -> float:
         direction: `higher` or `lower` for a one-sided test; two-sided if empty.
     """
     divisor = max(np.gcd.reduce(gains), 1)
-    gains = gains // divisor  # repeated episodes count once
+    # p does not depend on a common factor, such as that of repeated episodes.
+    gains = gains // divisor
     nonzero_gains = np.abs(gains[gains != 0])
     sizes, counts = np.unique(nonzero_gains, return_counts=True)
     probabilities = np.ones(1)
@@ -148,7 +151,7 @@ def signed_rank_p(differences: np.ndarray) -> float:
     """Return the two-sided p-value of Wilcoxon's signed-rank test; 1 if no map differs.
 
     If at most 13 maps differ, the test is exact even with ties: all signs of the ranks
-    are counted. SciPy returns the same p, but is slower, because it calls a function
+    are enumerated. SciPy returns the same p, but is slower, because it calls a function
     for each assignment of signs.
 
     Args:

@@ -104,8 +104,9 @@ def summarise(scores: Sequence[Score], sums: Mapping[str, Sums]) -> pd.DataFrame
 
     Returns:
         One row per contestant: `units`, the number of maps M; and for each score whose
-        parts the contestant has, `NAME` with its 95 % interval `NAME_low`, `NAME_high`.
-        The interval is NaN if there are fewer than `bootstrap.LEAST_MAPS` maps.
+        parts the contestant has, `NAME`, with the limits `NAME_low` and `NAME_high` of
+        its 95 % interval. The interval is NaN if there are fewer than
+        `bootstrap.LEAST_MAPS` maps.
     """
     rows = {}
     for contestant, contestant_sums in sums.items():
@@ -139,10 +140,10 @@ def compare_pairs(
 
     Returns:
         One row per pair and score: `measure`, the score's name; `one` and `other`, the
-        contestants; `difference` of the compared quantity, `one` minus `other`, with
-        its 95 % interval `low`, `high`; `p`; and `p_holm`, which is NaN unless both
-        contestants compete. Pairs without the score, or with different values of
-        `same`, are omitted.
+        contestants; `difference` of the compared quantity (`one` minus `other`), with
+        the limits `low` and `high` of its 95 % interval; `p`; and `p_holm`, which is
+        NaN unless both contestants compete. Pairs without the score, or with different
+        values of `same`, are omitted.
     """
     records = []
     for first, second in combinations(sums, 2):

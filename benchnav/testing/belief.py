@@ -212,8 +212,8 @@ class _BeliefCheck:
             first: a state.
             second: another state.
             tolerance: tolerance between probabilities.
-            members: episodes of the second state that the first state contains,
-                indices; if None, all episodes in their order.
+            members: indices of the episodes of the second state that the first state
+                contains; if None, all episodes in order.
         """
         a = _cdf(self.belief.distribution(first))
         b = _cdf(self.belief.distribution(second))

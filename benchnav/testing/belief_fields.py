@@ -87,6 +87,6 @@ def check_fields(
         is_close = deviation <= _MAX_ERRORS * error + 0.03
         expect(
             bool(is_close.all()),
-            "Expected λ of each cell over the fields to have the belief's distribution, "
-            "got other frequencies.",
+            "Expected the λ of each cell, taken over all fields, to follow the "
+            "belief's distribution, got other frequencies.",
         )

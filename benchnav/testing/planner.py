@@ -84,7 +84,7 @@ def check_planner(
     are_names = isinstance(steers, tuple) and all(map(_are_single_lines, steers))
     breaches.expect(
         steers is None or are_names,
-        "Expected `steers` as a tuple of tuples of action names, or None, got "
+        "Expected `steers` to be a tuple of tuples of action names, or None, got "
         f"{steers!r}.",
     )
     is_bool = isinstance(new_planner.blind, bool)
@@ -363,8 +363,8 @@ class _PlannerCheck:
         is_valid = (status >= min(PlanStatus)) & (status <= max(PlanStatus))
         expect(
             bool(is_valid.all()),
-            "Expected `Plan.status` as values of `PlanStatus`, "
-            f"0–{int(max(PlanStatus))}, got other numbers.",
+            "Expected `Plan.status` to contain only values of `PlanStatus` "
+            f"(0–{int(max(PlanStatus))}), got other numbers.",
         )
         self.check_layers(plan)
 

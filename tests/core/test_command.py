@@ -232,12 +232,12 @@ def test_each_program_prints_its_help_when_bare(program: str) -> None:
         (["work"], "Expected PLACE, got none. See `x work --help`."),
         (
             ["go", "--config", "nope.yaml"],
-            "or one of demo, paper, got 'nope.yaml', which does not exist.",
+            "or one of demo, paper, got 'nope.yaml'.",
         ),
         (["go", "--config", "papr"], "Did you mean 'paper'?"),
         (
             ["work", "a", "--config", "demo"],
-            "Expected --config as a YAML file, got 'demo'",
+            "Expected --config to be an existing YAML file, got 'demo'",
         ),
     ],
 )

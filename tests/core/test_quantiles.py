@@ -165,7 +165,7 @@ SPACED = tuple(np.linspace(0, 1, 80).tolist())
 @pytest.mark.parametrize(
     ("levels", "expected"),
     [
-        (LEVELS[:60], "at least 64 `levels` that ascend from 0 to 1, got 60"),
+        (LEVELS[:60], "at least 64 `levels`, got 60"),
         (LEVELS[1:], "ascend from 0 to 1"),
         (LEVELS[:-1], "ascend from 0 to 1"),
         ((*LEVELS[:-2], 1.0, 0.999), "ascend from 0 to 1"),

@@ -239,7 +239,8 @@ def test_real_ground_is_imported(datagen: Call, capsys) -> None:  # type: ignore
     assert datagen("validate", "site.h5") == 0
     assert datagen("import-dem", "nope.tif", "--out", "x.h5") == 2
     assert (
-        "`dem` as a raster that GDAL can read, got nope.tif" in capsys.readouterr().err
+        "`dem` to be a raster that GDAL can read, got nope.tif"
+        in capsys.readouterr().err
     )
 
 
@@ -315,7 +316,7 @@ def test_an_import_passes_every_setting_on(datagen: Call, capsys) -> None:  # ty
     ("words", "said"),
     [
         (("--splits", "train:0.7"), "sum to 1"),
-        (("--stride", "0.3"), "`stride` as a multiple"),
+        (("--stride", "0.3"), "`stride` to be a multiple"),
         (("nonsense",), "Expected an override such as"),
         (("--photo", "photo.tif"), "--random-classes"),
         (("--class-ids", "{1: gravel}"), "Expected `classes` with `class_ids`"),

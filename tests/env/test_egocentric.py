@@ -508,7 +508,7 @@ def test_the_world_may_resample_λ_where_nothing_is_learnt_of_it(
         ({"unseen": "black"}, "unseen"),
         ({"replan_every_s": 0.0}, "replan_every_s"),
         ({"crop_cells": 1}, "crop_cells"),
-        ({"crop_cells": 10.5}, "`crop_cells` as an integer"),
+        ({"crop_cells": 10.5}, "`crop_cells` to be an integer"),
         ({"crop_behind": 1.0}, "crop_behind"),
         ({"render_mode": "ansi"}, "render_mode"),
         ({"belief": "copula", "world": "paper"}, "world='stakes'"),

@@ -235,7 +235,7 @@ def test_a_step_after_the_end_raises_until_a_reset(
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
-        ({"map": 1.5}, "`map` as an integer from 0 to 7, got 1.5"),
+        ({"map": 1.5}, "`map` to be an integer from 0 to 7, got 1.5"),
         ({"map": 1.0}, "got 1.0"),
         ({"map": "3"}, "got '3'"),
         ({"map": True}, "got True"),

@@ -267,13 +267,13 @@ def test_run_says_what_it_recorded_and_how_it_is_replayed(
     [
         (
             ("replay", "RUN", "--video", "a.avi"),
-            "Expected `video` as a .mp4 file, got 'a.avi'",
+            "Expected `video` to be a .mp4 file, got 'a.avi'",
         ),
         (
             ("replay", "RUN", "--video", "a.mp4", "--web"),
             "Expected `video` or `web`, got both.",
         ),
-        (("replay", "RUN", "--video", "mp4"), "Expected `video` as a .mp4 file"),
+        (("replay", "RUN", "--video", "mp4"), "Expected `video` to be a .mp4 file"),
         (("replay", "RUN", "--planner", "mpi"), "planner straight, Faulty; "),
         (
             ("run", "--record", "some"),

@@ -504,7 +504,7 @@ def test_a_family_is_no_model_and_a_checkpoint_of_an_unknown_one_says_so(
         load_model("mdn")
     foreign = replace(load_checkpoint(checkpoint_path), model="theirs")
     with pytest.raises(
-        CheckpointError, match=r"got one of 'theirs'. Install the package"
+        CheckpointError, match=r"got a checkpoint of 'theirs'. Install the package"
     ):
         open_checkpoint(foreign)
 

@@ -229,7 +229,7 @@ BAD: dict[str, tuple[Any, str]] = {
     "elsewhere": (action_of(lambda action, _: action.to("meta")), "on cpu, got torch.float32 of shape [4, 2] on meta"),
     "too fast": (action_of(lambda action, _: action + 0.5), "within the robot's bounds"),
     "no plan": (plan_of(lambda plan: None), "Expected `plan` to return a Plan as its third value"),
-    "an unknown status": (plan_of(lambda plan: replace(plan, status=plan.status + 3)), "values of `PlanStatus`, 0–2"),
+    "an unknown status": (plan_of(lambda plan: replace(plan, status=plan.status + 3)), "values of `PlanStatus` (0–2)"),
     "a status for all": (plan_of(lambda plan: replace(plan, status=plan.status[:1])), "got torch.int64 of shape [1]"),
     "a path for all": (plan_of(lambda plan: replace(plan, path=plan.path[:1])), "shape [4, N, 2], got [1, 3, 2]"),
     "raises": (acting(lambda step, _: step.state[9]), "Expected a result from `plan`, got IndexError"),
@@ -268,7 +268,7 @@ BAD: dict[str, tuple[Any, str]] = {
     ),
     "follows no text": (having(follows=lambda self, task: 3), "Expected `follows` to return a single line"),
     "follows that is text": (having(follows="time"), "from `follows`, got TypeError"),
-    "steers by one name": (having(steers=("speed_mps", "turn_rate_radps")), "as a tuple of tuples of action names"),
+    "steers by one name": (having(steers=("speed_mps", "turn_rate_radps")), "to be a tuple of tuples of action names"),
     "steers nothing": (having(steers=()), "steer at least one of the tried robots, got a planner that steers none"),
     "remarks that are no tuple": (having(remarks=lambda self, task: "slow"), "to return a tuple of single lines"),
     "remarks that raise": (having(remarks=lambda self, task: task.wheels), "from `remarks`, got AttributeError"),
@@ -335,7 +335,7 @@ def test_every_breach_is_named_once_with_the_robots_and_maps_it_was_found_on() -
     message = str(caught.value)
     assert (
         message.count("within the robot's bounds")
-        == message.count("values of `PlanStatus`, 0–2")
+        == message.count("values of `PlanStatus` (0–2)")
         == 1
     )
     assert message.count("[in all cases]\n(2) ") == 1

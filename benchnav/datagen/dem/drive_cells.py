@@ -167,8 +167,8 @@ def check_drive_count(log: DriveLog, splits: Sequence[str]) -> None:
         raise DatasetError(
             f"Expected a drive for each of the {len(splits)} splits "
             f"{', '.join(splits)}, got {n_drives} in "
-            f"{log.settings.file}. Name drives in a column `drive`, or use fewer "
-            "--splits."
+            f"{log.settings.file}. Add a column `drive` with the name of each row's "
+            "drive, or use fewer --splits."
         )
 
 

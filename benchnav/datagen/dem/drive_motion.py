@@ -148,7 +148,7 @@ def compare_motion(log: DriveLog) -> DriveLog:
 
 
 def compare_slopes(log: DriveLog, elevation_m: ndarray) -> DriveLog:
-    """Reject measured speed of wheels; correct speed from positions for the slope.
+    """Reject measured wheel speed; correct speed from positions for the slope.
 
     Measured speed is the speed of wheels if its ratio to the command does not depend on
     the slope, or if it equals the command while positions move less far.

@@ -101,7 +101,7 @@ def _unit_of(
 
 
 def _check_command(log: DriveLog, rows: pd.DataFrame, spans: pd.DataFrame) -> None:
-    """Reject a log whose ratio of positions to the command is implausible as λ."""
+    """Reject a log whose positions and commands together imply an implausible λ."""
     least_speed = log.settings.least_speed
     is_geographic = log.is_geographic
     result = unit_of_command(rows, spans, least_speed, is_geographic=is_geographic)
@@ -123,8 +123,9 @@ def check_sign(log: DriveLog, is_driven: ndarray) -> None:
         is_driven: mask of the rows to check, bool, shape [N].
 
     Raises:
-        DatasetError: If the signs differ in most rows of a direction of the command,
-            and these are more than 5 % of all checked rows.
+        DatasetError: If the signs differ in most rows with a forward command, or in
+            most with a backward command, and these are more than 5 % of all checked
+            rows.
     """
     commanded = log.rows["commanded"].to_numpy()[is_driven]
     measured = log.rows["speed"].to_numpy()[is_driven]
@@ -137,7 +138,7 @@ def check_sign(log: DriveLog, is_driven: ndarray) -> None:
             raise DatasetError(
                 "Expected `measured_m_s` to have the sign of `commanded_m_s` in "
                 f"{log.settings.file}, got the opposite sign in "
-                f"{against} of {len(ratios)} rows commanded {direction}. Log "
+                f"{against} of the {len(ratios)} rows with a {direction} command. Log "
                 "the forward speed over ground, negative when the robot moves "
                 "backward, or pass --speed positions, or --speed measured to use the "
                 "rows unchanged."

@@ -223,8 +223,8 @@ def _arc_over_fit(
     turn_rates = velocity_of(track.assign(angle=angle), ["angle"])
     rate = turn_rates["angle"].abs()
     a = (rate * reach_s).clip(upper=np.pi / 2)  # the formula holds up to a half circle
-    wide = a.clip(lower=0.01)
-    exact = wide**3 / (3 * (np.sin(wide) - wide * np.cos(wide)))
+    clipped_a = a.clip(lower=0.01)
+    exact = clipped_a**3 / (3 * (np.sin(clipped_a) - clipped_a * np.cos(clipped_a)))
     series = 1 + a**2 / 10
-    factor = exact.where(a == wide, series)
+    factor = exact.where(a == clipped_a, series)
     return factor[heading.index].reindex(track.index).fillna(1)

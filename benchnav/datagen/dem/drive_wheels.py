@@ -17,8 +17,8 @@ from benchnav.datagen.dem.drive_units import median_ratio
 # this value. Terrain causes a larger spread.
 _MAX_SPREAD = 0.02
 _MIN_SPANS = 10  # minimum number of spans for a decision (20 s)
-# Fraction by which positions may move less far than measured speed, if this equals the
-# command.
+# Maximum fraction by which positions may move less far than measured speed implies, if
+# measured speed equals the command.
 _MAX_SHORTFALL = 0.05
 # If the difference between the 5 % and 95 % quantiles of slope along a track reaches
 # this value, λ must vary.
@@ -58,9 +58,9 @@ def _ratio_quantiles(spans: pd.DataFrame) -> list[float]:
 def check_wheels(log: DriveLog, track: pd.DataFrame) -> None:
     """Reject a log whose measured speed is wheel speed, everywhere or in stretches.
 
-    Spans of two durations are compared, and the one with longer distances by positions
-    counts: short spans follow alternating curves better, and noise can only increase
-    these distances.
+    Spans of two durations are compared, and the duration with longer distances by
+    positions decides: short spans follow alternating curves better, and noise can only
+    increase these distances.
 
     Args:
         log: log of the drives.

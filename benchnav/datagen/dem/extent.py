@@ -117,12 +117,12 @@ class Extent:
         size_m = end_m - start_m
         cells = _cells_within(size_m, step)
         if np.less(cells, grid.shape).any():
-            wide, high = grid.extent_m
+            width_m, height_m = grid.extent_m
             raise DatasetError(
-                f"Expected `dem` to cover at least one map of {wide:g} m × {high:g} m, "
-                f"got {self.raster.name} of "
-                f"{self.size_m[1]:g} m × {self.size_m[0]:g} m. Use a larger raster "
-                "or a recipe with smaller maps."
+                f"Expected `dem` to cover at least one map of {width_m:g} m × "
+                f"{height_m:g} m, got {self.raster.name} of {self.size_m[1]:g} m × "
+                f"{self.size_m[0]:g} m. Use a larger raster or a recipe with smaller "
+                "maps."
             )
         tiling = cut(cells, grid.shape, stride, self.shares)
         # Margins keep the maps off the raster's edges, where interpolation lacks
@@ -163,7 +163,7 @@ class Extent:
         largest_m = self._largest_origin(start_m, end_m, grid, stride)
         if largest_m is None:
             return
-        wide, high = grid.extent_m
+        width_m, height_m = grid.extent_m
         maps = f"maps of {len(self.shares)} splits"
         if len(self.shares) == 1:
             maps = "a map"
@@ -171,8 +171,8 @@ class Extent:
         if self.positions_m is None:
             end = "of `dem`"
         raise ConfigError(
-            f"Expected `origin` from which {maps} of {wide:g} m × {high:g} m fit up to "
-            f"the north-east corner {end}, got {list(self.origin_m or ())}. "
+            f"Expected `origin` from which {maps} of {width_m:g} m × {height_m:g} m "
+            f"fit up to the north-east corner {end}, got {list(self.origin_m or ())}. "
             "The largest that fits: "
             f"--origin '{_origin_text(self.corner_m + largest_m)}'"
         )
@@ -231,15 +231,15 @@ class Extent:
             bytes_per_map += np.dtype(field.dtype).itemsize * n_values
         n_bytes = tiling.maps * bytes_per_map
         gigabytes = f"{n_bytes / 1e9:,.2f}" if n_bytes >= 1e7 else "under 0.01"
-        high, wide = (f"{value:.4g}" for value in self.cell_m)
+        cell_height, cell_width = (f"{value:.4g}" for value in self.cell_m)
         maps = f"{tiling.maps:,} map{'s' * (tiling.maps > 1)}"
         stride_m = tiling.stride[1] * grid.resolution_m
         corner = _origin_text(self.corner_m + layout.offset_m)
         origin_hint = "set by `origin`" if self.origin_m else "set it by `origin`"
         return (
-            f"{self.raster.name}: {file.height} × {file.width} cells of {wide} m × "
-            f"{high} m on the terrain, elevations "
-            f"in {self.unit}, {_RESAMPLED[layout.resampling]}. {maps} of {grid.height} × "
+            f"{self.raster.name}: {file.height} × {file.width} cells of {cell_width} m "
+            f"× {cell_height} m on the terrain, elevations in {self.unit}, "
+            f"{_RESAMPLED[layout.resampling]}. {maps} of {grid.height} × "
             f"{grid.width} cells of {grid.resolution_m:g} m, one every {stride_m:g} m "
             f"from the south-west corner {corner} ({origin_hint}), in "
             f"{_name_of(self.crs)}; {gigabytes} GB before compression."

@@ -92,12 +92,12 @@ class Raster(NamedTuple):
             if worst <= _MAX_STRETCH:
                 with self.warped(crs) as warped:
                     return crs, warped.bounds, (warped.res[1], warped.res[0])
-        wide = bounds.right - bounds.left
-        high = bounds.top - bounds.bottom
+        width = bounds.right - bounds.left
+        height = bounds.top - bounds.bottom
         raise DatasetError(
             f"Expected `{self.argument}` of terrain small enough for a projection "
             f"whose scale is within {_MAX_STRETCH:.0%} of 1, got "
-            f"{self.name} of {wide:g} × {high:g} units of "
+            f"{self.name} of {width:g} × {height:g} units of "
             f"{raster_crs.to_string()[:80]}. Cut out a part: rio clip {self.name} "
             "part.tif --bounds 'WEST SOUTH EAST NORTH'"
         )
@@ -256,6 +256,6 @@ def _named_errors(argument: str, name: str) -> Iterator[None]:
     except load_rasterio().errors.RasterioError as error:
         reason = " ".join(str(error.__cause__ or error).split())
         raise DatasetError(
-            f"Expected `{argument}` as a raster that GDAL can read, got {name}: "
+            f"Expected `{argument}` to be a raster that GDAL can read, got {name}: "
             f"{reason}"
         ) from error

@@ -1,7 +1,8 @@
-"""Check that a recipe's maps fit an elevation model, and settings that make them fit.
+"""Check whether a recipe's maps fit an elevation model, or suggest settings that do.
 
-Maps must not be too many, and their cells must not be much smaller than those of the
-elevation model. If they are, the error contains a resolution, size or stride that fits.
+There must not be too many maps, and their cells must not be much smaller than those of
+the elevation model. Otherwise, the error contains a resolution, size or stride that
+fits.
 """
 
 from collections.abc import Iterator, Mapping
@@ -36,7 +37,8 @@ class GroundError(ConfigError):
 
     Args:
         problem: Problem as text, with the option that allows such maps.
-        changes: Changed recipe settings by key that solve the problem; may be empty.
+        changes: Recipe settings that solve the problem, as new values by key; may be
+            empty.
         stride_m: Changed distance from one map to the next in metres; None if it need
             not change.
     """
@@ -88,8 +90,9 @@ def check_fit(
     if is_coarse:
         problem = (
             f"Expected cells of `dem` less than {MAX_RATIO:g} times as wide as the "
-            f"maps' cells of {step:g} m, got {cell_m:.4g} m in {name}. Terrain would "
-            f"be smooth in {n_maps:,} maps. Pass --coarse to allow such cells."
+            f"maps' cells of {step:g} m, got {cell_m:.4g} m in {name}. The "
+            f"terrain of all {n_maps:,} maps would be too smooth. Pass --coarse to "
+            "allow such cells."
         )
     elif n_maps > max_maps:
         problem = (
@@ -113,9 +116,10 @@ def _corrections(
     scalings: Iterator[Scaling],
     max_maps: int,
 ) -> Iterator[tuple[dict[str, Any], float | None]]:
-    """Yield settings and a stride in metres with which maps fit, by scaling in order.
+    """Yield recipe settings and a stride in metres with which maps fit.
 
-    The stride is None if maps are adjacent, which is the default.
+    There is one pair for each scaling with which maps fit, in the given order. The
+    stride is None if maps are adjacent, which is the default.
 
     Args:
         extent: Terrain.
@@ -144,7 +148,10 @@ def _corrections(
 def _thinned(
     extent: Extent, grid: Grid, stride: Shape, max_maps: int
 ) -> tuple[Layout, int]:
-    """Return a layout of up to `max_maps` maps, and the factor of its longer stride."""
+    """Return a layout of up to `max_maps` maps, and the factor of its stride.
+
+    The factor is relative to the given stride; it is 1 if the stride is unchanged.
+    """
     factor = 1
     layout = extent.lay(grid, stride)
     while layout.tiling.maps > max_maps:
@@ -155,7 +162,10 @@ def _thinned(
 
 
 def _has_maps(extent: Extent, layout: Layout, step: float) -> bool:
-    """Return whether each split has a map with all elevations and an allowed relief."""
+    """Return whether each split has a map that an import would keep.
+
+    Such a map has no missing elevations, and at most the maximum relief.
+    """
     frame = extent.frame(layout, step)
     layer = extent.raster.resampled(frame, [1], layout.resampling)
     without_map = set(extent.shares)

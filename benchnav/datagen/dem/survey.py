@@ -293,8 +293,8 @@ def _stride(cut: Cut, recipe: Recipe) -> Shape:
     n_cells = cut.stride_m / recipe.resolution_m
     expect(
         n_cells > 0.5 and abs(n_cells - round(n_cells)) < 1e-6,
-        f"`stride` as a multiple of {recipe.resolution_m:g} m, which is the resolution "
-        f"of the maps, got {cut.stride_m:g} m.",
+        f"`stride` to be a multiple of {recipe.resolution_m:g} m (the resolution of "
+        f"the maps), got {cut.stride_m:g} m.",
     )
     return round(n_cells), round(n_cells)
 
@@ -373,9 +373,9 @@ def _check_covers(
         raise DatasetError(
             f"Expected `{raster.argument}` to cover all of the terrain (WEST SOUTH "
             f"EAST NORTH {expected} in {crs.to_string()[:80]}), got {raster.name}, "
-            f"which covers {covered}. Use a raster that covers the terrain, with a "
-            "declared value for missing cells, or cut a part out of `dem`: rio clip "
-            "DEM part.tif --bounds 'WEST SOUTH EAST NORTH'"
+            f"which covers {covered}. Use a raster that covers the terrain and "
+            "declares a value for missing cells. Or reduce `dem` to the part that the "
+            "raster covers: rio clip DEM part.tif --bounds 'WEST SOUTH EAST NORTH'"
         )
 
 

@@ -108,7 +108,7 @@ class Publication:
         is_listed = listed == self.license and is_simple
         expect(
             self.is_url or is_listed,
-            "`license` as an identifier from the SPDX list, such as CC-BY-4.0, or a "
+            "`license` to be an identifier from the SPDX list, such as CC-BY-4.0, or a "
             f"URL, got {self.license!r}.{advice}",
         )
         is_url_valid = not self.url or _URL.fullmatch(self.url)

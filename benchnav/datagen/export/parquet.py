@@ -26,9 +26,9 @@ _CELLS_PER_ROW_GROUP = 2**20
 
 
 def split_names(splits: Iterable[str]) -> dict[str, str]:
-    """Return file names of splits by split, such as `test_std` for `test/std`.
+    """Return the name of each split in file names, such as `test_std` for `test/std`.
 
-    They consist of letters, digits and `_`.
+    The names consist of letters, digits and `_`.
 
     Raises:
         DatasetError: If two splits have the same file name.

@@ -133,11 +133,11 @@ def tables(described: schema.Json) -> Iterator[Table | str]:
     extra = [name for name in fields if name not in (*schema.FIELDS, *layers)]
     if extra:
         yield f"optional fields: {', '.join(extra)}"
-    wide = widest(described["splits"])
+    name_width = widest(described["splits"])
     for key, title in _DIGESTS.items():
         yield title
         for name, entry in described["splits"].items():
-            yield f"  {name:{wide}} {entry[key]}"
+            yield f"  {name:{name_width}} {entry[key]}"
     columns = {layer["name"]: layer["classes"] for layer in described["drawn_layers"]}
     headings = ["id", "class", "colour", "a", "b", "o", "σ", "soft spots", *columns]
     rows = []
@@ -200,7 +200,7 @@ def written(path: Path) -> TerrainDataset:
     n_files = len(dataset.files)
     files = f" in {n_files} files" if n_files > 1 else ""
     print(f"wrote {path} ({size}{files})")
-    wide = widest(dataset.splits)
+    name_width = widest(dataset.splits)
     for name, split in dataset.splits.items():
-        print(f"  {name:{wide}} {split['maps']:6} maps  {split['digest']}")
+        print(f"  {name:{name_width}} {split['maps']:6} maps  {split['digest']}")
     return dataset

@@ -212,7 +212,8 @@ def read_layers(entries: Any) -> tuple[LayerSpec, ...]:
     for name in names:
         expect(
             names.count(name) == 1,
-            f"different names of `layers`, got {name!r} more than once. Leave one out.",
+            f"each of the `layers` to have its own name, got {name!r} more than once. "
+            "Leave one out.",
         )
     return specs
 

@@ -53,7 +53,7 @@ class Growth:
     @property
     def appearance(self) -> str:
         """Text of the properties that an image shows: colour and cover."""
-        return f"{list(self.colour)} on {self.cover:.6g}"
+        return f"colour {list(self.colour)} with cover {self.cover:.6g}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,7 +96,7 @@ class Vegetation(Layer):
         shown = []
         for name in names:
             growth = self.classes.get(name)
-            shown.append(growth.appearance if growth else "none")
+            shown.append(growth.appearance if growth else "no vegetation")
         for class_id, alike in enumerate(look_alike_classes(classes)):
             first = alike[0]
             if shown[first] != shown[class_id]:
@@ -176,9 +176,10 @@ class Vegetation(Layer):
 
         An overgrown cell looks like the overgrown cells of all classes on its map that
         have vegetation of the same colour. The weight of a class is its cover. If the
-        terrain of these classes has the same colour too, an image contains no more
-        information. Otherwise, bare terrain next to a patch indicates the class in the
-        patch, and a model that uses neighbouring cells can predict better.
+        terrain of these classes has the same colour too, an image contains no further
+        information about the class. Otherwise, bare terrain next to a patch indicates
+        the class in the patch, and a model that uses neighbouring cells can predict
+        better.
         """
         weights = weights.copy()
         overgrown = values > 0
@@ -214,7 +215,10 @@ class Vegetation(Layer):
         return f"{growth.cover:.0%} #{bytes(growth.colour).hex()} {low:g}–{high:g} m"
 
     def class_columns(self, name: str) -> dict[str, float | str]:
-        """Return cover, heights and colour on a class by column; 0 or "" if bare."""
+        """Return the properties of a class's vegetation, keyed by column name.
+
+        Without vegetation, they are 0, and "" for the colour.
+        """
         cover = low = high = 0.0
         colour = ""
         growth = self.classes.get(name)
@@ -237,7 +241,7 @@ class Vegetation(Layer):
 
 
 def read_keys(data: Mapping[str, Any]) -> tuple[Vegetation | None, dict[str, Any]]:
-    """Return the vegetation of a recipe, and the recipe without its keys.
+    """Return the vegetation of a recipe, and the recipe without the vegetation's keys.
 
     Args:
         data: recipe as plain data.
@@ -263,16 +267,16 @@ def read_keys(data: Mapping[str, Any]) -> tuple[Vegetation | None, dict[str, Any
         is_distinct = len(set(names)) == len(names)
         expect(
             is_distinct or not growths,
-            "different names of `classes` if a class has `vegetation`, got two classes "
-            "with the same name. Rename one.",
+            "each of the `classes` to have its own name if a class has `vegetation`, "
+            "got two classes with the same name. Rename one.",
         )
     if growths:
         options = {"period_m": period_m, "classes": growths}
         return read(Vegetation, options, _key_of), recipe
     expect(
         not period_m,
-        f"`vegetation_period_m` only if a class has `vegetation`, got {period_m} "
-        "without one. Leave `vegetation_period_m` out.",
+        f"`vegetation_period_m` only if a class has `vegetation`, got {period_m}, "
+        "although no class has `vegetation`. Leave `vegetation_period_m` out.",
     )
     return None, recipe
 
@@ -298,7 +302,7 @@ def _without_vegetation(row: Any) -> Any:
 
 
 def _key_of(key: str) -> str:
-    """Return the key of a recipe for an option of the layer, for messages."""
+    """Return the recipe key that sets an option of the layer, as messages name it."""
     head, _, tail = key.partition(".")
     name, _, inner = tail.partition(".")
     if head == "classes" and name:

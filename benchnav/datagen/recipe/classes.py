@@ -13,7 +13,7 @@ from benchnav.core.errors import check_label, expect
 
 @dataclass(frozen=True, kw_only=True)
 class SoftSpots:
-    """Second mode of λ of a class that no image shows, such as buried loose sand.
+    """Second mode of a class's λ, which no image shows, such as buried loose sand.
 
     Args:
         weight: fraction of the class's cells, in (0, 1).

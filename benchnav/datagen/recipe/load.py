@@ -69,8 +69,8 @@ def load_recipe(source: str | Path, overrides: Sequence[str] = ()) -> Recipe:
     if recipe.id in shipped and not is_shipped:
         expect(
             recipe == shipped_recipe(recipe.id),
-            f"an `id` in {source} that no shipped recipe has, got {recipe.id!r}. "
-            "Choose another `id`.",
+            f"an `id` in {source} that differs from the ids of shipped recipes, got "
+            f"{recipe.id!r}. Choose another `id`.",
         )
     return recipe
 

@@ -54,9 +54,9 @@ def check_tints(classes: ClassTable, scenarios: Mapping[str, Scenario]) -> None:
             problem = "the same colour" if is_alike else "different colours"
             remedy = "Lower a `share`" if is_alike else "Tint both"
             raise ConfigError(
-                f"Expected `tints` of scenario {name!r} to preserve the look-alikes of "
-                f"the class table, got {names[a]!r} and {names[b]!r} in {problem}. "
-                f"{remedy}."
+                f"Expected `tints` of scenario {name!r} to give classes the same "
+                "colour exactly if the class table does, got "
+                f"{names[a]!r} and {names[b]!r} in {problem}. {remedy}."
             )
 
 

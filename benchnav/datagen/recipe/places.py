@@ -34,8 +34,8 @@ class PlacesRule:
         in_range = 0 < self.least_distance_m < np.inf and 0 <= self.margin_m < np.inf
         expect(
             in_range,
-            "finite `least_distance_m` > 0 and `margin_m` ≥ 0 of `places`, got "
-            f"{self.least_distance_m} and {self.margin_m}.",
+            "`places` with finite `least_distance_m` > 0 and finite `margin_m` ≥ 0, "
+            f"got {self.least_distance_m} and {self.margin_m}.",
         )
 
 

@@ -404,8 +404,8 @@ def _check_look_alikes(recipe: Recipe) -> None:
     for unit in never_shown(recipe.units, shown):
         members = ", ".join(names[member] for member in unit)
         raise ConfigError(
-            f"Expected each class to be in a selection of {shown} classes that "
-            "includes all classes of a colour or none of them, got no such selection "
+            f"Expected each class to occur on a map of {shown} classes on which the "
+            "classes of one colour occur all together or not at all, got no such map "
             f"for {members}. A map has {shown} classes, as many as `occupancy` has "
             "fractions. Change `occupancy` or a `colour`."
         )

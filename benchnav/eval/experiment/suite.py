@@ -207,8 +207,8 @@ def _as_plain(kind: str, spec: Any) -> PartSpec:
         return _described(kind, spec)
     if "part" not in spec or isinstance(spec["part"], str):
         return spec
-    rest = {name: value for name, value in spec.items() if name != "part"}
-    return {**_described(kind, spec["part"]), **rest}
+    other_keys = {name: value for name, value in spec.items() if name != "part"}
+    return {**_described(kind, spec["part"]), **other_keys}
 
 
 def _described(kind: str, instance: Any) -> dict[str, Any]:

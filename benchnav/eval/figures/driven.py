@@ -59,16 +59,18 @@ class DrivenPaths(Figure):
         indices = driven.chosen(_MAX_PATHS)
         rows = driven.rows.iloc[indices]
         tracks = [driven.tracks[index] for index in indices]
-        high, wide = ground.grid.shape
-        is_wide = wide >= 2 * high
+        height, width = ground.grid.shape
+        is_wide = width >= 2 * height
         # The legend is to the right of the map, or below a wide map.
-        width = ONE_COLUMN_IN
+        map_width_in = ONE_COLUMN_IN
         legend_in = 0.0
         if is_wide:
-            width = TWO_COLUMNS_IN
+            map_width_in = TWO_COLUMNS_IN
             legend_in = 0.15 * (len(rows) + 4)
-        tall = min(width * high / wide, 7.0) + legend_in + 0.4
-        figure = Drawing(figsize=(TWO_COLUMNS_IN, tall), layout="compressed")
+        map_height_in = min(map_width_in * height / width, 7.0)
+        figure_height_in = map_height_in + legend_in + 0.4
+        figsize = (TWO_COLUMNS_IN, figure_height_in)
+        figure = Drawing(figsize=figsize, layout="compressed")
         panel = figure.subplots()
         maps.show_map(panel, _backdrop(ground), ground.grid.extent_m)
         labels = rows[[name for name in NAMING if name in rows]]
@@ -97,7 +99,7 @@ class DrivenPaths(Figure):
             handles.append(drives.mark_handle(name, label=words))
         corner = (1.02, 1.01)
         if is_wide:
-            corner = (0, -0.18 * wide / high)
+            corner = (0, -0.18 * width / height)
         panel.legend(
             handles=handles,
             loc="upper left",

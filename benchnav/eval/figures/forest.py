@@ -16,8 +16,8 @@ from benchnav.eval.experiment.metrics import further_quantities, quantities
 from benchnav.eval.figures.data import RunData
 from benchnav.eval.words import (
     NOT_YET,
+    display_names,
     p_in_words,
-    reading_names,
 )
 from benchnav.stats.bootstrap import LEAST_MAPS
 from benchnav.viz.figure import Figure
@@ -122,7 +122,7 @@ def _draw_tests(panel: Axes, rows: pd.DataFrame, quantity: Quantity) -> None:
         panel.plot(row["difference"], height, "o", color=BLUE, zorder=3, **look)
         p = p_in_words(row["p_holm"])
         panel.text(1.01, height, p, transform=side, va="center", size=TEXT)
-        first, second = map(reading_names, row["names"])
+        first, second = map(display_names, row["names"])
         names.append(f"{row['number']}. {first}\n− {second}")
     panel.set_yticks(range(len(rows)), names)
     panel.tick_params(axis="y", length=0)

@@ -66,8 +66,9 @@ def draw_knowledge(recording: Recording) -> Drawing:
     last = len(recording.traversability)
     steps = sorted({round(step) for step in np.linspace(0, last, _N_TIMES)})
     ratio = min(max(recording.grid.height / recording.grid.width, 0.3), 2.0)
-    tall = (TWO_COLUMNS_IN - 0.9) / _N_TIMES * ratio
-    figure = Drawing(figsize=(TWO_COLUMNS_IN, 2 * tall + 1.1), layout="compressed")
+    panel_height_in = (TWO_COLUMNS_IN - 0.9) / _N_TIMES * ratio
+    figsize = (TWO_COLUMNS_IN, 2 * panel_height_in + 1.1)
+    figure = Drawing(figsize=figsize, layout="compressed")
     panels = figure.subplots(2, len(steps), squeeze=False, sharex=True, sharey=True)
     for row, (name, look) in zip(panels, _SHOWN.items(), strict=True):
         label, colours, maximum = look

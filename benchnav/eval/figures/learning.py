@@ -13,7 +13,7 @@ from benchnav.eval.figures.data import RunData
 from benchnav.eval.figures.lines import MAX_ACROSS, divide_lines
 from benchnav.eval.folder.steps import AHEAD_COLUMNS, AHEAD_DEG, AHEAD_M, step_files
 from benchnav.eval.stats.best import BLOCK
-from benchnav.eval.words import NAMING, joined, reading_name
+from benchnav.eval.words import NAMING, display_name, joined
 from benchnav.stats.bootstrap import LEAST_MAPS, bootstrap_counts
 from benchnav.viz.figure import Figure
 from benchnav.viz.panels import Curves, line_looks
@@ -90,7 +90,7 @@ def _line_names(rows: pd.DataFrame, titled: Sequence[str]) -> list[str]:
     named = [name for name in differing if name not in titled]
     names = []
     for row in rows.to_dict("records"):
-        name = joined(reading_name(column, row[column]) for column in named)
+        name = joined(display_name(column, row[column]) for column in named)
         names.append(name or "mean over maps")
     return names
 

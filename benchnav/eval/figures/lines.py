@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import pandas as pd
 
 from benchnav.eval.experiment.condition import NOT_USED
-from benchnav.eval.words import joined, reading_name
+from benchnav.eval.words import display_name, joined
 
 MAX_ACROSS = 4  # panels side by side
 _MAX_LINES = 7  # maximum number of lines in a panel
@@ -46,6 +46,6 @@ def divide_lines(
     titled = [name for name in columns if groups[name].nunique() > 1]
     panels = []
     for row in groups.to_dict("records"):
-        title = joined(reading_name(name, row[name]) for name in titled)
+        title = joined(display_name(name, row[name]) for name in titled)
         panels.append((title, row["line"]))
     return titled, panels

@@ -125,8 +125,8 @@ def find_sweeps(conditions: Mapping[str, Mapping[str, Any]]) -> dict[str, list[L
                 continue
             ordered = group[number].astype(float).sort_values(kind="stable")
             ids = tuple(ordered.index)
-            rest = fixed.loc[ids[0]].dropna().to_dict()
-            line = Line(values=tuple(ordered), conditions=ids, rest=rest)
+            other_settings = fixed.loc[ids[0]].dropna().to_dict()
+            line = Line(values=tuple(ordered), conditions=ids, rest=other_settings)
             sweeps.setdefault(number, []).append(line)
     return sweeps
 
@@ -293,14 +293,15 @@ class Over(Figure):
             shown: indices of the lines in the panel.
         """
         swept = [condition for line in self.lines for condition in line.conditions]
-        others = rows.drop(swept)
-        settings = [_setting_name(row) for row in others.to_dict("records")]
+        other_rows = rows.drop(swept)
+        settings = [_setting_name(row) for row in other_rows.to_dict("records")]
         order = list(dict.fromkeys(settings))
         references = []
         for index in shown:
             first_row = rows.loc[self.lines[index].conditions[0]]
             line_colour = looks[names[index]]["color"]
-            for name, (condition, row) in zip(settings, others.iterrows(), strict=True):
+            named_rows = zip(settings, other_rows.iterrows(), strict=True)
+            for name, (condition, row) in named_rows:
                 is_blind = row["model"] == NOT_USED
                 shared = list(_SAME) if is_blind else [*_SAME, "model", "planner"]
                 if (row[shared] != first_row[shared]).any():

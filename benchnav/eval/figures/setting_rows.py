@@ -53,14 +53,14 @@ def lay_out(
     if columns > 1:
         across = columns
         shared = "col"
-    tall = _ROW_IN * (lowest + 1.4) + 0.5
+    panel_height_in = _ROW_IN * (lowest + 1.4) + 0.5
     titles = [title for title, _ in block_panels]
     ends_in = 0.2 + legend_in
     # In one column, long names would leave little space for a single panel.
     is_wide = settings["name"].str.len().max() > _MAX_LETTERS
     width_in = TWO_COLUMNS_IN if is_wide else 0.0
     figure, grid = panel_grid(
-        titles, across, tall, ends_in, width_in, sharex=shared, sharey=True
+        titles, across, panel_height_in, ends_in, width_in, sharex=shared, sharey=True
     )
     panels = []
     for index, (_, rows) in enumerate(block_panels):

@@ -51,7 +51,7 @@ class Success(Figure):
 def _handles(summary: pd.DataFrame) -> list[Artist]:
     """Return the entries of the legend for the drawn points and lines."""
     # A planner is blind if it uses no model. The model `clairvoyant` has no risk
-    # setting, so that the risk label cannot decide.
+    # setting either, so the risk label does not show which planners are blind.
     is_blind = summary["model"] == NOT_USED
     unmarked = pd.Series(False, summary.index)
     marks = summary.get("best_marked", unmarked)

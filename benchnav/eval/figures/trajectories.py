@@ -82,8 +82,8 @@ def draw_trajectories(recordings: Sequence[Recording]) -> Drawing:
     panel_in = (width - 0.9) / across - 0.1
     grids = [recording.grid for recording in recordings]
     max_ratio = max(grid.height / grid.width for grid in grids)
-    tall = panel_in * min(max(max_ratio, 0.3), 2.0) + 0.35
-    size = (width, (layers * tall + 0.2) * lines + 0.8)
+    panel_height_in = panel_in * min(max(max_ratio, 0.3), 2.0) + 0.35
+    size = (width, (layers * panel_height_in + 0.2) * lines + 0.8)
     figure = Drawing(figsize=size, layout="compressed")
     stacks = stack_panels(figure, len(recordings), across, layers)
     headings = _headings(recordings)

@@ -55,7 +55,7 @@ def note_checksums(folder: Path, files: Iterable[Path]) -> None:
         write_text(folder / SUMS, "".join(lines))
 
 
-def is_as_noted(folder: Path, file: Path) -> bool:
+def matches_checksum(folder: Path, file: Path) -> bool:
     """Return whether a file agrees with its recorded SHA-256; True without a record."""
     if not file.is_relative_to(folder):
         return True

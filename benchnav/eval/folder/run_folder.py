@@ -183,7 +183,7 @@ def damaged(path: Path, remedy: str) -> Iterator[None]:
 
     Args:
         path: path of the file, for the message.
-        remedy: sentence that tells the user how to replace the file.
+        remedy: sentence on how to replace the file.
     """
     try:
         yield
@@ -225,8 +225,8 @@ class Finished:
     def has(self, unit: Unit) -> bool:
         """Return whether the steps and recordings that `unit` requests were stored.
 
-        The folder may instead contain the steps of another file of the unit, which do
-        not count.
+        The folder may instead contain the steps of another file of the unit. These are
+        not considered.
         """
         record = self.metadata["record"]
         if RECORDS.index(record) < RECORDS.index(unit.record):

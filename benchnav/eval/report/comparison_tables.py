@@ -9,7 +9,7 @@ import pandas as pd
 from benchnav.core.quantity import Quantity
 from benchnav.core.tables import Table
 from benchnav.eval.experiment.condition import LABELS, NOT_USED
-from benchnav.eval.words import count_range, differ, reading_name
+from benchnav.eval.words import count_range, differ, display_name
 from benchnav.stats.bootstrap import LEAST_MAPS
 from benchnav.stats.holm import ALPHA
 from benchnav.stats.tables import (
@@ -172,9 +172,9 @@ def _pair_table(
     labels = []
     for name in names:
         if differ(table[name]):
-            label = partial(reading_name, name)
+            label = partial(display_name, name)
             labels.append(Column(name, cell_of(name, label)))
-    label = partial(reading_name, by)
+    label = partial(display_name, by)
     labels.append(Column(by, cell_of("one", label)))
     labels.append(Column("against", cell_of("other", label)))
     shown_counts = []

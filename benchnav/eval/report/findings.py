@@ -61,12 +61,13 @@ def _pairing_by_label(rows: pd.DataFrame, summary: pd.DataFrame) -> dict[str, bo
     is_paired_by = {}
     for name in ("robot", "objective", "world"):
         fixed = [label for label in BLOCK if label != name]
-        others = same_maps[
+        other_rows = same_maps[
             (same_maps[fixed] == first[fixed]).all(axis=1)
             & (same_maps[name] != first[name])
         ]
-        if not others.empty:
-            other_settings = others[setting_columns].itertuples(index=False, name=None)
+        if not other_rows.empty:
+            other_labels = other_rows[setting_columns]
+            other_settings = other_labels.itertuples(index=False, name=None)
             has_common_setting = not settings.isdisjoint(other_settings)
             # Settings of different worlds are not paired, since λ may differ.
             is_paired_by[name] = name != "world" and has_common_setting
@@ -119,9 +120,9 @@ def _sentences(
 
 
 def _rank(
-    best: Mapping[Any, Any], others: pd.DataFrame, pairing: Mapping[str, bool]
+    best: Mapping[Any, Any], other_rows: pd.DataFrame, pairing: Mapping[str, bool]
 ) -> Iterable[str]:
-    if others.empty:
+    if other_rows.empty:
         with_this = f" with this {' and '.join(pairing)}" if pairing else ""
         yield f"There is no other setting{with_this} to compare it with."
         for name, is_paired in pairing.items():
@@ -131,10 +132,10 @@ def _rank(
                     "run."
                 )
         return
-    alike = others[others["best_alike"]]
-    worse = others[~others["best_alike"]]
+    alike = other_rows[other_rows["best_alike"]]
+    worse = other_rows[~other_rows["best_alike"]]
     unit = "group" if best["n_groups"] < best["n_maps"] else "map"
-    test = f"max-T bootstrap test by {unit} over {len(others) + 1} settings"
+    test = f"max-T bootstrap test by {unit} over {len(other_rows) + 1} settings"
     if best["best_maps"] < FEWEST_MAPS:
         yield (
             f"No setting is marked: with fewer than {FEWEST_MAPS} {unit}s, no setting "
@@ -142,8 +143,8 @@ def _rank(
         )
         return
     if worse.empty:
-        shown = others["best_shown"].max()
-        p = others["best_p"].min()
+        shown = other_rows["best_shown"].max()
+        p = other_rows["best_p"].min()
         maps = f"{int(best['best_maps'])} {unit}s"
         power = ""
         if shown <= 1:

@@ -12,7 +12,7 @@ from benchnav.core.tables import Bold, Table
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.experiment.hypotheses import Hypothesis
 from benchnav.eval.experiment.metrics import further_quantities, quantities
-from benchnav.eval.words import NOT_YET, count_range, p_in_words, reading_names
+from benchnav.eval.words import NOT_YET, count_range, display_names, p_in_words
 from benchnav.metrics.shipped import QUANTITIES, TOTAL_TIME
 from benchnav.stats.bootstrap import LEAST_MAPS
 from benchnav.stats.holm import ALPHA
@@ -120,7 +120,7 @@ def _claim(row: Mapping[Any, Any], quantities_by_name: Mapping[str, Quantity]) -
     """
     names = [field.name for field in fields(Hypothesis)]
     test = Hypothesis(**{name: row[name] for name in names})
-    first, second = (_in_brackets(reading_names(name)) for name in row["names"])
+    first, second = (_in_brackets(display_names(name)) for name in row["names"])
     return test.claim(first, second, quantities_by_name[test.metric])
 
 

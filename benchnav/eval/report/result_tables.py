@@ -18,12 +18,12 @@ from benchnav.eval.words import (
     blocks,
     count_range,
     differ,
+    display_name,
     failures_in_words,
     maps_in_words,
     mean_and_std,
     naming_labels,
     rate_in_words,
-    reading_name,
     success_interval_in_words,
     unit_of_statistics,
 )
@@ -213,7 +213,7 @@ def _label_columns(summary: pd.DataFrame, always: Collection[str]) -> list[Colum
 
 def _label(name: str, row: Row) -> str:
     mark = row.get("mark", "") if name == "planner" else ""
-    return reading_name(name, str(row[name])) + mark
+    return display_name(name, str(row[name])) + mark
 
 
 def _further_column(quantity: Quantity) -> Column:
@@ -360,7 +360,7 @@ def _across(
     is_as_above = names.eq(names.shift()).cummin(axis=1)
     starts_planner = ~is_as_above["planner"]
     for name in labels:
-        names[name] = [reading_name(name, label) for label in names[name]]
+        names[name] = [display_name(name, label) for label in names[name]]
     shown_names = names.mask(is_as_above, "")
     label_headings = [name.capitalize() for name in labels]
     return Table(

@@ -136,7 +136,7 @@ def _fix_hypotheses(
     left_out: Mapping[str, LeftOut],
     all_quantities: Mapping[str, Quantity],
 ) -> dict[str, Any]:
-    """Return `fix_hypotheses` of the conditions that can be run.
+    """Fix the hypotheses of a suite, on the conditions that can be run.
 
     Raises:
         ConfigError: If a hypothesis is invalid, or compares a condition that can be run

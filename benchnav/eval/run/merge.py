@@ -200,7 +200,7 @@ def _unlike(first: Run, second: Run) -> list[str]:
 
 
 def _find(unit: Unit, runs: Sequence[Run]) -> Finished | None:
-    """Return a finished unit from some shards; reject it if their rows differ."""
+    """Find a finished unit in shards; reject shards that have different rows for it."""
     columns = {metric.quantity.column for metric in metrics_of_run(runs[0].manifest)}
     newest = []
     for run in runs:

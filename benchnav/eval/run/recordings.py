@@ -207,8 +207,8 @@ def _check_unchanged(run: Run, unit: Unit, code_digest: str) -> None:
     for part, digest in origin.code["parts"].items():
         if parts.get(part) != digest:
             raise BenchnavError(
-                f"Expected {part} with which {run.folder} was run, got a changed one. "
-                "Restore it, or run the suite again."
+                f"Expected {part} to be unchanged since {run.folder} was run, got a "
+                "changed one. Restore it, or run the suite again."
             )
 
 

@@ -406,7 +406,7 @@ def _lower_bounds_s(unit: Unit, inputs: UnitInputs) -> list[float] | None:
 
 
 class _FailedPlanner(Planner[None]):
-    """Substitute for a planner that could not be created; it raises that error."""
+    """Substitute for a planner that could not be created; it raises the error."""
 
     def __init__(self, error: BaseException) -> None:
         self.error = error

@@ -102,9 +102,9 @@ def against_best(
           number of common episodes; `best_maps`, the number of maps of these episodes,
           or of groups of maps.
         - `best_difference`, the success rate of the best minus that of the condition,
-          with its uncorrected 95 % interval `best_low`, `best_high`; `best_p`, the
-          p-value from `best_set_p`; `best_shown`, the minimum detectable difference
-          with 80 % power.
+          with the limits `best_low` and `best_high` of its uncorrected 95 % interval;
+          `best_p`, the p-value from `best_set_p`; `best_shown`, the minimum detectable
+          difference with 80 % power.
         - `best_alike`, true if the condition competes and is not significantly worse
           than the best; `best_marked`, true if also some condition of the block is
           significantly worse.
@@ -132,7 +132,7 @@ def against_best(
 def _compare(
     rivals: Mapping[str, pd.DataFrame],
 ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-    """Return the columns of `against_best` for a block, and by condition.
+    """Return the columns of `against_best` for a whole block, and for each condition.
 
     Args:
         rivals: rows of episodes by id of each competing condition.

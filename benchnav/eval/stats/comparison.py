@@ -38,8 +38,9 @@ def compare(pairs: Sequence[Pair], difference: float = 0.05) -> pd.DataFrame:
         - common labels; `one` and `other`, the labels of the pair; `n_maps`;
           `n_groups`, the number of statistical units, which is `n_maps` unless maps are
           grouped; `n_episodes`, the number of episodes of each condition.
-        - `success_one`, `success_other`, the success rates; `success_difference` with
-          its 95 % interval `success_low`, `success_high`; `success_p`, and
+        - `success_one` and `success_other`, the success rates; `success_difference`,
+          with the limits `success_low` and `success_high` of its 95 % interval;
+          `success_p`, and
           `success_p_holm` after Holm's correction; `success_detectable`, the minimum
           detectable difference with 80 % power, and `maps_needed`, the number of maps
           for `difference`, both at the level of the first step of Holm's correction.
@@ -70,9 +71,9 @@ def compare_by(pairs: Sequence[Pair], quantity: Quantity) -> pd.DataFrame:
     Returns:
         One row per pair: common labels, `one`, `other`, `n_maps`, `n_groups` and
         `n_episodes`, as in `compare`; `metric`; `unit` of the following columns;
-        `mean_one`, `mean_other`; `difference` with its 95 % interval `low`, `high`; `p`
-        of a sign-flip test, and `p_holm` after Holm's correction. The difference and
-        its interval are NaN without episodes.
+        `mean_one`, `mean_other`; `difference`, with the limits `low` and `high` of its
+        95 % interval; `p` of a sign-flip test, and `p_holm` after Holm's correction.
+        The difference and its interval are NaN without episodes.
     """
     rows = []
     for pair in pairs:
@@ -131,7 +132,7 @@ def _compare(
 
 
 def named(name: str, interval: Interval, unit: str = "") -> dict[str, float]:
-    """Return a difference and the limits of its interval, by column.
+    """Return a difference and the limits of its interval, keyed by column name.
 
     Args:
         name: start of the columns, such as `time`.

@@ -1,4 +1,4 @@
-"""Tests per map of the hypotheses that a suite fixes.
+"""Tests of the hypotheses that a suite states in advance; the unit is the map.
 
 A difference is tested by sign flips. Other kinds of hypotheses are tested by intervals
 and a margin (`benchnav.stats.margins`). Holm's correction covers all hypotheses of a
@@ -35,7 +35,7 @@ def test_hypotheses(
     """Test the hypotheses of a run.
 
     Args:
-        fixed: entry of hypotheses from `fix_hypotheses`.
+        fixed: hypotheses of the run, as returned by `fix_hypotheses`.
         episodes: all rows of the run.
         worlds: world of each condition by id, as in `run.json`.
         is_whole: whether the run is finished. If it is not, `p` and `p_holm` are NaN,
@@ -45,10 +45,10 @@ def test_hypotheses(
     Returns:
         One row per hypothesis: all keys of its entry in `tests`; `unit`
         of the following columns; `n_maps`, the number of maps, or of groups of maps;
-        `n_episodes` of each condition; `mean_one`, `mean_other`; `difference`, `one`
-        minus `other`; the limits `low`, `high` of its 95 % interval and `low_90`,
-        `high_90` of its 90 % interval; `p`, and `p_holm` after Holm's correction; and
-        `supported`, true if `p_holm` is below 0.05. With fewer than
+        `n_episodes` of each condition; `mean_one` and `mean_other`; `difference` (of
+        `one` minus `other`), with the limits `low` and `high` of its 95 % interval, and
+        `low_90` and `high_90` of its 90 % interval; `p`, and `p_holm` after Holm's
+        correction; and `supported`, true if `p_holm` is below 0.05. With fewer than
         `stats.bootstrap.LEAST_MAPS` maps, only a difference in success has an interval.
     """
     rows = dict(list(episodes.groupby("condition", sort=False)))
@@ -88,13 +88,15 @@ def comparable(
     """Return the episodes in which two conditions can be compared, side by side.
 
     Args:
-        first: rows of the first condition, with T as `time_budget_s`.
-        second: rows of the second condition, with T as `time_budget_s`.
+        first: rows of the first condition, with the time budget in the column
+            `time_budget_s`.
+        second: such rows of the second condition.
         quantity: the compared quantity.
 
     Returns:
-        The episodes in which both conditions have a value and, for a quantity
-        `of_arrivals`, both reach the goal; columns as in `side_by_side`.
+        The episodes in which both conditions have a value and, if
+        `quantity.of_arrivals`, in which both conditions also reach the goal; columns as
+        in `side_by_side`.
     """
     column = quantity.column
     measures = dict.fromkeys(["success", "total_time_s", "time_budget_s", column])
@@ -106,10 +108,12 @@ def comparable(
 
 
 def means_and_difference(quantity: Quantity, rows: pd.DataFrame) -> dict[str, float]:
-    """Return both means, and their difference with its 95 % interval, by column.
+    """Return the two means, and their difference with its 95 % interval.
+
+    The keys are names of columns.
 
     Args:
-        quantity: the compared quantity, whose unit the values have.
+        quantity: the compared quantity; the returned values are in its unit.
         rows: rows from `comparable`.
     """
     difference, low, high = _interval(rows, quantity, 0.95)

@@ -47,7 +47,8 @@ class Compared:
             several runs contain the condition.
         value: all settings that affect the rows, as in `run.json`.
         maps: digests of the maps, in the order of maps.
-        episodes: rows of the condition, with T as `time_budget_s`.
+        episodes: rows of the condition, with the time budget T in the column
+            `time_budget_s`.
         code: code of the rows by name of the run, as in `Origin.code`.
         map_properties: digest of the `SPLIT_PROPERTIES` of the maps; empty if the run
             does not contain it.

@@ -129,9 +129,10 @@ def split_regret(
           `one_model`, `other`, `other_planner`, `other_model`.
         - `n_maps`, the number of maps, or of groups of maps; `n_episodes`.
         - for `success` and `time` (T_total in seconds; a failure counts as T): the
-          means `…_one` and `…_other`; `…_difference`, one minus other, with its 95 %
-          interval `…_low`, `…_high`; and `…_bound`, the best mean that the lower bounds
-          of the time allow, NaN if the rows of the reference have no bounds.
+          means `…_one` and `…_other`; `…_difference` (one minus other), with the
+          limits `…_low` and `…_high` of its 95 % interval; and `…_bound`, the best mean
+          that the lower bounds of the time allow, NaN if the rows of the reference have
+          no bounds.
     """
     rows = dict(list(episodes.groupby("condition", sort=False)))
     steps: list[dict[str, Any]] = []
@@ -169,7 +170,7 @@ def best_possible(rows: pd.DataFrame) -> dict[str, float]:
     """Return the best means of success and T_total that the lower bounds allow.
 
     Args:
-        rows: rows of episodes, with T as `time_budget_s`.
+        rows: rows of episodes, with the time budget T in the column `time_budget_s`.
 
     Returns:
         `success_bound`, and `time_bound` in seconds; NaN if any episode has no

@@ -129,22 +129,22 @@ def summarise(
 
         - `condition` and its labels; `n_episodes`; `n_maps`; `n_groups`, which is
           `n_maps` if the dataset has no groups.
-        - `success_rate` with its interval `success_low`, `success_high`, and
-          `design_effect`; see `success_mean`.
+        - `success_rate`, with the limits `success_low` and `success_high` of its
+          interval, and `design_effect`; see `success_mean`.
         - `NAME_mean`, `NAME_std`, and `NAME_n`, the number of episodes with a value,
           for the total time (a failure counts as T), the time of successes only,
           observed λ, the time divided by the reference time, the score, the path
           length, the fraction of stuck steps, and the roughness.
-        - `total_time_low_s`, `total_time_high_s`, the 95 % interval of the mean total
-          time from `total_time_mean`.
+        - `total_time_low_s` and `total_time_high_s`, the limits of the 95 % interval of
+          the mean total time from `total_time_mean`.
         - the medians `planning_ms_median`, `planning_ms_p95_median` and
           `planning_start_ms_median`.
         - `NAME_mean` for metrics of learning, NaN if robots do not learn;
           `compiled_share`, the fraction of episodes with a compiled planner;
           `OUTCOME_count`, the number of failures with each outcome.
         - for each further quantity: mean, standard deviation and number of episodes, as
-          above; and `NAME_low`, `NAME_high`, Student's 95 % interval of the mean over
-          maps.
+          above; and `NAME_low` and `NAME_high`, the limits of Student's 95 % interval
+          of the mean over maps.
     """
     groups = episodes.groupby("condition", sort=False)
     rows = [
@@ -198,7 +198,7 @@ def _summarise_condition(
 
 
 def _spread(quantity: Quantity, values: pd.Series) -> dict[str, object]:
-    """Return mean, standard deviation and number of values of a quantity, by column."""
+    """Return mean, standard deviation and number of values, keyed by column name."""
     stem = quantity.column.removesuffix(quantity.suffix)
     return {
         quantity.summary_column("mean"): values.mean(),

@@ -38,7 +38,7 @@ _MIN_GAIN = 1e-3  # nats per cell; with a smaller gain, a distribution is left u
 
 
 def fit_temperature(logits: Tensor, class_id: Tensor) -> float:
-    """Return the temperature of minimum negative log-likelihood, in [0.05, 20].
+    """Return the temperature that minimises the negative log-likelihood, in [0.05, 20].
 
     Args:
         logits: shape [N, C].
@@ -55,12 +55,13 @@ def fit_temperature(logits: Tensor, class_id: Tensor) -> float:
 def fit_pool_temperature(
     members: Sequence[nn.Module], maps: Any, seed: int = 0, device: torch.device = CPU
 ) -> float:
-    """Return the temperature of the average of classifiers, for `models.fused.sharpen`.
+    """Fit the temperature for the average of classifiers, for `models.fused.sharpen`.
 
     Args:
         members: calibrated classifiers; each returns logits [B, C, H, W] from the layers
             of maps by name.
-        maps: a `models.training.data.MapDataset` with their inputs and `class_id`.
+        maps: a `models.training.data.MapDataset` with the inputs of the classifiers and
+            `class_id`.
         seed: root seed for sampling cells.
         device: device of the computation, to which the classifiers are moved.
     """
@@ -105,7 +106,7 @@ def fit_width(lower: Tensor, upper: Tensor) -> float:
 
 
 def _minimise(loss: Callable[[float], float]) -> float:
-    """Return the temperature of minimum loss, in [0.05, 20]."""
+    """Return the temperature that minimises a loss, in [0.05, 20]."""
     bound = float(np.log(_MAX_TEMPERATURE))
     result = minimize_scalar(
         lambda log: loss(float(np.exp(log))), bounds=(-bound, bound), method="bounded"
@@ -123,7 +124,8 @@ def sample_logits(
     Args:
         classifier: function that returns logits [B, C, H, W] from the layers of maps by
             name.
-        maps: a `models.training.data.MapDataset` with its inputs and `class_id`.
+        maps: a `models.training.data.MapDataset` with the inputs of the classifier and
+            `class_id`.
         seed: root seed for sampling cells.
         device: device of the computation, to which the classifier is moved.
 

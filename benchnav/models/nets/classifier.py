@@ -73,7 +73,7 @@ class TerrainClassifier(TrainableNetwork):
         return build_network(self.config, channels, len(self.map_classes))
 
     def configure_losses(self) -> Loss:
-        """Return the loss: cross-entropy, a proper score, changed by two settings.
+        """Return the loss: cross-entropy (a proper score), modified by two settings.
 
         `dice` adds the soft Dice loss, in which rare and frequent classes have the same
         weight. Source: Milletari et al. (2016), "V-Net". `focal` reduces the weight of

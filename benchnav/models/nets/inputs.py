@@ -101,7 +101,7 @@ def check_inputs(inputs: Sequence[str], fields: Iterable[str]) -> None:
     is_unique = len(set(inputs)) == len(inputs)
     expect(
         inputs and is_unique,
-        f"`inputs` of at least one layer, each named once, got {list(inputs)}.",
+        f"`inputs` to name at least one map layer, and none twice, got {list(inputs)}.",
     )
     for name in inputs:
         if name not in options:

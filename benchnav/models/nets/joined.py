@@ -25,7 +25,7 @@ _N_FEATURES = 32
 
 
 class JoinedModel(TrainableModel):
-    """Model that predicts N numbers per cell from the image, and from slope if an input.
+    """Model that predicts N numbers per cell from the image, and slope if given.
 
     Args:
         config: settings of the model and its training.

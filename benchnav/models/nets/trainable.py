@@ -82,7 +82,7 @@ class TrainableNetwork(lightning.LightningModule):
 
     @property
     def stride(self) -> int:
-        """Number of cells: maps are padded to multiples of it, and outputs are cropped."""
+        """Maps are padded to multiples of this number of cells; outputs are cropped."""
         return 1
 
     @abstractmethod
@@ -99,8 +99,8 @@ class TrainableNetwork(lightning.LightningModule):
     def configure_losses(self) -> Loss:
         """Return the loss, a function of `forward`'s outputs and the target [B, H, W].
 
-        It returns a scalar. The target is NaN in cells without a value, or 255 in unlabelled
-        cells; the loss must ignore these cells.
+        The loss returns a scalar. The target is NaN in cells without a value, or 255 in
+        unlabelled cells; the loss must ignore these cells.
         """
 
     def configure_metrics(self) -> dict[str, Metric]:
@@ -251,7 +251,8 @@ class TrainableNetwork(lightning.LightningModule):
 
         Args:
             members: trained and calibrated networks.
-            maps: a `models.training.data.MapDataset` with their inputs and the field to learn.
+            maps: a `models.training.data.MapDataset` with the inputs of the members and
+                the field to learn.
             seed: root seed for sampling cells.
             device: device of the computation.
         """

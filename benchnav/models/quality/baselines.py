@@ -21,7 +21,7 @@ def nearest_colour(rgb: Tensor, colours: Tensor) -> Tensor:
         colours: colours of the classes, 0–255, shape [C, 3].
 
     Returns:
-        Class ids, int64, shape [B, H, W]. Of equally near classes, the first is chosen.
+        Class ids, int64, shape [B, H, W]. If several are equally near, the first.
     """
     pixels = rgb.movedim(1, -1).float().flatten(1, 2)
     palette = colours.float().expand(len(rgb), -1, -1)
@@ -45,7 +45,7 @@ def nearest_colour_accuracy(dataset: TerrainDataset, split: str) -> float:
 
 
 def climatology_crps(dataset: TerrainDataset, split: str) -> float:
-    """Return the CRPS of one prediction for all cells: the distribution of observed λ.
+    """Return the CRPS of predicting the distribution of observed λ in every cell.
 
     The CRPS is ∫ F·(1 − F), where F(x) is the fraction of cells with λ ≤ x, computed from
     a histogram with an error below 1e-4; NaN if λ was not observed. Source: Gneiting and

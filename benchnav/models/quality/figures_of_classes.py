@@ -63,8 +63,8 @@ class Confusion(Figure):
             frame_map(panel)
         figure.supxlabel("most likely class")
         figure.supylabel("true class")
-        # The colour bar is as high as the square of the upper right panel, which does not
-        # fill the panel.
+        # The upper right panel contains a square that does not fill the panel. The
+        # colour bar is as high as this square.
         right_panel = panels[min(n_panels, n_columns) - 1]
         colour_bar = right_panel.inset_axes((1.04, 0, 0.05, 1))
         figure.colorbar(image, cax=colour_bar, label="fraction of the true class [%]")

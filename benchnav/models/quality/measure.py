@@ -97,8 +97,10 @@ class TraversabilityQuality:
         nll: negative log-likelihood of observed λ, from the density in (0, 1) and the mass
             at 0 and 1; NaN for distributions without a density.
         crps: continuous ranked probability score of observed λ.
-        coverage: fraction of λ in the central 90 % interval of its prediction; ideally 0.9.
-        tail_rate: fraction of λ below the VaR at level 0.9; ideally 0.1.
+        coverage: fraction of cells whose observed λ is in the central 90 % interval of
+            the prediction; ideally 0.9.
+        tail_rate: fraction of cells whose observed λ is below the VaR at level 0.9;
+            ideally 0.1.
         pit: number of cells in 20 equal bins of the randomised PIT; ideally all equal.
     """
 
@@ -268,8 +270,8 @@ def measure(
     sums = map_tally.sums() if n_maps else {}
     if not n_maps or not sums["cells"].any():
         raise DatasetError(
-            "Expected maps with observed λ to measure on, got no such cell. Record λ in "
-            "some cells."
+            "Expected maps with observed λ in some cells, got none. Record λ in some "
+            "cells."
         )
     values = {name: SCORES[name].value(sums) for name in _SHARED_SCORES}
     traversability = TraversabilityQuality(

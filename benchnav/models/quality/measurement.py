@@ -87,7 +87,7 @@ class Measurement:
 
     @cached_property
     def climatology_crps(self) -> dict[str, float]:
-        """CRPS of the split's distribution of λ as prediction for all cells, by split."""
+        """CRPS of predicting the split's distribution of λ in every cell, by split."""
         return {
             split: baselines.climatology_crps(self.dataset, split)
             for split in self.splits

@@ -26,7 +26,7 @@ class KeepBest(Callback):
     """
 
     def __init__(self, last: bool = False) -> None:
-        """Create the callback without weights."""
+        """Create the callback; no weights are stored yet."""
         self.last = last
         self.guard = WeightGuard()
         self.best: dict[str, Any] = {"loss": float("inf"), "metrics": {}, "weights": {}}
@@ -68,9 +68,8 @@ class KeepBest(Callback):
                 "Expected a finite validation loss, got none in any epoch. Train with a "
                 "lower `learning_rate`."
                 if self.validated
-                else "Expected `trainer` to measure the split valid, got a training that "
-                "ended before the first validation. Train for longer, or validate more "
-                "often."
+                else "Expected at least one validation, got a training run that ended "
+                "before the first one. Train for longer, or validate more often."
             )
         module.load_state_dict(self.best["weights"])
         # Processes that the trainer starts return only the metrics of the trainer.
@@ -97,14 +96,14 @@ class KeepBest(Callback):
 class WeightGuard(Checkpoint):
     """A callback that raises an error if another callback changes weights after training.
 
-    `KeepBest`, the first callback, notes the weights in each hook. Lightning calls the same
-    hook of a `Checkpoint` after all other callbacks and before the module. If the weights
-    then differ, a callback in between has changed them. Digests of bytes are compared,
-    because NaN does not equal itself.
+    `KeepBest`, the first callback, notes the weights in each hook. Lightning calls the
+    hook of a `Checkpoint`, such as this class, after that of all other callbacks and
+    before that of the module. If the weights then differ, a callback in between has
+    changed them. Digests of bytes are compared, because NaN does not equal itself.
     """
 
     def __init__(self) -> None:
-        """Create the callback without weights."""
+        """Create the callback; no digest of weights is stored yet."""
         self.digest = ""
 
     def note(self, module: torch.nn.Module) -> None:
@@ -143,8 +142,8 @@ class WeightGuard(Checkpoint):
         owner = " or ".join(names) or "a callback"
         raise ConfigError(
             "Expected callbacks that leave the trained weights unchanged, got weights "
-            f"that `{hook}` of {owner} changed. The weights of the best epoch are "
-            "exported. Leave the callback out."
+            f"that `{hook}` of {owner} changed. Only the weights of the best epoch may "
+            "be exported. Leave the callback out."
         )
 
     def check_module(self, module: torch.nn.Module) -> None:

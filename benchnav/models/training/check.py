@@ -72,8 +72,8 @@ def check_network(
 
     Raises:
         ConfigError: If Lightning or the network does not accept the settings, the maps
-            lack an input, a hook returns an invalid value, or no batch would be trained
-            on or measured.
+            lack an input, a hook returns an invalid value, or no batch would be left
+            for training or for validation.
         DatasetError: If there are too few maps, or no cell has a value to learn.
     """
     kind = trainable.kind
@@ -340,7 +340,7 @@ def _batch_error(
         file = Path(frame.filename).name
         remedy = f"See {file}, line {frame.lineno}, in `{frame.name}`."
     elif hasattr(config, "architecture") and hasattr(config, "encoder"):
-        owner = f"{config.architecture} of {config.encoder}"
+        owner = f"{config.architecture} with the encoder {config.encoder}"
     return out_of_memory_error(error) or ConfigError(
         f"Expected a network that accepts batches of {batch} maps of {height}×{width} "
         f"cells, got {owner}, which fails: {one_line(error).rstrip('.')}. {remedy}"

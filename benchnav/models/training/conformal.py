@@ -20,7 +20,7 @@ def stopping_step(conformal: bool) -> int:
 
 
 def scored_maps(count: int) -> range:
-    """Return the indices of every second map of a split of `count` maps, for scores.
+    """Return the indices of the maps for scores: every second of `count` maps.
 
     Early stopping and temperature do not use these maps.
     """

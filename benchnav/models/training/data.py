@@ -46,7 +46,7 @@ Batch = dict[str, Tensor]
 
 
 class MapDataset(TerrainMaps):
-    """Maps of a split; an index, a `MapKey`, selects a whole batch.
+    """Maps of a split; a `MapKey`, used as an index, selects a whole batch.
 
     Args:
         path: path of the dataset.
@@ -151,7 +151,7 @@ class MapDataset(TerrainMaps):
         return {name: masked[name] for name in self.output_fields}
 
     def _cut(self, layer: Tensor, origin: Sequence[int]) -> Tensor:
-        """Return the square at an origin of a layer [*, H, W]; the layer without `crop`."""
+        """Cut a square out of a layer [*, H, W]; without `crop`, return the layer."""
         if not self.crop:
             return layer
         row, column = origin

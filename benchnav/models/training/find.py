@@ -46,15 +46,16 @@ def find_trainable(source: str, settings: dict[str, Any]) -> Trainable:
         name in registered and registry.find("model", name).target is not kind
     ):
         raise ConfigError(
-            f"Expected a class whose name no model of this package has, got {name!r}. "
-            "Checkpoints identify a class by its name. Rename the class."
+            "Expected a class with a name that differs from those of this package's "
+            f"models, got {name!r}. Checkpoints identify a class by its name. Rename "
+            "the class."
         )
     code = "" if match.shipped else match.digest
     return Trainable(kind=kind, config=config, name=name, family=name, code=code)
 
 
 def find_kind(source: str) -> registry.Found:
-    """Find the class of a model by the name of a model, file or module.
+    """Find the class of a model by the name of the model, of a file or of a module.
 
     Raises:
         ConfigError: If the class or name does not exist or cannot be imported.

@@ -164,7 +164,7 @@ def _class(setting: str, class_path: str) -> type:
             ) from error
     expect(
         _is_kind(kind, base),
-        f"`trainer.{setting}` as a subclass of lightning's {base.__name__}, got "
+        f"`trainer.{setting}` to be a subclass of lightning's {base.__name__}, got "
         f"{class_path!r}.",
     )
     return kind

@@ -29,7 +29,7 @@ def size_of(norms: Mapping[str, Any]) -> int:
 
 
 def to_buffers(norms: Mapping[str, Any], row: Tensor) -> dict[str, Tensor]:
-    """Return the buffers by name from all statistics in one row, shape [S]."""
+    """Convert a row of all statistics, shape [S], to buffers by name."""
     names = []
     sizes = []
     for name, norm in norms.items():

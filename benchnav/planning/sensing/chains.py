@@ -35,7 +35,9 @@ _ROUNDS = 6  # number of sweeps in an update
 _COUNTED = 3  # number of final sweeps from which probabilities are estimated
 _FIRST_COUNTED = _ROUNDS - _COUNTED
 _PASSES = 8  # number of passes over observed cells with stored random numbers
-_STEP = 13, 31  # rows and columns by which the stored numbers then shift, on the torus
+# Each time all passes have been used, the stored numbers shift by these numbers of rows
+# and columns, with wrap-around.
+_STEP = 13, 31
 _N_OFFSETS = 4096  # stored random numbers of resamplings
 
 

@@ -11,13 +11,13 @@ observed λ y_i, the joint density of all observations is
 
 where F_i and f_i are the predicted CDF and density, φ is the standard normal density
 and K is the correlation matrix of the scores. For λ of 0 or 1, the probability of an
-interval replaces the density. The labels are a Potts field without an outer field
+interval replaces the density. The labels are a Potts field without an external field
 (`labels`). It is sampled given y by 64 chains (`chains`).
 
 The predicted odds of the two classes of a cell enter its posterior odds as a factor,
-once. They are not an outer field of the chains: a model has already used the cell's
-neighbours, and an outer field would count this evidence again for each of them. Without
-measurements, P(class) is the model's.
+once. They are not an external field of the chains: a model has already used the cell's
+neighbours, and an external field would count this evidence again for each of them.
+Without measurements, P(class) is the model's.
 
 The belief is the average of two distributions of λ, one under either label, weighted by
 P(class). Each is conditioned as in `copula`, with the scores of observed cells under
@@ -147,7 +147,7 @@ class Classes(Belief[ClassesState]):
 
         A new prediction replaces the old one where it differs, as in `Copula`. The
         scores of observed λ are computed again there, and repeated measurements of a
-        cell then count as one.
+        cell are then treated as one.
         """
         updated = state
         has_new_prediction = torch.zeros_like(sensed.mask)

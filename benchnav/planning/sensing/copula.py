@@ -94,7 +94,7 @@ class Copula(Belief[CopulaState]):
             is_valid = 0 <= length < math.inf
         expect(
             is_valid,
-            "`correlation_m` as a finite number ≥ 0, 'world' or 'estimated', got "
+            "`correlation_m` to be a finite number ≥ 0, 'world' or 'estimated', got "
             f"{length!r}.",
         )
         expect(self.window >= 1, f"`window` ≥ 1, got {self.window}.")
@@ -146,9 +146,9 @@ class Copula(Belief[CopulaState]):
     ) -> CopulaState:
         """Condition cells near new observations.
 
-        Repeated measurements of a cell are averaged if their scores are numbers. Of
-        intervals, the least noisy one is used. A new prediction replaces the old one in
-        cells where its parameters differ by more than 10⁻³.
+        Repeated measurements of a cell are averaged if their scores are numbers. If
+        they are intervals, the least noisy one is used. A new prediction replaces the
+        old one in cells where its parameters differ by more than 10⁻³.
         """
         updated = state
         new_prior = torch.zeros_like(state.observed)
@@ -234,7 +234,7 @@ class Copula(Belief[CopulaState]):
     def at(self, state: CopulaState, cells: Tensor) -> TabulatedDistribution:
         """Return the belief in some cells, from a table of scores; see `Belief`.
 
-        This is far faster than `distribution`. λ̂ differs from it by less than 0.01.
+        This is far faster than `distribution`. The two λ̂ differ by less than 0.01.
         """
         table = state.table.with_rows(state.prior, cells)
         mean = state.mean[cells]

@@ -1,7 +1,8 @@
 """A Potts field of two states on look-alike cells, sampled by 64 chains.
 
-A cell that may belong to either class of a pair is coupled to those of its four
-neighbours that may belong to the same pair. Without an outer field, at strength β:
+Look-alike classes come in pairs. A cell that may belong to either class of a pair is
+coupled to those of its four neighbours to which the same two classes apply. Without an
+external field, at strength β:
 
     P(labels) ∝ exp(β · number of coupled pairs of neighbours with equal labels).
 
@@ -27,7 +28,9 @@ from benchnav.core import rng
 
 CHAINS = 64
 _SWEEPS = 64  # number of sweeps with stored random numbers
-_STEP = 11, 29  # rows and columns by which the stored numbers then shift, on the torus
+# Each time all sweeps have been used, the stored numbers shift by these numbers of rows
+# and columns, with wrap-around.
+_STEP = 11, 29
 _NEIGHBOURS = 4
 _MAX_LEVEL = 2 * _NEIGHBOURS  # index of the stored bits with log odds 4β
 
@@ -252,13 +255,21 @@ def count_bits(words: Tensor) -> Tensor:
 
 
 def unpacked(words: Tensor) -> Tensor:
-    """Return the bits of words of shape [*], bool, shape [*, S]."""
+    """Return the bits of words as bool, shape [*, S].
+
+    Args:
+        words: int64, shape [*].
+    """
     chain = torch.arange(CHAINS, device=words.device)
     bits = words[..., None] >> chain & 1
     return bits.bool()
 
 
 def packed(bits: Tensor) -> Tensor:
-    """Return words of bits of shape [*, S], int64, shape [*]."""
+    """Return words that contain bits, int64, shape [*].
+
+    Args:
+        bits: bool, shape [*, S].
+    """
     chain = torch.arange(CHAINS, device=bits.device)
     return (bits.long() << chain).sum(-1)

@@ -37,7 +37,7 @@ def statistics_of(covariance: CovarianceModel) -> GroundStatistics:
 def split_by_class(
     prior: TraversabilityDistribution, covariance: CovarianceModel
 ) -> tuple[TraversabilityMixture, TraversabilityMixture, Tensor, Tensor]:
-    """Split a prediction into one under each class of a pair of look-alike classes.
+    """Return the predictions under either class of each cell's look-alike pair.
 
     Args:
         prior: the model's prediction, shape [B, H, W].

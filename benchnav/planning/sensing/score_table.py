@@ -96,7 +96,7 @@ class TabulatedDistribution(TraversabilityDistribution):
         mean_remaining = (low + high) / 2
         if tail == 1:  # F never exceeds p
             return (mean_remaining @ step).clamp(max=1)
-        # In the interval in which F crosses p, only the part below p counts.
+        # In the interval in which F crosses p, only the part below p contributes.
         rise = below.diff(dim=-1).clamp(min=1e-30)
         is_before = high > 0
         fraction = low / torch.where(is_before, 1.0, rise)

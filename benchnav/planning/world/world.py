@@ -332,7 +332,7 @@ def read_world(world: Any, task: Any = None) -> tuple[World, Rules, str]:
         world = world.spec
     expect(
         isinstance(world, Mapping | str),
-        f"`world` as the name of a preset or a mapping of settings, got {world!r}.",
+        f"`world` to be the name of a preset or a mapping of settings, got {world!r}.",
     )
     changes = {"preset": world} if isinstance(world, str) else dict(world)
     name = changes.pop("preset", "paper")

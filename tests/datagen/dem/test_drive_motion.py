@@ -384,7 +384,7 @@ def test_a_speed_of_the_other_sign_is_rejected() -> None:
     unsigned = rows.assign(speed=rows["speed"].abs())
     with pytest.raises(
         DatasetError,
-        match=r"sign of .* got the opposite sign in 300 of 300 rows commanded backward",
+        match=r"sign of .* got the opposite sign in 300 of the 300 rows with a backward command",
     ):
         compare_motion(log_of(unsigned))
     for speed in ("measured", "positions"):

@@ -306,7 +306,7 @@ def test_the_truth_of_imported_ground_is_unknown(tmp_path: Path) -> None:
 @pytest.mark.parametrize("stride", [0.7, 0, -1, np.nan])
 def test_a_stride_is_a_number_of_cells(tmp_path: Path, stride: float) -> None:
     message = refusal(write(tmp_path / "dem.tif", FLAT), stride_m=stride)
-    assert "`stride` as a multiple of 0.5 m, which is the resolution" in message
+    assert "`stride` to be a multiple of 0.5 m (the resolution" in message
 
 
 def test_a_split_without_maps_is_named_with_the_reason(tmp_path: Path) -> None:
@@ -356,7 +356,7 @@ def test_files_that_are_no_whole_raster_are_refused(tmp_path: Path) -> None:
     (tmp_path / "cut.tif").write_bytes(whole[: len(whole) // 2])
     for name in ("text.tif", "empty.tif", "cut.tif", "none.tif"):
         message = refusal(tmp_path / name)
-        assert "Expected `dem` as a raster that GDAL can read" in message
+        assert "Expected `dem` to be a raster that GDAL can read" in message
         assert name in message
     assert "No such file" in message
     dem = write(tmp_path / "dem.tif", FLAT)
@@ -366,7 +366,7 @@ def test_files_that_are_no_whole_raster_are_refused(tmp_path: Path) -> None:
             **{argument: tmp_path / "text.tif"},
             **({} if argument == "classes" else ANY),
         )
-        assert f"`{argument}` as a raster" in message
+        assert f"`{argument}` to be a raster" in message
 
 
 def test_a_photo_that_is_damaged_is_blamed_rather_than_the_output(

@@ -276,7 +276,7 @@ def test_rasters_of_no_such_values_are_refused(
 def test_a_raster_that_is_not_there_is_refused(tmp_path: Path) -> None:
     dem = write(tmp_path / "dem.tif", FLAT)
     assert (
-        "Expected `layer moss` as a raster that GDAL can read, got nope.tif"
+        "Expected `layer moss` to be a raster that GDAL can read, got nope.tif"
         in refusal(dem, "moss=nope.tif")
     )
 

@@ -374,10 +374,10 @@ def test_what_is_there_is_refused_and_replaced_only_where_it_is_an_export(
         (["--splits", "[]"], "`splits` among"),
         (["--fields", "[rbg]"], "`fields` among"),
         (["--maps-per-file", "-1"], "`maps_per_file` ≥ 0"),
-        (["--license", "my own"], "`license` as an identifier"),
+        (["--license", "my own"], "`license` to be an identifier"),
         (
             ["--license", "foo"],
-            "`license` as an identifier from the SPDX list, such as CC-BY-4.0, or a URL, got 'foo'.",
+            "`license` to be an identifier from the SPDX list, such as CC-BY-4.0, or a URL, got 'foo'.",
         ),
         (["--license", "cc-by-4.0"], "got 'cc-by-4.0'. Did you mean 'CC-BY-4.0'?"),
         (["--license", "LicenseRef-mine"], "got 'LicenseRef-mine'"),

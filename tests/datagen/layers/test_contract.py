@@ -255,7 +255,7 @@ def test_a_bad_layer_ends_in_one_line(
         ([{"part": "vegetation", "label": "grass"}], "a layer as NAME or as {part: NAME, options: {…}}"),
         ([{"part": "vegetation", "options": {"period_m": 4, "moss": 1}}], "'moss'"),
         ([{"part": "vegetation", "options": ON_ICE}], "classes of layer 'vegetation' among"),
-        ([{"part": "tests.datagen.layers.own:Plain"}] * 2, "different names of `layers`, got 'plain' more than once"),
+        ([{"part": "tests.datagen.layers.own:Plain"}] * 2, "its own name, got 'plain' more than once"),
     ],
 )  # fmt: skip
 def test_layers_that_are_none_are_rejected(layers: object, expected: str) -> None:

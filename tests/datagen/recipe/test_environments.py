@@ -124,7 +124,7 @@ def test_tables_that_cannot_be_dealt_are_refused_by_name() -> None:
     ))  # fmt: skip
     assert small_stakes(classes=classes, occupancy=(0.5, 0.5)).units == ((0, 1), (2, 3))
     with pytest.raises(
-        ConfigError, match=r"selection of 3 classes.*for sand, dust"
+        ConfigError, match=r"map of 3 classes.*for sand, dust"
     ) as caught:
         small_stakes(classes=classes, occupancy=(0.4, 0.3, 0.3))
     assert "\n" not in str(caught.value)

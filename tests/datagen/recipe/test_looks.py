@@ -168,7 +168,7 @@ def test_a_recipe_without_scenarios_has_the_three_of_before() -> None:
         ({"classes": ["gravle"]}, "`classes` of a tint of scenario 'std' among basalt"),
         (
             {"share": 0.995},
-            "of the class table, got 'basalt' and 'wet_clay' in the same colour. Lower",
+            "if the class table does, got 'basalt' and 'wet_clay' in the same colour. Lower",
         ),
         (
             {"classes": ["packed_soil"]},

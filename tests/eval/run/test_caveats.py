@@ -155,7 +155,7 @@ def test_a_merged_run_says_what_its_shards_said(
         ({"planner": "optimal", "sensors": ("near:4",)}, "got 'static' and 'near:4'. This planner plans only once"),
         ({"planner": "near_optimal"}, "planner 'near_optimal', got 'oracle'. This planner needs the true"),
         ({"planner": "optimal", "robots": ("bicycle",)}, "Expected robot Unicycle for planner 'optimal', got Bicycle"),
-        ({"planner": HAZARD, "world": "paper"}, "immobilises robots for `hazard`"),
+        ({"planner": HAZARD, "world": "paper"}, "only in a world that immobilises"),
         ({"planner": FREE, "models": ("clairvoyant",), "world": "paper"}, "constant λ for the model 'clairvoyant'"),
         ({"planner": FREE, "risks": ("single-class",), "models": (TWO_MODES,)}, "has no `class_names`"),
     ],
@@ -256,7 +256,7 @@ def test_a_planner_whose_settings_are_never_prepared_is_refused(
     suite = suite_on(
         dataset_path, planners=(FREE, HAZARD), robots=("unicycle",), world="paper"
     )
-    with pytest.raises(ConfigError, match="immobilises robots for `hazard`"):
+    with pytest.raises(ConfigError, match="only in a world that immobilises"):
         check_suite(suite, uses_workers=False)
     left = check_suite(replace(suite, world=("paper", "stakes")), uses_workers=False)
     assert [entry["world"] for entry in left.dropped] == ["paper"]

@@ -56,8 +56,8 @@ def test_scales_are_kept_whole_where_kernels_are_halved() -> None:
 @pytest.mark.parametrize(
     ("inputs", "expected"),
     [
-        ((), "each named once"),
-        (("rgb", "rgb"), "each named once"),
+        ((), "at least one map layer, and none twice"),
+        (("rgb", "rgb"), "at least one map layer, and none twice"),
         (("rgb", "vegetation"), "Did you mean 'vegetation_m'"),
         (("class_id",), "got 'class_id'"),
     ],

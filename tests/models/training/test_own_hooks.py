@@ -230,7 +230,7 @@ def test_a_class_of_a_name_that_is_ours_is_refused(
         == 2
     )
     assert (
-        f"a class whose name no model of this package has, got {name!r}"
+        f"differs from those of this package's models, got {name!r}"
         in capfd.readouterr().err
     )
 
@@ -248,7 +248,7 @@ def test_a_class_of_a_name_that_is_ours_is_refused(
         ),
         (
             ["own.py:CellModel", "--settings.inputs", "[]"],
-            "`inputs` of at least one layer, each named once",
+            "`inputs` to name at least one map layer, and none twice",
         ),
         (["own.py:CellModel", "--settings.width", "3"], "got 'width'"),
         (["own.py:CellModel", "--crop", "33"], r"`crop` from 8 to 32 cells"),

@@ -715,7 +715,7 @@ def test_what_cannot_be_known_is_refused() -> None:
         ConfigError, match="model 'clairvoyant' for planner 'near_optimal'"
     ):
         NearOptimal().init(unsure, generator())
-    with pytest.raises(ConfigError, match="immobilises robots for `hazard`"):
+    with pytest.raises(ConfigError, match="only in a world that immobilises"):
         Optimal(OptimalConfig(hazard=True)).init(posed, generator())
 
 

@@ -19,7 +19,7 @@ from benchnav.core.grid import is_azimuth
 from benchnav.core.store import replacing
 from benchnav.core.tables import Bold, Table, to_markdown
 from benchnav.eval.experiment.condition import NOT_USED
-from benchnav.eval.folder.checksums import is_as_noted, note_checksums
+from benchnav.eval.folder.checksums import matches_checksum, note_checksums
 from benchnav.eval.recording import Recording
 from benchnav.eval.report.playback.scene import (
     TIMELINE,
@@ -29,7 +29,7 @@ from benchnav.eval.report.playback.scene import (
     log_driver,
     log_terrain,
 )
-from benchnav.eval.words import NAMING, contender_names, reading_name
+from benchnav.eval.words import NAMING, contender_names, display_name
 from benchnav.viz.maps import MAX_SPREAD, layer_scale
 from benchnav.viz.style import bytes_of, condition_colours
 
@@ -56,7 +56,7 @@ def write_viewer_files(folder: Path) -> None:
     for stored in sorted((folder / "playback").glob("*.npz")):
         file = stored.with_suffix(".rrd")
         files.append(file)
-        if not file.exists() or not is_as_noted(folder, file):
+        if not file.exists() or not matches_checksum(folder, file):
             write_rerun([Recording.load(stored)], file)
     note_checksums(folder, files)
 
@@ -125,7 +125,7 @@ def arrange(drivers: Sequence[Driver]) -> Any:
     title = "All conditions"
     if len(drivers) == 1:
         title = drivers[0].recording.title
-        commands = rrb.TimeSeriesView(name="Commanded", origin="/series/command")
+        commands = rrb.TimeSeriesView(name="Commanded speeds", origin="/series/command")
         series.insert(1, commands)
     terrain = rrb.Spatial3DView(name=title, origin="/world")
     description = rrb.TextDocumentView(name="About", origin="/about")
@@ -156,11 +156,12 @@ def map_views(drivers: Sequence[Driver]) -> dict[str, list[str]]:
         views[layer_title(name, layer)] = [f"/{layer_entity(name)}", *overlays]
     views["True mean of λ"] = ["/map/true_mean", *on_truth]
     if recording.field is not None:
-        title = "λ field of the episode; dark red immobilises a robot"
+        title = "λ field of the episode; cells that immobilise a robot in dark red"
         views[title] = ["/map/field", *on_truth]
     for driver in drivers:
         planner = driver.name or "the planner"
-        title = f"λ̂ given to {planner}, free: {free_rule(driver.recording)}"
+        rule = free_rule(driver.recording)
+        title = f"λ̂ given to {planner}; cells are free with {rule}"
         overlay = driver.entity("/map/overlay", "**")
         views[title] = [driver.entity("/map/risk"), overlay, _START_AND_GOAL]
     if is_single and recording.known:
@@ -178,19 +179,19 @@ def layer_title(name: str, layer: np.ndarray) -> str:
 
 
 def describe(drivers: Sequence[Driver]) -> str:
-    """Describe the episodes in Markdown: labels, outcomes, and the rule of free space."""
+    """Describe the episodes in Markdown: labels, outcomes and rules for free cells."""
     recordings = [driver.recording for driver in drivers]
     rows: dict[str, Sequence[str]] = {}
     for name in NAMING:
         labels = [recording.about.get(name, NOT_USED) for recording in recordings]
-        cells = [reading_name(name, label) for label in labels]
+        cells = [display_name(name, label) for label in labels]
         if set(cells) != {NOT_USED}:
             rows[name] = cells
     rows["outcome"] = [Bold(recording.outcome) for recording in recordings]
     rows["time"] = [_time_in_words(recording) for recording in recordings]
     observed = [recording.traversability for recording in recordings]
     rows["observed λ"] = list(map(_mean_in_words, observed))
-    rows["free"] = [free_rule(recording) for recording in recordings]
+    rows["free cells"] = [free_rule(recording) for recording in recordings]
     names = [driver.name for driver in drivers]
     table = Table(
         headings=("", *names),
@@ -211,6 +212,6 @@ def _mean_in_words(traversability: np.ndarray) -> str:
 
 
 def free_rule(recording: Recording) -> str:
-    """Return the rule of free space in words."""
+    """Return the rule for which cells are free, in words."""
     by = "mean λ" if recording.free_by == "mean" else "λ̂"
     return f"{by} above {recording.free_above:g}"

@@ -54,7 +54,7 @@ class Candidate:
 
     @property
     def needs_truth(self) -> bool:
-        """Whether the model uses the class table, which is valid for generated maps."""
+        """Whether the model uses the class table, valid only for generated maps."""
         return isinstance(self.model, Oracle | Ideal)
 
 

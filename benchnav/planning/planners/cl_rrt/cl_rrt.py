@@ -10,20 +10,21 @@ et al. (2009), "Real-time motion planning with applications to autonomous urban
 driving"; paper IV-A2.
 
 `tree.search` computes one plan, and `edges` simulates. This module is the execution
-loop of the source, algorithm 2, which decides when to plan, and from which state.
+loop, algorithm 2 of Kuwata et al., which decides when to plan, and from which state.
 
-- The source grows one tree all the time, simulates its best path again from the latest
-  state, and stops if no path is safe. Here a tree is grown only when a plan is due (at
+- Kuwata et al. grow one tree all the time, simulate its best path again from the latest
+  state, and stop if no path is safe. Here a tree is grown only when a plan is due (at
   the end of the path, or when the robot has strayed or stalled; paper IV-A2), and is
   then discarded. A node need not be a state at which the robot can stop safely.
-- References are Dubins paths; the source draws straight lines and uses Dubins lengths
-  only in its heuristics.
+- References are Dubins paths; Kuwata et al. draw straight lines and use Dubins lengths
+  only in their heuristics.
 - λ̂ may decrease along a path to the goal. If the remaining path then costs over a
   tenth more than on the map on which it was chosen, the path is doubted: a new tree is
   grown, and the robot drives the cheaper of the old and the new path. Both costs are
   times along the predicted positions under the new λ̂. If no new path is found, the
-  next steps try again, up to `most_failures` times. A partial path is left at once.
-  Hence a constant map needs no further tree, and a slowly changing map only a few.
+  next steps try again, up to `most_failures` times. The robot leaves a partial path at
+  once. Hence a constant map needs no further tree, and a slowly changing map only a
+  few.
 - Sampled points have no heading, so a reference is the shortest path to a point with
   any final heading. Hence no random heading causes a detour.
 - After a plan without a path to the goal, the robot follows the best partial path. The
@@ -239,8 +240,9 @@ class CLRRT(Planner[CLRRTState]):
     def revise(self, plan_state: CLRRTState, problem: Problem) -> CLRRTState:
         """Return the plan state under an updated λ̂; see `Planner`.
 
-        A path that is no longer free, or a partial path that has become more expensive,
-        is left. A path to the goal that has become more expensive is doubted.
+        The robot leaves a path that is no longer free, and a partial path that has
+        become more expensive. A path to the goal that has become more expensive is
+        doubted.
         """
         route = plan_state.route
         points, length_m = self._ahead(route, problem, problem.start)

@@ -55,7 +55,7 @@ class CLRRTConfig:
         check_finite("CL-RRT", self, above_zero)
         expect(
             self.expansions % self.expansions_per_round == 0,
-            "`expansions` as a multiple of `expansions_per_round` = "
+            "`expansions` to be a multiple of `expansions_per_round` = "
             f"{self.expansions_per_round} for CL-RRT, got {self.expansions}.",
         )
         expect(

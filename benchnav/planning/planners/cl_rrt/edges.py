@@ -12,7 +12,8 @@ collides.
 - If edges may cross non-free cells (`ClosedLoop.crossing`), they do not collide with
   such cells. Each metre of an edge in or between such cells has a penalty.
 - If an edge collides, the first half of its free part is kept, since in narrow passages
-  no edge of full length is free. The source likewise keeps feasible nodes along a path.
+  no edge of full length is free. Kuwata et al. likewise keep feasible nodes along a
+  path.
 
 Source: Kuwata et al. (2009), algorithm 1, lines 4–10. Letters in shapes: B episodes, R
 edges simulated at once, T time steps, N points of a reference, P drawn points of an
@@ -120,7 +121,7 @@ def draw_references(
     Args:
         loop: closed loop with the turning radii and the maximum length of an edge.
         pose: start poses (x, y, θ) of the paths, shape [B, R, 3].
-        target_m: points (x, y) to reach in metres, shape [B, R, 2].
+        target_m: points (x, y) to reach, in metres, shape [B, R, 2].
 
     Returns:
         The references, and the length of each path in metres, shape [B, R]. References

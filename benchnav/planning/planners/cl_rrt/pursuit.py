@@ -184,8 +184,8 @@ class PathFollower:
             progress_m: progress before the motion in metres, shape [*B].
 
         Returns:
-            The new progress in metres, shape [*B], at most such that the look-ahead
-            point is on the reference.
+            The new progress in metres, shape [*B], limited so that the look-ahead point
+            stays on the reference.
         """
         near_x, near_y, cos, sin = reference.at(progress_m).unbind(-1)
         near_m = (progress_m * (1 / SPACING_M)).floor() * SPACING_M

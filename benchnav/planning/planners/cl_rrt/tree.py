@@ -5,13 +5,14 @@ round chooses nodes and a target for each node, simulates the robot along refere
 the targets (`edges`), and adds the ends of the edges as nodes. Finally the best route
 is selected. A tree is an immutable table of nodes; each round returns a longer table.
 
-- Nodes are chosen by Kuwata's mix of two heuristics: the nearest node in Dubins length
-  (explore), or the node through which the point is reached soonest (optimise). 70 % of
-  the choices explore before a path to the goal is found, and 30 % afterwards. Nodes
-  that cannot improve on the best path are excluded.
+- For each sampled point, a node is chosen by Kuwata's mix of two heuristics: the node
+  with the shortest Dubins path to the point (explore), or the node through which the
+  robot reaches the point soonest (optimise). 70 % of the choices explore before a path
+  to the goal is found, and 30 % afterwards. Nodes that cannot improve on the best path
+  are excluded.
 - Edges to the goal start from nodes without such an edge, the most promising nodes
   first. A simulation is deterministic, so a second edge from the same node would be a
-  copy. The source tries an edge to the goal from each new node.
+  copy. Kuwata et al. instead try an edge to the goal from each new node.
 - The cost of a path is its simulated time, plus `PENALTY` for each metre in non-free
   cells.
 
@@ -46,8 +47,8 @@ from benchnav.planning.planners.planner import PlanStatus
 # Fraction of choices that explore, before and after a path to the goal is found.
 _EXPLORE = (0.7, 0.3)
 _PARTIAL_GAIN_M = 0.5  # minimum gain of a partial path toward the goal, in metres
-# A partial path is left at this distance from its end in metres, since the end may be
-# close to non-free cells.
+# Distance in metres before the end of a partial path at which the robot stops following
+# it, since the end may be close to non-free cells.
 _MARGIN_M = 0.3
 _FAR_M = 1e4  # length in metres; every path on a map is shorter
 
@@ -72,9 +73,9 @@ class Tree(Choice, Edges):
     """Trees of B episodes, as tables of nodes.
 
     Node 0 is the root, and each other node is the end of the edge that leads to it. The
-    inherited fields describe these edges, with V instead of R in their shapes. Times
-    and metres in non-free cells count from the root; the time of a rejected edge is
-    inf.
+    inherited fields describe these edges, with V instead of R in their shapes. Times,
+    and distances in non-free cells, are measured from the root; the time of a rejected
+    edge is inf.
 
     Args:
         to_goal_m: Dubins length from each node to the goal in metres, inf for rejected
@@ -170,7 +171,8 @@ def search(
         loop: robots, controller and terrain.
         root: states to plan from, shape [B, S].
         tracking: state of the controllers at the root, shape [B].
-        sample_m: points (x, y) to reach in D rounds, in metres, shape [D, R, 2].
+        sample_m: sampled points (x, y) that the edges of each round aim at, in metres,
+            for D rounds, shape [D, R, 2].
         chance: uniform draws in [0, 1) that select the heuristic of each choice, shape
             [D, R].
         goal_edges: number of edges of a round that aim at the goal.
@@ -178,7 +180,7 @@ def search(
     tree = plant(loop, root, tracking)
     for points_m, chances in zip(sample_m, chance, strict=True):
         choice = choose(loop, tree, points_m, chances, goal_edges)
-        begin = stand(tree, choice.parent)
+        begin = states_at(tree, choice.parent)
         pose = begin.state[..., :3]
         reference, length_m = draw_references(loop, pose, choice.target_m)
         edges = drive(loop, begin, reference, length_m)
@@ -217,7 +219,7 @@ def choose(
     Args:
         loop: robots, controller and terrain.
         tree: tree of the previous rounds.
-        sample_m: points (x, y) to reach in metres, shape [R, 2].
+        sample_m: sampled points (x, y) to reach, in metres, shape [R, 2].
         chance: uniform draws in [0, 1) that select the heuristics, shape [R].
         goal_edges: maximum number of the R edges whose target is the goal instead of a
             point; only nodes without an edge to the goal are used.
@@ -237,8 +239,9 @@ def choose(
     spent_m = loop.follower.wanted_mps * tree.time_s
     spent_m = torch.where(closed, 0, spent_m)
 
-    # Line 2 of algorithm 1: the first node by the Dubins length (explore), or by the
-    # length of the path from the root (optimise).
+    # Line 2 of algorithm 1: the node with the shortest Dubins length to the point
+    # (explore), or with the shortest path from the root through the node to the point
+    # (optimise).
     explore_fraction = torch.where(is_reached, _EXPLORE[1], _EXPLORE[0])
     explore = chance < explore_fraction  # [B, R]
     pose = tree.at.state[:, None, :, :3]
@@ -257,9 +260,9 @@ def choose(
     promise_m = tree.to_goal_m + closed_m + torch.where(is_reached, spent_m, 0)
     promise_m = torch.where(tried, math.inf, promise_m)
     promise_m, promising = promise_m.topk(n_aimed, dim=1, largest=False)
-    others = (0, node.shape[1] - n_aimed)
-    aimed = pad(promise_m < math.inf, others)
-    promising = pad(promising, others)
+    padding = (0, node.shape[1] - n_aimed)
+    aimed = pad(promise_m < math.inf, padding)
+    promising = pad(promising, padding)
     return Choice(
         parent=torch.where(aimed, promising, node),
         target_m=torch.where(aimed[..., None], goal_m, target_m),
@@ -267,7 +270,7 @@ def choose(
     )
 
 
-def stand(tree: Tree, node: Tensor) -> LoopState:
+def states_at(tree: Tree, node: Tensor) -> LoopState:
     """Return the closed-loop states at nodes, int64, shape [B, R]."""
     return map_tensors(tree.at, lambda values: _take(values, node))
 
@@ -320,7 +323,7 @@ def best_route(loop: ClosedLoop, tree: Tree, rounds: int) -> Route:
     is_ok = is_reached & ~is_crossed
 
     parents = tree.parent.gather(1, nodes)
-    pose = stand(tree, parents).state[..., :3]
+    pose = states_at(tree, parents).state[..., :3]
     target_m = _take(tree.target_m, nodes)
     reference, _ = draw_references(loop, pose, target_m)
     path = _take(tree.drawn.flatten(2), nodes).unflatten(-1, (-1, 2))

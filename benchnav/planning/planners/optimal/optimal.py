@@ -247,8 +247,8 @@ class Optimal(Planner[OptimalState]):
         immobile = problem.immobile
         if immobile is None:
             raise ConfigError(
-                "Expected a world that immobilises robots for `hazard` of "
-                f"{self.name!r}, got a world without `immobile`."
+                f"Expected option `hazard` of planner {self.name!r} only in a world "
+                "that immobilises robots, got a world without `immobile`."
             )
         below = immobile.below
         distribution = problem.distribution

@@ -358,7 +358,9 @@ def test_each_map_shows_its_own_layer_under_what_is_driven_and_planned() -> None
     ]
     assert list(frozen.values())[2] == ["/map/field", "/map/closed", *OVERLAY]
     assert list(frozen.values())[3] == list(resampled.values())[2]
-    assert list(resampled)[-1] == "λ̂ given to the planner, free: λ̂ above 0.3"
+    assert (
+        list(resampled)[-1] == "λ̂ given to the planner; cells are free with λ̂ above 0.3"
+    )
 
 
 def test_the_blueprint_has_all_of_them() -> None:
@@ -389,7 +391,7 @@ def test_an_episode_is_told_with_its_outcome_and_the_threshold() -> None:
     for words in (
         "| outcome | **immobilised** |",
         "| time | 4.3 s of 90 s |",
-        "| free | mean λ above 0.1 |",
+        "| free cells | mean λ above 0.1 |",
         "| planner | MPPI |",
         "std 4",
     ):

@@ -21,7 +21,7 @@ from benchnav.planning.planners.cl_rrt.tree import (
     no_route,
     plant,
     search,
-    stand,
+    states_at,
 )
 from benchnav.planning.planners.dubins import dubins_length_to_point
 from benchnav.planning.planners.planner import PlanStatus
@@ -40,7 +40,7 @@ def extended(
     """The tree with an edge from each node to each target."""
     batch = len(loop.problem)
     node, target_m = torch.tensor([nodes] * batch), torch.tensor([targets] * batch)
-    begin = stand(tree, node)
+    begin = states_at(tree, node)
     reference, length_m = draw_references(loop, begin.state, target_m)
     choice = Choice(
         parent=node, target_m=target_m, aimed=torch.zeros_like(node, dtype=torch.bool)
@@ -150,7 +150,7 @@ def test_the_goals_share_goes_to_nodes_that_have_not_tried_it_the_nearest_first(
     assert first.aimed.tolist() == [[True, True, False, False, False]]
     torch.testing.assert_close(first.target_m[0, :2], loop.problem.goal_m.expand(2, 2))
     torch.testing.assert_close(first.target_m[0, 2:], sample_m[2:])
-    begin = stand(tree, first.parent)
+    begin = states_at(tree, first.parent)
     reference, length_m = draw_references(loop, begin.state, first.target_m)
     larger = add(loop, tree, first, drive(loop, begin, reference, length_m))
     again = choose(loop, larger, sample_m[:1].expand(9, 2), torch.zeros(9), 9)
