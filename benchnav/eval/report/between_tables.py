@@ -17,9 +17,9 @@ from benchnav.eval.stats.world_blocks import BLOCK_LABELS, SETTING_LABELS
 from benchnav.eval.words import (
     contender_names,
     differ,
+    display_name,
     joined,
     p_in_words,
-    reading_name,
     shared_words,
     success_interval_in_words,
     world_names,
@@ -120,7 +120,7 @@ def _blocks(rows: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
 def _block_columns(rows: pd.DataFrame) -> list[Column]:
     """Return columns with the labels of blocks that differ."""
     names = [name for name in BLOCK_LABELS if differ(rows[name])]
-    return [Column(name, cell_of(name, partial(reading_name, name))) for name in names]
+    return [Column(name, cell_of(name, partial(display_name, name))) for name in names]
 
 
 def _settings_table(compared: BetweenWorlds, unit: str) -> Table:
