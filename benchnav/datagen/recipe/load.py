@@ -77,7 +77,7 @@ def load_recipe(source: str | Path, overrides: Sequence[str] = ()) -> Recipe:
 
 @cache
 def shipped_recipe(recipe_id: str) -> Recipe:
-    """Return a shipped recipe by its id; a process reads each recipe once (50 ms)."""
+    """Return a shipped recipe by its id; a process reads each recipe once."""
     return load_recipe(recipe_id)
 
 

@@ -152,7 +152,7 @@ def load_presets(synthesis: Any) -> tuple[list[Any], dict[str, Any]]:
 
 @cache
 def _read_presets() -> Any:
-    """Return the content of `presets.yaml`, which a process reads once (20 ms)."""
+    """Return the content of `presets.yaml`, which a process reads once."""
     return yaml.safe_load(PRESETS.read_text())
 
 
