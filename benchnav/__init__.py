@@ -32,7 +32,7 @@ __getattr__, __dir__, __all__ = face(
     },
 )
 
-__version__ = "2.0.0"
+__version__ = "2.1.0.dev0"
 
 # The import of Gymnasium takes 0.05 s after that of NumPy, and does not import PyTorch.
 gymnasium.register(
