@@ -166,7 +166,8 @@ class EnvBatch:
                 rng.stream_key(0, "environment"),
                 self._noise_seed[members].tolist(),
             )
-            pose = heading_to(places.start_m, places.goal_m)
+            start_m = self._world.starts_m(places.start_m)
+            pose = heading_to(start_m, places.goal_m)
             initial_state = self._task.robot.initial_state(pose)
             start = new_simulation.init(initial_state)
         all_start = len(members) == len(chosen)

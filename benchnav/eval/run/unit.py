@@ -236,7 +236,7 @@ def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> UnitInputs:
     simulation = create_simulation(
         block.terrain, task, condition.world, block.endpoints, noise, unit.maps
     )
-    start_m = block.endpoints.start_m
+    start_m = condition.world.starts_m(block.endpoints.start_m)
     goal_m = block.endpoints.goal_m
     try:
         learner = _learner(condition, block)
@@ -361,8 +361,9 @@ def simulate(
                 planner = condition.planner.create()
         except (Exception, SystemExit) as error:
             planner = _FailedPlanner(error)
-        # The key depends on seed and split, not on the batch.
         draw = _draw(condition.split, unit.realisation)
+        if condition.world.start_shift_m:
+            draw += ("shifted start",)
         key = rng.stream_key(unit.seed, "planner", *draw)
         episodes = run_episodes(
             planner,

@@ -67,6 +67,9 @@ class World:
             goal are connected by cells around which no cell within this distance, in
             metres, immobilises a robot. None for the cells themselves. A suite takes
             the largest footprint of its robots.
+        start_shift_m: distance in metres by which starts move along x, while planners
+            draw other samples; None for neither. It measures how far episodes agree
+            with themselves, the ceiling of agreement between worlds.
         immobile: rule by which terrain immobilises a robot and ends its episode; None
             if terrain only slows robots.
         time_budget_s: time budget T in seconds, after which an episode fails; None to
@@ -84,6 +87,7 @@ class World:
     physics: Physics | None = None
     lag_s: float | None = None
     clearance_m: float | None = None
+    start_shift_m: float | None = None
     immobile: Immobile | None = None
     time_budget_s: float | None = 100.0
     time_budget_ratio: float | None = None
@@ -121,6 +125,11 @@ class World:
             expect(
                 0 < self.clearance_m < float("inf"),
                 f"`clearance_m` > 0 and finite, got {self.clearance_m}.",
+            )
+        if self.start_shift_m is not None:
+            expect(
+                0 < self.start_shift_m < float("inf"),
+                f"`start_shift_m` > 0 and finite, got {self.start_shift_m}.",
             )
         is_ratio = self.time_budget_s is None
         expect(
@@ -172,6 +181,12 @@ class World:
         if not is_rejecting or clearance_m <= (self.clearance_m or 0):
             return self
         return replace(self, clearance_m=clearance_m)
+
+    def starts_m(self, start_m: Tensor) -> Tensor:
+        """Return the starts (x, y) of episodes, given those of the maps, [B, 2]."""
+        if self.start_shift_m is None:
+            return start_m
+        return start_m + start_m.new_tensor([self.start_shift_m, 0.0])
 
     def budget_s(self, reference_time_s: Tensor, top_speed_mps: float) -> Tensor:
         """Return the time budget of each episode.

@@ -1,6 +1,7 @@
 """Suites of robots with a footprint, in several worlds."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -13,7 +14,7 @@ from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.run.check import check_suite
 from benchnav.eval.run.knowledge import KnowledgeTracker
 from benchnav.eval.run.runner import run_suite
-from benchnav.eval.run.unit import Settings, UnitInputs, build, read_block
+from benchnav.eval.run.unit import Settings, UnitInputs, build, read_block, simulate
 from benchnav.eval.stats.pairs import drawn_field
 from benchnav.planning.footprint import minimum_over_footprint
 from benchnav.planning.robots import SkidSteer
@@ -123,6 +124,40 @@ def test_accepted_draws_have_a_way_for_the_footprint(
     (narrow,) = conditions_of(point)
     fewer = inputs_of(narrow).simulation.attempts
     assert bool((inputs.simulation.attempts > fewer).any())
+
+
+def test_a_shifted_start_changes_start_and_samples_only(dataset_path: Path) -> None:
+    shifted = KINEMATIC | {"start_shift_m": 0.01}
+    suite = suite_of(
+        dataset_path,
+        robots=("unicycle",),
+        world=(KINEMATIC, shifted),
+        planners=("mppi",),
+    )
+    first, second = (
+        condition for condition in conditions_of(suite) if condition.risk.part == "mean"
+    )
+    assert "start_shift_m=0.01" in second.world_label
+    one, other = inputs_of(first), inputs_of(second)
+    moved = other.problem.start[:, :2] - one.problem.start[:, :2]
+    assert torch.allclose(moved, torch.tensor([0.01, 0.0]), atol=1e-6)
+    field = one.simulation.field
+    assert field is not None
+    assert torch.equal(other.simulation.field, field)
+    assert torch.equal(other.simulation.steps, one.simulation.steps)
+    keys: list[int] = []
+
+    def note(*arguments: Any, **options: object) -> None:
+        keys.append(arguments[3].initial_seed())
+        raise KeyboardInterrupt
+
+    for condition, inputs in ((first, one), (second, other)):
+        unit = Unit(condition=condition, seed=0, realisation=0, maps=(0, 1))
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("benchnav.eval.run.unit.run_episodes", note)
+            with pytest.raises(KeyboardInterrupt):
+                simulate(unit, inputs, Settings())
+    assert keys[0] != keys[1]
 
 
 def test_point_robots_alone_have_the_ids_of_before(dataset_path: Path) -> None:
