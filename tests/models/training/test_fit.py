@@ -293,7 +293,7 @@ def test_a_training_that_ends_before_it_was_measured_does_not_blame_the_learning
     dataset: TerrainDataset,
 ) -> None:
     options = FitOptions(device="cpu", trainer={**EXACT, "max_time": {"seconds": 0}})
-    with pytest.raises(ConfigError, match="before the first validation") as caught:
+    with pytest.raises(ConfigError, match="ended before the first one") as caught:
         fit_network(trainable(SMALL), dataset, 1, options)
     assert "learning_rate" not in str(caught.value)
 

@@ -426,7 +426,7 @@ def test_a_loss_that_is_no_number_ends_training_and_says_the_epoch(
         for words in ((), ("--resume",)):
             assert call("train", *command, *words) == 1
             assert (
-                f"Expected a finite {name}, got nan in epoch 2,"
+                f"Expected a finite {name}, got nan in epoch 2."
                 in capsys.readouterr().err
             )
             assert not Path(name).exists()
@@ -540,6 +540,6 @@ def test_maps_without_a_layer_that_the_model_was_trained_on_are_refused(
     model = module.CellModel(module.CellConfig(inputs=("rgb", "vegetation_m"))).build()
     with pytest.raises(
         ConfigError,
-        match=r"layers vegetation_m, .* got maps with rgb, elevation_m, slope_deg",
+        match=r"layers vegetation_m, got maps with rgb, elevation_m, slope_deg",
     ):
         model.predict(dataset.terrain("test/std").observe())
