@@ -19,7 +19,7 @@ def test_long_titles_meet_neither_each_other_nor_the_edge(across: int) -> None:
         canvas.draw()
         boxes = [panel.title.get_window_extent() for (panel,) in stacks]
     for index, box in enumerate(boxes):
-        assert 0 <= box.x0
+        assert box.x0 >= 0
         assert box.x1 <= figure.bbox.width
         for other in boxes[:index]:
             assert not box.overlaps(other)
