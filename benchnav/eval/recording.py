@@ -2,7 +2,7 @@
 
 Viewer files, videos and figures of episodes are created from recordings only; they need
 neither dataset nor prediction. Letters in shapes: N steps, H×W cells, S state and A
-action dimensions, P points.
+action dimensions, P points, W wheels or other contacts.
 """
 
 import json
@@ -124,6 +124,9 @@ class Recording(RecordedMap):
         layers: optional layers of the map, by name, each of shape [H, W].
         known: the robot's known maps, in order of steps; empty if the robot does not
             learn.
+        body: values of the robot's body by name, each of shape [N + 1, ...]; empty for
+            a point. Robots with a footprint have `contacts_m`, and rigid bodies all
+            values of `PhysicsSimulation.drawn`.
     """
 
     elevation_m: np.ndarray
@@ -142,6 +145,7 @@ class Recording(RecordedMap):
     plans: Sequence[DrawnPlan] = ()
     layers: Mapping[str, np.ndarray] = field(default_factory=dict)
     known: tuple[KnownMap, ...] = ()
+    body: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     _REMEDY: ClassVar[str] = (
         "Remove the file and its .rrd; `replay` creates both again."
@@ -167,6 +171,16 @@ class Recording(RecordedMap):
     def end_s(self) -> float:
         """Time of the end of the episode, in seconds."""
         return len(self.traversability) * self.dt_s
+
+    @property
+    def contacts_m(self) -> np.ndarray | None:
+        """Contacts (x, y) with the terrain, shape [N + 1, W, 2]; None for a point."""
+        return self.body.get("contacts_m")
+
+    @property
+    def ruts_m(self) -> np.ndarray | None:
+        """Depths of ruts in metres, shape [N + 1, W]; None without recorded ruts."""
+        return self.body.get("ruts_m")
 
     @property
     def immobilised_at(self) -> np.ndarray | None:
@@ -227,8 +241,9 @@ class Recording(RecordedMap):
         values = super()._stored()
         del values["plans"]
         values |= pack_known(values.pop("known"))
-        for name, layer in values.pop("layers").items():
-            values[f"layers:{name}"] = layer
+        for group in ("layers", "body"):
+            for name, array in values.pop(group).items():
+                values[f"{group}:{name}"] = array
         shown = self.plan.step
         plans = []
         for plan in self.own_plans:
@@ -238,6 +253,7 @@ class Recording(RecordedMap):
     @classmethod
     def _read(cls, values: dict[str, Any]) -> Self:
         layers = under("layers:", values)
+        body = under("body:", values)
         plans = under("plans:", values)
         known_maps = under("known:", values)
         scalars = {name: value for name, value in values.items() if ":" not in name}
@@ -245,6 +261,7 @@ class Recording(RecordedMap):
         return cls(
             **scalars,
             layers=layers,
+            body=body,
             plans=unpack_plans(plans),
             known=unpack_known(known_maps) if known_maps else (),
         )

@@ -82,15 +82,19 @@ def condition_name(labels: Mapping[str, Any], differing: Collection[str] = ()) -
 def episode_names(labels: Sequence[Mapping[str, str]]) -> list[str]:
     """Name episodes shown together by planner, risk setting and labels that differ.
 
+    Worlds have short names; see `world_names`.
+
     Args:
         labels: labels of each episode's condition.
     """
     differing = _differing(labels)
+    worlds = world_names([row["world"] for row in labels])
     extra = [name for name in ("robot", "objective") if name in differing]
     names = []
     for row in labels:
         further = [row[name] for name in extra]
-        names.append(joined([condition_name(row, differing), *further]))
+        short = {**row, "world": worlds[row["world"]]}
+        names.append(joined([condition_name(short, differing), *further]))
     return names
 
 

@@ -1,6 +1,6 @@
 """Drawing of driven paths on maps, with marks of start, goal, robot and outcome.
 
-Letters in shapes: N positions.
+Letters in shapes: N positions; W wheels or other contacts.
 """
 
 from collections.abc import Sequence
@@ -15,6 +15,7 @@ from matplotlib.path import Path as MarkerPath
 from matplotlib.transforms import Affine2D, ScaledTranslation
 from scipy.sparse.csgraph import connected_components
 
+from benchnav.viz.bodies import draw_body
 from benchnav.viz.maps import ROBOT
 
 
@@ -65,13 +66,18 @@ class Drive:
         goal_m: position (x, y) of the goal in metres, shape [2].
         outcome: outcome of the episode; empty before the end of the episode.
         heading_rad: heading of the robot in radians from +x towards +y; used only before
-            the end of the episode.
+            the end of the episode, or with contacts.
+        contacts_m: contacts (x, y) of the robot with the terrain in metres, shape
+            [W, 2]; None for a point, which is drawn as an arrowhead.
+        ruts_m: depth of each wheel's rut in metres, shape [W]; None if unknown.
     """
 
     track: np.ndarray
     goal_m: np.ndarray
     outcome: str = ""
     heading_rad: float = 0.0
+    contacts_m: np.ndarray | None = None
+    ruts_m: np.ndarray | None = None
 
 
 def draw_drive(
@@ -97,7 +103,12 @@ def draw_drive(
     mark(panel, "start", drive.track[0], scale)
     mark(panel, "goal", drive.goal_m, scale)
     end = drive.track[-1]
+    if drive.contacts_m is not None:
+        pose = np.append(end, drive.heading_rad)
+        draw_body(panel, pose, drive.contacts_m, drive.ruts_m)
     if not drive.outcome:
+        if drive.contacts_m is not None:
+            return
         mark(panel, "robot", end, scale, marker=robot_marker(drive.heading_rad))
         return
     drawn = mark(panel, end_mark(drive.outcome), end, scale, clip_on=False)

@@ -9,8 +9,10 @@ from matplotlib.axes import Axes
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.recording import Recording
 from benchnav.viz import drives, maps, plans
+from benchnav.viz.bodies import draw_body
 from benchnav.viz.style import bytes_of
 
+CLOSE_UP_M = 5.0  # edge length of a close-up
 # RGB colours of unobserved cells, observed cells, and cells with measured λ.
 _SEEN_COLOURS = np.array(
     [bytes_of(colour)[:3] for colour in (maps.UNSEEN, maps.SEEN, maps.SENSED)], np.uint8
@@ -113,12 +115,37 @@ def draw_plan(panel: Axes, recording: Recording, step: int) -> None:
         plans.draw_plan(panel, plan.lines)
 
 
+def draw_close_up(panel: Axes, recording: Recording, step: int) -> None:
+    """Draw a robot with a footprint in its size on the true map, with wheel tracks.
+
+    Args:
+        panel: axes to draw on; the robot is in its middle.
+        recording: recording of the episode, with contacts.
+        step: index of the step.
+    """
+    contacts_m = recording.contacts_m
+    assert contacts_m is not None
+    show_truth(panel, recording)
+    x, y = recording.track[step].astype(float)
+    half = CLOSE_UP_M / 2
+    panel.set(xlim=(x - half, x + half), ylim=(y - half, y + half))
+    for wheel_track in np.moveaxis(contacts_m[: step + 1], 1, 0):
+        panel.plot(*wheel_track.T, color="black", lw=0.5, label="_wheel track")
+    ruts_m = None if recording.ruts_m is None else recording.ruts_m[step]
+    pose = recording.states[step, :3]
+    draw_body(panel, pose, contacts_m[step], ruts_m, "_robot")
+
+
 def drive_at(recording: Recording, step: int) -> drives.Drive:
     """Return the path of a recording up to a step."""
     outcome = recording.about["outcome"] if has_ended(recording, step) else ""
+    contacts_m = recording.contacts_m
+    ruts_m = recording.ruts_m
     return drives.Drive(
         track=recording.track[: step + 1],
         goal_m=recording.goal_m,
         outcome=outcome,
         heading_rad=recording.states[step, 2],
+        contacts_m=None if contacts_m is None else contacts_m[step],
+        ruts_m=None if ruts_m is None else ruts_m[step],
     )

@@ -14,6 +14,7 @@ from benchnav.eval.figures.learning import Learning
 from benchnav.eval.figures.outcomes import Outcomes
 from benchnav.eval.figures.over import Over
 from benchnav.eval.figures.regret import Regret
+from benchnav.eval.figures.same_episode import SameEpisode
 from benchnav.eval.figures.success import Success
 from benchnav.eval.figures.trajectories import Trajectories
 from benchnav.eval.figures.waterfall import Waterfall
@@ -22,7 +23,7 @@ from benchnav.viz.figure import Figure, applicable
 SHIPPED: tuple[type[Figure], ...] = (
     *(Forest, Success, WorldAgreement, Waterfall, Regret, DrivenPaths, Over),
     *(Outcomes, Distributions),
-    *(Failures, Learning, KnowledgeMaps, Trajectories),
+    *(Failures, Learning, KnowledgeMaps, SameEpisode, Trajectories),
 )
 
 

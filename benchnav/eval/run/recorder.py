@@ -22,11 +22,11 @@ from benchnav.eval.run.rollout import Episodes, Observer
 from benchnav.planning.planners.planner import Plan
 from benchnav.planning.problem import Problem
 from benchnav.planning.world.outcome import Outcome
-from benchnav.planning.world.simulation import Simulation
+from benchnav.planning.world.simulation import Simulation, SimulationState
 
 
 class Recorder:
-    """Collector of the plans and known maps of some episodes of a unit.
+    """Collector of the plans, known maps and bodies of some episodes of a unit.
 
     Args:
         unit: unit whose episodes are recorded.
@@ -55,6 +55,7 @@ class Recorder:
         self._known: dict[int, list[KnownMap]] = {
             episode_index: [] for episode_index in self._plans
         }
+        self._bodies: list[dict[str, np.ndarray]] = []
 
     def store_plan(self, step: int, plan: Plan, planned: list[int]) -> None:
         """Store the plan of a step; thin its lines after the time that figures show.
@@ -80,6 +81,7 @@ class Recorder:
             plan=self.store_plan,
             plan_interval=drawing_interval(self.problem.dt_s),
             knowledge=self.store_knowledge,
+            state=self.store_bodies,
         )
 
     def store_knowledge(self, step: int, tracker: KnowledgeTracker) -> None:
@@ -95,6 +97,36 @@ class Recorder:
                 name: getattr(known_map, name).astype(np.float16) for name in NUMBERS
             }
             self._known[episode_index].append(replace(known_map, **halved))
+
+    def store_bodies(self, now: SimulationState) -> None:
+        """Store the values that the simulation offers to draw robots.
+
+        Args:
+            now: state of the simulation at the start, or after a step.
+        """
+        members = list(self._plans)
+        bodies = {}
+        for name, values in self.simulation.drawn(now).items():
+            bodies[name] = values[members].float().cpu().numpy()
+        self._bodies.append(bodies)
+
+    def _body(self, episode_index: int, states: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the values of an episode's robot at each step, by name.
+
+        If the simulation did not run, only contacts on level terrain are known.
+        """
+        if self._bodies:
+            member = list(self._plans).index(episode_index)
+            stored = self._bodies[: len(states)]
+            return {
+                name: np.stack([bodies[name][member] for bodies in stored])
+                for name in stored[0]
+            }
+        footprint = self.problem.robot.footprint
+        if footprint is None:
+            return {}
+        contacts_m = footprint.contacts(torch.as_tensor(states)).flatten(1, 2)
+        return {"contacts_m": contacts_m.float().numpy()}
 
     def recording(self, episodes: Episodes, episode_index: int) -> Recording:
         """Return the recording of an episode, by its index in the unit."""
@@ -171,6 +203,7 @@ class Recorder:
             plans=self._plans.get(episode_index, ()),
             layers=layers,
             known=tuple(known_maps),
+            body=self._body(episode_index, states),
         )
 
     def _identity(self, episode_index: int, outcome: str) -> dict[str, str]:

@@ -21,14 +21,9 @@ from benchnav.core.device import GPU_FAULTS, DeviceError, gpu_failed
 from benchnav.core.errors import BenchnavError, out_of_memory_error
 from benchnav.core.settings import fault
 from benchnav.eval.run.knowledge import KnowledgeTracker, Learning
+from benchnav.eval.run.planned_batch import PlannedBatch
 from benchnav.planning.objective import distance
-from benchnav.planning.planners.boundary import (
-    Answer,
-    act,
-    begin,
-    revise,
-    standing_actions,
-)
+from benchnav.planning.planners.boundary import begin
 from benchnav.planning.planners.planner import Plan, Planner, PlanStatus
 from benchnav.planning.problem import Problem
 from benchnav.planning.sensing.knowledge import KnowledgeError
@@ -36,7 +31,6 @@ from benchnav.planning.sensing.sensor import Step
 from benchnav.planning.world.outcome import Outcome, classify_standstill
 from benchnav.planning.world.simulation import Simulation, SimulationState, end
 
-_MAX_REMAINING = 0.75  # a batch is reduced if at most this fraction still runs
 _CHECK_INTERVAL = 8  # steps between two reads of the running episodes on a GPU
 
 
@@ -51,11 +45,14 @@ class Observer:
             the first step.
         knowledge: function that is called after an update and before the step is
             planned, with the index of the step and the knowledge.
+        state: function that is called with the state of the simulation at the start and
+            after each step.
     """
 
     plan: Callable[[int, Plan, list[int]], None] | None = None
     plan_interval: int = 1
     knowledge: Callable[[int, KnowledgeTracker], None] | None = None
+    state: Callable[[SimulationState], None] = lambda now: None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -280,6 +277,7 @@ def run_episodes(
         DeviceError: If the GPU failed.
     """
     now = simulation.init(problem.start)
+    observer.state(now)
     log = _Log(now, problem)
     observed = torch.full_like(now.state[:, 0], torch.nan)
     check_interval = 1 if observed.device.type == "cpu" else _CHECK_INTERVAL
@@ -288,7 +286,7 @@ def run_episodes(
     try:
         with log.clock.timed():
             plan_state = begin(planner, problem, generator)
-        batch = _Batch(planner, problem, plan_state)
+        batch = PlannedBatch(planner, problem, plan_state)
         for count in itertools.count():
             if stop(count):
                 break
@@ -329,6 +327,7 @@ def run_episodes(
             now = end(now, status == PlanStatus.FAILED, Outcome.PLANNER_FAILURE)
             now, observed, unhindered = _move(simulation, now, action)
             log.add(now, action, observed, unhindered)
+            observer.state(now)
     except (RobotError, DeviceError):
         raise
     except GPU_FAULTS as error:
@@ -350,87 +349,6 @@ def run_episodes(
         first or second for first, second in zip(episodes.errors, faults, strict=True)
     ]
     return replace(episodes, errors=tuple(errors))
-
-
-class _Batch:
-    """The planned episodes: at first all, later only those that still run.
-
-    Args:
-        planner: planner of all episodes.
-        problem: problem of all episodes.
-        plan_state: plan state that `begin` returned.
-
-    Attributes:
-        episode_indices: indices of the planned episodes among all, int64 on the CPU.
-    """
-
-    def __init__(
-        self, planner: Planner[Any], problem: Problem, plan_state: Any
-    ) -> None:
-        self.episode_indices = torch.arange(len(problem))
-        self._planner = planner
-        self._all = problem
-        self._part = problem
-        self._state = plan_state
-        self._index = self.episode_indices.to(problem.start.device)
-
-    def drop_ended(self, running: Tensor) -> Tensor | None:
-        """Remove ended episodes if at least a quarter has ended.
-
-        A planner that does not implement `select` keeps all episodes.
-
-        Args:
-            running: mask of running episodes, bool on the CPU, shape [B].
-
-        Returns:
-            Indices of the remaining episodes among those planned so far, int64; None if
-            no episode was removed.
-        """
-        remaining = running[self.episode_indices].nonzero()[:, 0]
-        if len(remaining) > _MAX_REMAINING * len(self.episode_indices):
-            return None
-        indices = remaining.to(self._index.device)
-        state = self._planner.select(self._state, indices)
-        if state is NotImplemented:
-            return None
-        self._state = state
-        self.episode_indices = self.episode_indices[remaining]
-        self._index = self.episode_indices.to(self._index.device)
-        self._part = self._part.select(indices)
-        return indices
-
-    def part_of(self, values: Tensor) -> Tensor:
-        """Select the planned episodes from the values of all episodes, [B, ...]."""
-        return values[self._index]
-
-    def revise(self, problem: Problem, generator: torch.Generator) -> None:
-        """Replan for a changed problem of the planned episodes."""
-        self._state = revise(self._planner, self._state, problem, generator)
-        self._part = problem
-
-    def act(self, step: Step) -> Answer:
-        """Return the planner's answer for the planned episodes."""
-        part_step = replace(
-            step,
-            state=step.state[self._index],
-            traversability=step.traversability[self._index],
-        )
-        answer = act(self._planner, part_step, self._state, self._part)
-        self._state = answer.plan_state
-        return answer
-
-    def spread(self, answer: Answer) -> tuple[Tensor, Tensor, Tensor]:
-        """Return actions, fault masks and statuses of all episodes, shape [B, ...].
-
-        Episodes that are no longer planned stand still, without a fault.
-        """
-        index = self._index
-        zeros = torch.zeros(len(self._all), dtype=torch.int64, device=index.device)
-        standing = standing_actions(self._all)
-        action = standing.index_copy(0, index, answer.action)
-        faulty = zeros.bool().index_copy(0, index, answer.faulty)
-        status = zeros.index_copy(0, index, answer.plan.status)
-        return action, faulty, status
 
 
 class RobotError(BenchnavError):

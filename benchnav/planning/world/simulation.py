@@ -217,6 +217,24 @@ class Simulation:
         """
         return [""] * len(now.state)
 
+    def drawn(self, now: SimulationState) -> dict[str, Tensor]:
+        """Return the values that recordings keep of each step, to draw robots.
+
+        Backends add values of their own.
+
+        Args:
+            now: current state; not modified.
+
+        Returns:
+            Values by name, floating-point, each of shape [B, ...]. For a robot with a
+            footprint, `contacts_m` has the positions (x, y) of its contacts in metres,
+            shape [B, 4, 2]; for a point, there are no values.
+        """
+        footprint = self.robot.footprint
+        if footprint is None:
+            return {}
+        return {"contacts_m": footprint.contacts(now.state).flatten(1, 2)}
+
     def exchange_(self, indices: Tensor, replacements: "Simulation") -> None:
         """Replace M episodes by those of another simulation, in place.
 

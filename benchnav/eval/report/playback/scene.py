@@ -246,30 +246,34 @@ def _log_robot(stage: Stage, driver: Driver) -> None:
     """Log the robot's position and heading at each step."""
     recording = driver.recording
     heading_rad = recording.states[:, 2]
-    times = _times(recording, len(heading_rad))
+    times = times_of(recording, len(heading_rad))
     components = (np.cos(heading_rad), np.sin(heading_rad), 0 * heading_rad)
     ahead = _HEADING_M * np.stack(components, axis=1)
     ahead_flat = ahead[:, :2] * (1, -1) / recording.resolution_m
     lifted = stage.lifted(recording.track)
     flat = stage.flat(recording.track)
+    # A dot would hide the wheels of a robot with a footprint.
+    dot_size = 1.0 if recording.contacts_m is None else 0.2
     for root, dots, arrows, positions, vectors, radius in (
         ("world", rr.Points3D, rr.Arrows3D, lifted, ahead, 0.3),
         ("map/overlay", rr.Points2D, rr.Arrows2D, flat, ahead_flat, 0.7),
     ):
         robot = driver.entity(root, "robot")
         moving = dots.columns(positions=positions)
-        dot = dots.from_fields(radii=[radius], colors=[driver.colour])
+        dot = dots.from_fields(radii=[dot_size * radius], colors=[driver.colour])
         stage.stream.send_columns(robot, [times], moving)
         stage.stream.log(robot, dot, static=True)
         heading = driver.entity(root, "heading")
         turning = arrows.columns(origins=positions, vectors=vectors)
-        arrow = arrows.from_fields(radii=[radius / 3], colors=[driver.colour])
+        arrow = arrows.from_fields(
+            radii=[dot_size * radius / 3], colors=[driver.colour]
+        )
         stage.stream.send_columns(heading, [times], turning)
         stage.stream.log(heading, arrow, static=True)
 
 
-def _times(recording: Recording, count: int) -> Any:
-    """Return the times of the first `count` steps of an episode."""
+def times_of(recording: Recording, count: int) -> Any:
+    """Return the column of the times of the first `count` steps of an episode."""
     return rr.TimeColumn(TIMELINE, duration=np.arange(count) * recording.dt_s)
 
 
@@ -281,7 +285,7 @@ def _log_series(stage: Stage, driver: Driver) -> None:
     recording = driver.recording
     positions = recording.track[:-1]
     n_steps = len(positions)
-    times = _times(recording, n_steps)
+    times = times_of(recording, n_steps)
     distance_m = np.linalg.norm(positions - recording.goal_m, axis=1)
     lines = {
         driver.entity("series/traversability", "observed"): recording.traversability,

@@ -1,7 +1,7 @@
 """Videos of one or several episodes on one map, synchronous in time, in 16:9.
 
 A frame shows the λ̂ of each planner with its plan, and the λ field. Episodes with the
-same λ field share one panel of it.
+same λ field share one panel of it. Below, a robot with a footprint has a close-up.
 """
 
 import textwrap
@@ -103,6 +103,7 @@ class Frames:
     Attributes:
         given: panel with the planner's λ̂, for each recording.
         truths: panel with λ, for each group of recordings with the same λ.
+        close_ups: panel with a close-up of the robot, by index of the recording.
         time: text with the time.
     """
 
@@ -118,8 +119,18 @@ class Frames:
         size_in = (width_in, SIZE[1] / _DPI)
         self._figure = Figure(figsize=size_in, dpi=_DPI, layout="constrained")
         self._canvas = FigureCanvasAgg(self._figure)
-        columns = _columns(count, extent_m[1] / extent_m[0])
-        panels = [panel for (panel,) in stack_panels(self._figure, count, columns)]
+        have_contacts = [recording.contacts_m is not None for recording in recordings]
+        layers = 2 if any(have_contacts) else 1
+        columns = _columns(count, layers * extent_m[1] / extent_m[0])
+        stacks = stack_panels(self._figure, count, columns, layers)
+        self.close_ups: dict[int, Axes] = {}
+        for index, stack in enumerate(stacks):
+            if index < len(recordings) and have_contacts[index]:
+                self.close_ups[index] = stack[1]
+                stack[1].axis("off")
+            elif layers > 1:
+                stack[1].remove()
+        panels = [stack[0] for stack in stacks]
         self.given = panels[: len(recordings)]
         self.truths = panels[len(recordings) :]
         names = episode_names([recording.about for recording in recordings])
@@ -209,6 +220,9 @@ class Frames:
             corner: dict[str, Any] = {"transform": panel.transAxes, "ha": "right"}
             words = _state_in_words(recording, step)
             panel.text(1, -0.02, words, va="top", size=TEXT, **corner)
+            if index in self.close_ups:
+                moment.draw_close_up(self.close_ups[index], recording, step)
+                moment.draw_plan(self.close_ups[index], recording, step)
         for panel, indices in zip(self.truths, self._groups, strict=True):
             for index in indices:
                 step = _step(self._recordings[index], time_s)

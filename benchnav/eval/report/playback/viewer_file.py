@@ -4,7 +4,8 @@ A file contains the terrain as a mesh, maps (colour, layers, true mean of λ, λ
 the λ̂ and the plans of each planner, each robot with heading, driven path and outcome,
 time series, and a blueprint that arranges these contents. For a robot that learns, it
 also contains the belief, the observed and measured cells and the sensors' footprint,
-all over time.
+all over time. A robot with a footprint has contacts, and a rigid body its wheels,
+chassis and ruts.
 """
 
 from collections.abc import Sequence
@@ -21,6 +22,7 @@ from benchnav.core.tables import Bold, Table, to_markdown
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.folder.checksums import matches_checksum, note_checksums
 from benchnav.eval.recording import Recording
+from benchnav.eval.report.playback.bodies import RUTS, log_body
 from benchnav.eval.report.playback.scene import (
     TIMELINE,
     Driver,
@@ -83,6 +85,7 @@ def write_rerun(recordings: Sequence[Recording], path: Path) -> None:
             log_terrain(Stage(stream=stream, recording=recordings[0]))
             for driver in drivers:
                 log_driver(stream, driver)
+                log_body(stream, driver)
             stream.flush()
         finally:
             stream.disconnect()
@@ -127,6 +130,9 @@ def arrange(drivers: Sequence[Driver]) -> Any:
         title = drivers[0].recording.title
         commands = rrb.TimeSeriesView(name="Commanded speeds", origin="/series/command")
         series.insert(1, commands)
+    if any(driver.recording.ruts_m is not None for driver in drivers):
+        ruts = rrb.TimeSeriesView(name="Depth of ruts [cm]", origin=f"/{RUTS}")
+        series.insert(1, ruts)
     terrain = rrb.Spatial3DView(name=title, origin="/world")
     description = rrb.TextDocumentView(name="About", origin="/about")
     below = rrb.Horizontal(*series, description)

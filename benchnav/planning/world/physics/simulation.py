@@ -147,6 +147,30 @@ class PhysicsSimulation(Simulation):
         outcome = torch.where(now.running, outcome, now.outcome)
         return replace(after, outcome=outcome), observed
 
+    def drawn(self, now: SimulationState) -> dict[str, Tensor]:
+        """Return poses of bodies and wheels, and ruts; see `Simulation`.
+
+        Returns:
+            `contacts_m`: positions (x, y) of the contacts in metres, shape [B, W, 2].
+            `position_m`: position (x, y, z) of the body's reference point, [B, 3].
+            `rotation`: quaternion (w, x, y, z) of the body, shape [B, 4].
+            `wheels_m`: centres (x, y, z) of the wheels in metres, shape [B, W, 3].
+            `wheel_radius_m`: radii of the wheels in metres, shape [B, W].
+            `ruts_m`: depth of each wheel's rut in metres, shape [B, W].
+        """
+        assert isinstance(now, PhysicsState)
+        pose = now.body[:, 1:8]  # after the time: position and quaternion of the root
+        wheels_m = torch.from_numpy(self._workspace.wheels(now.body.numpy()))
+        radius_m = torch.as_tensor(self._workspace.wheel_radius_m)
+        return {
+            "contacts_m": now.contacts_m.unflatten(1, (-1, 2)),
+            "position_m": pose[:, :3],
+            "rotation": pose[:, 3:],
+            "wheels_m": wheels_m,
+            "wheel_radius_m": radius_m.expand(len(pose), -1),
+            "ruts_m": now.ruts_m,
+        }
+
     def faults(self, now: SimulationState) -> list[str]:
         """Return a message for each episode whose physics failed; otherwise empty."""
         assert isinstance(now, PhysicsState)

@@ -211,6 +211,28 @@ class Workspace:
             )
         return state, memory, moved
 
+    def wheels(self, state: np.ndarray) -> np.ndarray:
+        """Return the centres (x, y, z) of the wheels, float64, shape [B, W, 3].
+
+        Args:
+            state: states of MuJoCo, float64, shape [B, state_size].
+        """
+        mujoco = import_mujoco()
+        geoms = self._arrays["wheel_geom"]
+        centres = np.empty((len(state), self.n_wheels, 3))
+        first, last = 1, 1 + self.model.nq  # the time is the first value of a state
+        with self.lock:
+            for index, values in enumerate(state):
+                self.data.qpos[:] = values[first:last]
+                mujoco.mj_kinematics(self.model, self.data)
+                centres[index] = self.data.geom_xpos[geoms]
+        return centres
+
+    @property
+    def wheel_radius_m(self) -> np.ndarray:
+        """Radii of the wheels in metres, float64, shape [W]."""
+        return self._arrays["wheel_radius"]
+
     def soil_forces(self, wheels: np.ndarray) -> np.ndarray:
         """Return the forces of the compiled law, shape [N, 2].
 
