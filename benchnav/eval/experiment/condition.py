@@ -21,6 +21,7 @@ from benchnav.core.short_repr import short_repr
 from benchnav.core.store import text_digest
 from benchnav.datagen.files.find import find_dataset
 from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.eval.experiment.clearance import largest_footprint_m, with_clearance
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.sweep import (
     check_count,
@@ -32,7 +33,7 @@ from benchnav.models.predictor import ModelPart, find_ground_statistics
 from benchnav.planning.free_space import Rules
 from benchnav.planning.planners.planner import INPUTS
 from benchnav.planning.problem import Task
-from benchnav.planning.world.world import World, read_world, split_label
+from benchnav.planning.world.world import World, read_world
 
 # Default parts of sensing and belief. Ids leave them out, so that conditions of runs
 # from before these parts existed keep their ids.
@@ -43,17 +44,8 @@ KNOWLEDGE: Mapping[str, Mapping[str, Any]] = {
 }
 PART_KINDS = ("model", "risk", "planner", "robot", "objective", *KNOWLEDGE)
 # Columns of `Condition.labels`, in the order of tables.
-LABELS = (
-    "data",
-    "scenario",
-    "world",
-    "robot",
-    "objective",
-    "model",
-    *KNOWLEDGE,
-    "planner",
-    "risk",
-)
+_TASK_LABELS = ("data", "scenario", "world", "robot", "objective")
+LABELS = (*_TASK_LABELS, "model", *KNOWLEDGE, "planner", "risk")
 NOT_USED = "–"
 ANY_RISK = Part(part="mean", label=NOT_USED, kind="risk")
 # Properties of a split that affect results in addition to its maps;
@@ -276,11 +268,15 @@ def conditions_of(
     """
     conditions: list[Condition] = []
     products = [list(_product(listed, scenarios_of)) for listed in suite.products]
-    clearance_m = _clearance_m(itertools.chain.from_iterable(products))
+    all_conditions = itertools.chain.from_iterable(products)
+    clearance_m = largest_footprint_m(condition.robot for condition in all_conditions)
     for product in products:
         ids: set[str] = set()
         for condition in product:
-            condition = _with_clearance(condition, clearance_m)
+            world, label = with_clearance(
+                condition.world, condition.world_label, condition.rules, clearance_m
+            )
+            condition = replace(condition, world=world, world_label=label)
             if condition.id in ids:
                 words = " ".join(label_words(condition.labels))
                 raise ConfigError(
@@ -291,30 +287,6 @@ def conditions_of(
     check_labels(conditions)
     by_id = {condition.id: condition for condition in conditions}
     return merge_alike(by_id.values())
-
-
-def _clearance_m(conditions: Iterable[Condition]) -> float:
-    """Return the radius in metres of the largest footprint; 0 for point robots."""
-    clearance_m = 0.0
-    robots = {id(condition.robot): condition.robot for condition in conditions}
-    for robot in robots.values():
-        footprint = robot.object.footprint
-        if footprint is not None:
-            clearance_m = max(clearance_m, footprint.radius_m)
-    return clearance_m
-
-
-def _with_clearance(condition: Condition, clearance_m: float) -> Condition:
-    """Return a condition whose draws of λ leave room for the run's largest footprint.
-
-    All conditions of a run then have the same fields, whatever their robot or world.
-    """
-    world = condition.world.with_clearance(clearance_m)
-    if world == condition.world:
-        return condition
-    name, changes = split_label(condition.world_label, condition.rules)
-    label = f"{name} clearance_m={clearance_m:.3g} {changes}".strip()
-    return replace(condition, world=world, world_label=label)
 
 
 def merge_alike(conditions: Iterable[Condition]) -> list[Condition]:
