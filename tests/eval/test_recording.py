@@ -311,3 +311,26 @@ def test_an_outline_goes_around_what_was_reached_line_by_line() -> None:
     (line,) = replace(known, outline=whole).outlines
     np.testing.assert_array_equal(line, whole)
     assert not replace(known, outline=np.empty((0, 2))).outlines
+
+
+def test_a_body_is_stored_and_recordings_without_one_stay_readable(
+    tmp_path: Path,
+) -> None:
+    recording = made.body_recording(23)
+    path = tmp_path / "a.npz"
+    recording.save(path)
+    loaded = Recording.load(path)
+    assert loaded.body.keys() == recording.body.keys()
+    for name, values in recording.body.items():
+        assert loaded.body[name].dtype == np.float32
+        np.testing.assert_array_equal(loaded.body[name], values)
+    assert loaded.layers == {}
+    # A file of an earlier version has no such names.
+    with np.load(path) as stored:
+        arrays = {name: stored[name] for name in stored if not name.startswith("body:")}
+    assert len(arrays) == len(np.load(path)) - len(recording.body)
+    np.savez_compressed(path, **arrays)
+    older = Recording.load(path)
+    assert older.body == {}
+    assert older.contacts_m is None
+    np.testing.assert_array_equal(older.states, recording.states)

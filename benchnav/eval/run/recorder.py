@@ -125,7 +125,7 @@ class Recorder:
         footprint = self.problem.robot.footprint
         if footprint is None:
             return {}
-        contacts_m = footprint.contacts(torch.as_tensor(states)).flatten(1, 2)
+        contacts_m = footprint.contacts(torch.tensor(states)).flatten(1, 2)
         return {"contacts_m": contacts_m.float().numpy()}
 
     def recording(self, episodes: Episodes, episode_index: int) -> Recording:

@@ -228,7 +228,8 @@ class Simulation:
         Returns:
             Values by name, floating-point, each of shape [B, ...]. For a robot with a
             footprint, `contacts_m` has the positions (x, y) of its contacts in metres,
-            shape [B, 4, 2]; for a point, there are no values.
+            in the order of `Footprint.contacts`, shape [B, 4, 2]; for a point, there
+            are no values.
         """
         footprint = self.robot.footprint
         if footprint is None:

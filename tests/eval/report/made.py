@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
+from scipy.spatial.transform import Rotation
 
 from benchnav.core.tables import Bold, Table
 from benchnav.eval.experiment.condition import LABELS
@@ -16,6 +17,7 @@ from benchnav.eval.recording import Recording
 from benchnav.eval.stats.best import against_best, privileged_models
 from benchnav.eval.stats.summary import summarise
 from benchnav.metrics import SHIPPED
+from benchnav.planning.robots import SkidSteer
 
 PAPER = {
     "world": {"noise": "resampled", "time_budget_s": 100.0},
@@ -255,3 +257,33 @@ def plan(step: int, state: np.ndarray) -> Any:
     )
     layers = {"path": ahead[None], "samples": spread, "reference": reference[None]}
     return drawn_plan(step, layers | {"tree": torch.empty(0, 0, 2)})
+
+
+def body_recording(
+    steps: int = 80, ruts: bool = True, rigid: bool = True, **changes: Any
+) -> Recording:
+    """An episode of a skid-steered robot: with `rigid`, of a body that tilts more and
+    more; with `ruts`, the ruts of its second and third wheel deepen to 5 and 2.5 cm.
+    """
+    taken = held_recording(steps, **changes)
+    states = torch.from_numpy(taken.states[:, :3])
+    contacts = SkidSteer().footprint.contacts(states).flatten(1, 2).numpy()
+    body = {"contacts_m": contacts}
+    if rigid:
+        tilt = np.linspace(0, 0.3, steps + 1)
+        angles = np.stack((states[:, 2].numpy(), tilt, 0.5 * tilt), axis=1)
+        rotation = Rotation.from_euler("ZYX", angles)
+        wheels = np.array([(a, b, 0) for a in (0.25, -0.25) for b in (0.25, -0.25)])
+        position = np.concatenate((states[:, :2], 1 + tilt[:, None]), axis=1)
+        placed = [position + rotation.apply(wheel) for wheel in wheels]
+        body |= {
+            "position_m": position,
+            "rotation": np.roll(rotation.as_quat(), 1, axis=1),
+            "wheels_m": np.stack(placed, axis=1),
+            "wheel_radius_m": np.full((steps + 1, 4), 0.165),
+        }
+    if ruts:
+        deepest = np.linspace(0, 0.05, steps + 1)[:, None]
+        body["ruts_m"] = deepest * np.array([0, 1, 0.5, 0])
+    body = {name: values.astype(np.float32) for name, values in body.items()}
+    return replace(taken, body=body)

@@ -150,6 +150,9 @@ class PhysicsSimulation(Simulation):
     def drawn(self, now: SimulationState) -> dict[str, Tensor]:
         """Return poses of bodies and wheels, and ruts; see `Simulation`.
 
+        Wheels have the order of the body's MJCF; in the shipped body: front left, front
+        right, rear left, rear right.
+
         Returns:
             `contacts_m`: positions (x, y) of the contacts in metres, shape [B, W, 2].
             `position_m`: position (x, y, z) of the body's reference point, [B, 3].
