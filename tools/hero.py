@@ -9,7 +9,7 @@ maps, it is the one whose driven paths are farthest apart.
 """
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -149,14 +149,40 @@ def draw_hero(pair: Pair) -> Figure:
     return figure
 
 
-def frames(pair: Pair) -> Iterator[Image.Image]:
-    """Yield frames of the video of both episodes, at `GIF_SIZE`."""
-    video = Frames(pair)
-    end_s = max(recording.end_s for recording in pair)
-    for time_s in [*np.arange(0, end_s, SPEED * TICK_MS / 1000), end_s]:
+def frames(
+    recordings: Sequence[Recording], until_s: float, tick_ms: int = TICK_MS
+) -> Iterator[Image.Image]:
+    """Yield frames of the video of episodes up to a time, and at the end."""
+    video = Frames(recordings)
+    end_s = max(recording.end_s for recording in recordings)
+    for time_s in [*np.arange(0, until_s, SPEED * tick_ms / 1000), end_s]:
+        # This filter draws no rings around the edges of cells.
         yield Image.fromarray(video.draw(float(time_s))).resize(
-            GIF_SIZE, Image.Resampling.LANCZOS
+            GIF_SIZE, Image.Resampling.HAMMING
         )
+
+
+def write_gif(
+    images: Sequence[Image.Image],
+    path: Path,
+    tick_ms: int = TICK_MS,
+) -> None:
+    """Write frames as a GIF with one palette.
+
+    Maximum coverage keeps colours of few pixels, such as those of the marks.
+    """
+    palette = images[len(images) // 2].quantize(256, method=Image.Quantize.MAXCOVERAGE)
+    first, *rest = (
+        image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images
+    )
+    first.save(
+        path,
+        save_all=True,
+        append_images=rest,
+        duration=[tick_ms] * len(rest) + [2500],
+        loop=0,
+        optimize=True,
+    )
 
 
 def main() -> None:
@@ -170,21 +196,8 @@ def main() -> None:
     pair = find_pair(arguments.run)
     print(f"map {pair[0].about['map']}")
     save(draw_hero(pair), arguments.out / "hero.png", "png", dpi=170)
-    # All frames have one palette. Maximum coverage keeps colours of few pixels, such as
-    # those of the marks.
-    images = list(frames(pair))
-    palette = images[len(images) // 2].quantize(256, method=Image.Quantize.MAXCOVERAGE)
-    first, *rest = (
-        image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images
-    )
-    first.save(
-        arguments.out / "hero.gif",
-        save_all=True,
-        append_images=rest,
-        duration=[TICK_MS] * len(rest) + [2500],
-        loop=0,
-        optimize=True,
-    )
+    end_s = max(recording.end_s for recording in pair)
+    write_gif(list(frames(pair, end_s)), arguments.out / "hero.gif")
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.patches import Polygon
 
-from benchnav.viz.maps import ROBOT, shades
+from benchnav.viz.maps import ROBOT, name_terrain, shades
 
 # Colours of wheels: white on the terrain, black in a rut from this depth on. With the
 # default entrapment, a rut of 3.6 cm holds a wheel.
@@ -67,7 +67,7 @@ def draw_body(
         panel: panel with axes in metres.
         pose: (x, y, θ) in metres and radians, shape [3].
         contacts_m: positions (x, y) of the contacts in metres, shape [W, 2].
-        ruts_m: depth of each wheel's rut in metres, shape [W]; None if there is none.
+        ruts_m: depth of each wheel's rut in metres, shape [W]; None if unknown.
         label: entry of the legend, to which an enlarged robot adds a word.
     """
     centre, size, axes = rectangle(pose, contacts_m)
@@ -87,11 +87,8 @@ def draw_body(
     tyre = size * _WHEEL * _UNIT
     wheels = [on_map(position + tyre) for position in local]
     colours: Any = WHEEL
-    wheel_label = "_wheels"
     if ruts_m is not None:
         colours = rut_colours(ruts_m) / 255
-        wheel_label = "wheel, darker in a deeper rut"
-    panel.add_collection(
-        PolyCollection(wheels, fc=colours, zorder=3.7, label=wheel_label, **_EDGE),
-        autolim=False,
-    )
+        name_terrain(panel, "wheel, darker in a deeper rut", fc="0.5", **_EDGE)
+    shapes = PolyCollection(wheels, fc=colours, zorder=3.7, label="_wheels", **_EDGE)
+    panel.add_collection(shapes, autolim=False)

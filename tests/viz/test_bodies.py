@@ -22,7 +22,7 @@ def panel(width_m: float) -> Axes:
 
 
 def drawn(axes: Axes) -> tuple[Polygon, PolyCollection]:
-    (body,) = axes.patches
+    body = axes.patches[0]
     (wheels,) = axes.collections
     assert isinstance(body, Polygon)
     assert isinstance(wheels, PolyCollection)

@@ -64,8 +64,8 @@ def same_episodes(
     """Choose recordings that differ only in their world, up to `MAX_PANELS`.
 
     Among such episodes of robots with a footprint, those with most different outcomes
-    are chosen, then those in most worlds, then the first. If there is none, the list is
-    empty.
+    are chosen, then those in most worlds, then the first. Without such an episode, the
+    list is empty.
 
     Args:
         recordings: all recordings.

@@ -35,8 +35,8 @@ def log_body(stream: Any, driver: Driver) -> None:
     colours = _wheel_colours(recording, contacts_m)
     flat = stage.flat(contacts_m)
     _log_marks(stage, driver, "map/overlay", flat, colours, times)
-    strips = rr.LineStrips2D.columns(strips=stage.flat(outlines))
-    look = rr.LineStrips2D.from_fields(radii=[_LINE_CELLS], colors=[driver.colour])
+    strips: Any = rr.LineStrips2D.columns(strips=stage.flat(outlines))
+    look: Any = rr.LineStrips2D.from_fields(radii=[_LINE_CELLS], colors=[driver.colour])
     _log_columns(stage, driver.entity("map/overlay", "footprint"), strips, look, times)
     if has_body:
         _log_rigid_body(stage, driver, colours, times)
