@@ -78,15 +78,26 @@ def panel_grid(
         width_in = ONE_COLUMN_IN if across == 1 else TWO_COLUMNS_IN
     n_rows = -(-len(titles) // across)
     letters = int(width_in / across / _LETTER_IN)
-    titles = [textwrap.fill(title, letters) for title in titles]
-    more_lines = max(title.count("\n") for title in titles)
+    lines = [_lines_of(title, letters) for title in titles]
+    n_given = [title.count("\n") + 1 for title in titles]
+    more_lines = max(
+        len(now) - given for now, given in zip(lines, n_given, strict=True)
+    )
     high_in += _LINE_IN * more_lines
     size = (width_in, high_in * n_rows + ends_in)
     figure = Figure(figsize=size, layout="constrained")
     stacks = stack_panels(figure, len(titles), across, layers, **shared)
-    for (panel, *_), title in zip(stacks, titles, strict=True):
-        panel.set_title(title, parse_math=False)
+    for (panel, *_), title_lines in zip(stacks, lines, strict=True):
+        panel.set_title("\n".join(title_lines), parse_math=False)
     return figure, stacks
+
+
+def _lines_of(title: str, letters: int) -> list[str]:
+    """Return the lines of a title, broken after at most a number of letters."""
+    lines: list[str] = []
+    for line in title.split("\n"):
+        lines += textwrap.wrap(line, letters) or [""]
+    return lines
 
 
 def draw_estimates(
