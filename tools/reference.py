@@ -178,7 +178,7 @@ def metrics_page() -> str:
         "A metric is one number for each episode: a column of `episodes.parquet`. "
         "Hypotheses and `compare --metric` "
         "take its name; the unit is that of differences and margins. "
-        "[A metric of your own](../../how-to/own-parts.md#metric) is a class in a "
+        "[A metric of your own](../../how-to/own-metric.md) is a class in a "
         "file."
     )
     return "\n".join(["# Metrics of episodes", "", introduction, "", *parts])
