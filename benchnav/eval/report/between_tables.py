@@ -86,9 +86,12 @@ def _robust_sentence(rows: pd.DataFrame) -> str:
             f"{least['name']} has the least worst regret: {_regret(least)} points."
         )
     if len(robust) == len(by_setting):
+        number = (
+            "the only setting" if len(robust) == 1 else f"all {len(robust)} settings"
+        )
         return (
             f"no setting is significantly worse than the best of a world, {level}; the "
-            f"robust set contains all {len(robust)} settings."
+            f"robust set contains {number}."
         )
     names = list(robust["name"])
     listed = "; ".join(names[:_MAX_NAMED])
