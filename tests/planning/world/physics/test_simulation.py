@@ -420,6 +420,17 @@ def test_a_robot_that_drives_off_a_ledge_rolls_over() -> None:
     assert driven.last.outcome.tolist() == [Outcome.ROLLOVER]
 
 
+def test_who_tips_over_at_the_goal_has_reached_it() -> None:
+    sim = simulation(uniform([0.9, 0.9]))
+    now = sim.init(pose_of(2))
+    body = now.body.clone()
+    body[:, 3] += 0.5  # height
+    body[:, 4:8] = torch.tensor([0.0, 1.0, 0.0, 0.0]).double()  # upside down
+    sim._goal_m = torch.stack((now.state[0, :2], now.state[1, :2] + 9))
+    after, _ = sim.step(replace(now, body=body), torch.zeros(2, 2))
+    assert after.outcome.tolist() == [Outcome.SUCCESS, Outcome.ROLLOVER]
+
+
 def test_physics_that_diverges_ends_the_episode_and_says_so() -> None:
     sim = simulation(uniform([0.9, 0.9]))
     now = sim.init(pose_of(2))
