@@ -88,6 +88,16 @@ def write_text(path: Path, text: str) -> None:
         partial.write_text(text)
 
 
+def write_texts(stem: Path, texts: Mapping[str, str]) -> list[Path]:
+    """Write texts, given by their suffixes, to files STEM + suffix; return the paths."""
+    paths = []
+    for suffix, text in texts.items():
+        path = stem.with_name(stem.name + suffix)
+        write_text(path, text)
+        paths.append(path)
+    return paths
+
+
 def resolve_link(path: Path) -> Path:
     """Return the path to which a link, or a path that ends in `.` or `..`, leads.
 

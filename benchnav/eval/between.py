@@ -9,7 +9,7 @@ import pandas as pd
 
 from benchnav.core.errors import ConfigError
 from benchnav.core.settings import check_known
-from benchnav.core.store import write_text
+from benchnav.core.store import write_texts
 from benchnav.core.tables import Table, to_latex, to_markdown, to_terminal
 from benchnav.eval.compare import merge_runs, read_conditions, select_conditions
 from benchnav.eval.experiment.metrics import further_quantities, quantities
@@ -63,12 +63,7 @@ class Between:
         for suffix, table in numbers.items():
             if not table.empty:
                 texts[suffix] = table.to_csv(index=False, float_format="%.6g")
-        paths = []
-        for suffix, text in texts.items():
-            target = path.with_name(path.name + suffix)
-            write_text(target, text)
-            paths.append(target)
-        return paths
+        return write_texts(path, texts)
 
     def __repr__(self) -> str:
         """Return one line with the numbers of settings and worlds."""

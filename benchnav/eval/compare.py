@@ -17,7 +17,7 @@ from benchnav.core.command import tell
 from benchnav.core.errors import ConfigError
 from benchnav.core.quantity import Quantity
 from benchnav.core.settings import check_known
-from benchnav.core.store import write_text
+from benchnav.core.store import write_texts
 from benchnav.core.tables import Table, to_latex, to_markdown
 from benchnav.eval.experiment.condition import LABELS, NOT_USED, label_words
 from benchnav.eval.experiment.metrics import further_quantities, quantities
@@ -160,12 +160,7 @@ def write_comparison(stem: Path, table: pd.DataFrame, shown: Table) -> list[Path
         ".md": to_markdown(shown),
         ".tex": to_latex([shown], _CAPTION, stem.name),
     }
-    paths = []
-    for suffix, text in texts.items():
-        path = stem.with_name(stem.name + suffix)
-        write_text(path, text)
-        paths.append(path)
-    return paths
+    return write_texts(stem, texts)
 
 
 def read_conditions(runs: Sequence[Run]) -> list[Compared]:

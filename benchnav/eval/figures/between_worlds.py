@@ -26,7 +26,7 @@ from benchnav.viz.style import (
 _PANEL_IN = 2.5  # height of a panel in inches
 _MAX_ACROSS = 3  # panels next to each other
 _LEGEND_LINE_IN = 0.16
-_MAX_PAIRS = 12  # maximum number of pairs of worlds of which all are shown
+_MAX_PAIRS = 12  # maximum number of pairs of worlds that are all shown
 _MAX_LETTERS = 22  # in a line of an axis label
 _MARGIN = 0.03  # distance from an interval to the frame, as a success rate
 

@@ -35,7 +35,9 @@ from benchnav.eval.run.combinations import LeftOut, find_left_out
 from benchnav.eval.run.unit import read_maps
 from benchnav.models.checkpoint import load_checkpoint
 from benchnav.models.predictor import class_mismatch
-from benchnav.planning.world.realisation import check_traversability, draw_frozen
+from benchnav.planning.world.physics.maps import check_physics_maps
+from benchnav.planning.world.realisation import check_traversability
+from benchnav.planning.world.tracks import create_simulation
 
 Say = Callable[[str], None]
 
@@ -281,23 +283,27 @@ def _check_world(condition: Condition, dataset: TerrainDataset, maps: int) -> li
     # Only imported maps have cells without λ.
     is_imported = any("source" in part for part in dataset.splits[split]["parts"])
     checked = chosen if is_imported else chosen[:1]
+    warnings: list[str] = []
     for start in checked[::BLOCK_MAPS]:
         block = read_maps(dataset, split, checked[start : start + BLOCK_MAPS])
         check_traversability(block.terrain, world)
-        if world.noise == "frozen" and start == 0:
+        if world.physics is not None:
+            warnings += check_physics_maps(block.terrain, world.physics, dataset.id)
+        if start == 0:
             first = torch.tensor([0])
             terrain = block.terrain.select(first)
             endpoints = block.endpoints.select(first)
-            draw_frozen(terrain, world, endpoints, key=0, maps=[0])
+            create_simulation(terrain, task, world, endpoints, 0, [0])
     centre_distance_m = np.linalg.norm(read["goal_m"] - read["start_m"], axis=1)
     distance_m = centre_distance_m - task.rules.goal_radius_m
     is_late = distance_m / top_speed_mps > budget_s.numpy()
     if not is_late.any():
-        return []
+        return warnings
     return [
+        *warnings,
         f"in {is_late.sum()} of {len(is_late)} maps of {condition.split}, a robot with "
         f"a top speed of {top_speed_mps:g} m/s cannot reach the goal within the time "
-        "budget T"
+        "budget T",
     ]
 
 

@@ -12,6 +12,7 @@ from benchnav.core.settings import call
 from benchnav.core.terrain import Grid, Observation
 from benchnav.eval.experiment.condition import Condition
 from benchnav.models.base import PrivilegedModel
+from benchnav.planning.free_space import INFLATIONS
 from benchnav.planning.planners.planner import check_steers
 from benchnav.planning.problem import Prediction, pose_problem
 from benchnav.planning.sensing.belief import CovarianceModel, Fields, Static
@@ -68,6 +69,13 @@ def _unsteered(condition: Condition) -> str:
 
 def _unsuited(condition: Condition) -> str:
     grid = condition.dataset.grid
+    is_point = condition.task.robot.footprint is None
+    if is_point and condition.rules.inflation != INFLATIONS[0]:
+        return (
+            "Expected a robot with a footprint for `task.inflation` "
+            f"{condition.rules.inflation!r}, got {condition.robot.label!r}, which is a "
+            "point."
+        )
     try:
         check_backend(condition.task, condition.world, grid)
     except ConfigError as error:

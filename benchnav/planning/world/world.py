@@ -60,7 +60,7 @@ class World:
             side scales that side, so that the sides slip apart; this needs a robot
             with a footprint. `physics`: rigid bodies on wheels that soil pulls.
         physics: soil, body, entrapment and sub-step of the backend `physics`; None for
-            the defaults. Other backends ignore it.
+            the defaults. Other backends have no such settings.
         lag_s: time constant of the wheel speeds in seconds, for `tracks`; None for
             wheels that follow the command at once.
         clearance_m: minimum clearance of an acceptable draw of frozen noise: start and
@@ -113,8 +113,14 @@ class World:
             f"`backend` {', '.join(map(repr, BACKENDS[:-1]))} or {BACKENDS[-1]!r}, got "
             f"{self.backend!r}.",
         )
-        if self.backend == "physics" and self.physics is None:
+        is_physics = self.backend == "physics"
+        if is_physics and self.physics is None:
             object.__setattr__(self, "physics", Physics())
+        expect(
+            is_physics or self.physics is None,
+            f"`backend` 'physics' with `physics`, got {self.backend!r}. Set `backend` to "
+            "'physics', or omit `physics`.",
+        )
         if self.lag_s is not None:
             expect(
                 0 < self.lag_s < float("inf") and self.backend == "tracks",
@@ -125,6 +131,11 @@ class World:
             expect(
                 0 < self.clearance_m < float("inf"),
                 f"`clearance_m` > 0 and finite, got {self.clearance_m}.",
+            )
+            expect(
+                self.noise == "frozen" and self.immobile is not None,
+                "`noise` 'frozen' and a rule `immobile` with `clearance_m`, since other "
+                f"draws are all accepted, got {self.noise!r} and {self.immobile}.",
             )
         if self.start_shift_m is not None:
             expect(
@@ -262,8 +273,6 @@ class World:
             unused.add("kernel")
         if self.backend == BACKENDS[0]:
             unused.add("backend")
-        if self.backend != "physics":
-            unused.add("physics")
         settings = {}
         for name, value in _plain(self).items():
             if value is not None and name not in unused:

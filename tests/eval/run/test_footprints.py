@@ -65,6 +65,17 @@ def test_a_point_is_left_out_where_sides_slip_apart(dataset_path: Path) -> None:
     assert len(checked.conditions) == 3
 
 
+def test_a_point_that_is_not_inflated_is_left_out(dataset_path: Path) -> None:
+    suite = suite_of(
+        dataset_path, world=(KINEMATIC,), task={"inflation": ["disc", "none"]}
+    )
+    checked = check_suite(suite, uses_workers=False)
+    (dropped,) = checked.dropped
+    assert dropped["robot"] == "unicycle"
+    assert "a robot with a footprint for `task.inflation` 'none'" in dropped["reason"]
+    assert len(checked.conditions) == 3
+
+
 def test_all_conditions_have_the_fields_of_the_largest_footprint(
     conditions: list[Condition],
 ) -> None:

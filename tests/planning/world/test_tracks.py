@@ -12,6 +12,7 @@ from benchnav.core.errors import ConfigError
 from benchnav.planning.free_space import Immobile
 from benchnav.planning.robots import DifferentialDrive, SkidSteer, Unicycle
 from benchnav.planning.world.outcome import Outcome
+from benchnav.planning.world.physics.settings import Physics
 from benchnav.planning.world.simulation import Simulation
 from benchnav.planning.world.tracks import TrackSimulation, create_simulation
 from benchnav.planning.world.world import World
@@ -208,6 +209,16 @@ def test_the_observed_rule_reads_the_contacts_and_the_rule_of_the_cell_the_middl
             now, _ = sim.step(now, torch.tensor([[0.1, 0.0]]))
         ends[by] = now.outcome.tolist() == [Outcome.IMMOBILISED]
     assert ends == {"cell": True, "observed": False}
+
+
+def test_settings_without_effect_are_refused() -> None:
+    with pytest.raises(ConfigError, match="`backend` 'physics' with `physics`, got"):
+        World.stakes(backend="tracks", physics=Physics())
+    with pytest.raises(ConfigError, match="`noise` 'frozen' and a rule `immobile`"):
+        World.paper(clearance_m=0.5)
+    with pytest.raises(ConfigError, match="`noise` 'frozen' and a rule `immobile`"):
+        World.stakes(clearance_m=0.5, immobile=None)
+    assert World.stakes(clearance_m=0.5).clearance_m == 0.5
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,7 @@ from benchnav.planning.problem import Task
 from benchnav.planning.world.backend import check_backend
 from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.physics.body import drive_of
+from benchnav.planning.world.physics.maps import check_heights
 from benchnav.planning.world.physics.settings import Physics, sub_steps
 from benchnav.planning.world.physics.workspace import (
     BROKEN,
@@ -100,7 +101,16 @@ class PhysicsSimulation(Simulation):
             f"{contact_radius_m:g} m from the robot's position. Increase "
             "`task.goal_radius_m`.",
         )
-        _check_maps(terrain, physics)
+        footprint = task.robot.footprint
+        assert footprint is not None
+        expect(
+            contact_radius_m <= 1.01 * footprint.radius_m,
+            "a body whose wheels are within the robot's footprint of "
+            f"{footprint.radius_m:.3g} m, which planners keep clear, got wheels "
+            f"{contact_radius_m:.3g} m from its position. Increase the robot's `track_m` "
+            "or `wheelbase_m`.",
+        )
+        check_heights(terrain, physics)
         super().__init__(terrain, task, world, places, noise_key, maps)
         self._noise_key = noise_key
         self._map_indices = torch.as_tensor([int(index) for index in maps])
@@ -329,25 +339,3 @@ class PhysicsSimulation(Simulation):
         achieved = (ground * wheels.sign()).sum(1) / total.clamp(min=1e-9)
         is_moving = wheels.abs().amax(1) >= MIN_WHEEL_SPEED_MPS
         return torch.where(is_moving, achieved.clamp(0, 1), met.double())
-
-
-def _check_maps(terrain: Terrain, physics: Physics) -> None:
-    """Check heights and resolution.
-
-    Raises:
-        ConfigError: If heights are missing, or cells are narrower than a wheel.
-    """
-    n_missing = int((~terrain.elevation_m.isfinite()).flatten(1).any(1).sum())
-    expect(
-        n_missing == 0,
-        "a height in each cell for `world.backend` 'physics', got missing heights on "
-        f"{n_missing} of {len(terrain)} maps. Fill them, or use another backend.",
-    )
-    width_m = physics.body.wheel_width_m
-    resolution_m = terrain.grid.resolution_m
-    expect(
-        resolution_m >= width_m,
-        f"cells at least as wide as a wheel, {width_m:g} m, for `world.backend` "
-        f"'physics', got cells of {resolution_m:g} m. Merge cells, or use another "
-        "backend.",
-    )

@@ -63,9 +63,14 @@ def test_a_steered_robot_has_its_rear_axle_at_its_position() -> None:
 def test_a_body_of_the_user_drives(tmp_path: Path) -> None:
     body = Body(mjcf=six_wheels(tmp_path / "rover.xml"))
     physics = Physics(entrapment=None, body=body)
-    driven = drive(simulation(uniform([0.3, 0.8]), physics), [0.0, 1.0], (0.8, 0.0))
+    robot = SkidSteer(track_m=0.5, wheelbase_m=0.7)
+    sim = simulation(uniform([0.3, 0.8]), physics, robot=robot)
+    driven = drive(sim, [0.0, 1.0], (0.8, 0.0))
     assert driven.along_mps.tolist() == pytest.approx([0.24, 0.64], abs=0.01)
     assert driven.last.contacts_m.shape == (2, 12)
+    # Planners would keep less clear than the wheels need.
+    with pytest.raises(ConfigError, match="wheels are within the robot's footprint"):
+        simulation(uniform([0.8]), physics)
 
 
 @pytest.mark.parametrize(

@@ -6,11 +6,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from benchnav.core.errors import ConfigError
 from benchnav.core.settings import read
 from benchnav.planning.robots import SkidSteer
 from benchnav.planning.world.physics.body import drive_of
+from benchnav.planning.world.physics.maps import check_physics_maps
 from benchnav.planning.world.physics.settings import Entrapment, Physics
 from benchnav.planning.world.physics.soil import (
     Calibrated,
@@ -25,6 +27,7 @@ from benchnav.planning.world.physics.soil import (
 )
 from benchnav.planning.world.physics.workspace import Workspace
 from benchnav.planning.world.world import World, read_world
+from tests import factories
 
 
 def workspace(soil: Soil) -> Workspace:
@@ -222,10 +225,23 @@ def test_a_world_stores_its_physics_only_for_that_backend() -> None:
     )
     assert read_world(world.spec)[0] == world
     assert world.to_dict()["physics"]["soil"] == plain_soil(Janosi(wheel="smooth"))
-    plain_world = replace(world, backend="tracks")
-    assert plain_world.to_dict() == replace(plain_world, physics=None).to_dict()
+    with pytest.raises(ConfigError, match="`backend` 'physics' with `physics`"):
+        replace(world, backend="tracks")
+    tracks = replace(world, backend="tracks", physics=None)
+    assert "physics" not in tracks.to_dict()
     # All constants are part of the ids of the backend, though none is set.
     assert World.stakes(backend="physics").to_dict()["physics"] == Physics().to_dict()
+
+
+def test_a_dataset_without_slope_laws_is_named() -> None:
+    terrain = factories.terrain(torch.full((1, 8, 8), 0.5))
+    assert terrain.slope_law is None
+    (warning,) = check_physics_maps(terrain, Physics(), "plains")
+    assert warning.startswith("maps of plains have no slope laws of classes")
+    for soil in (Isotropic(), Calibrated(is_directional=False), Janosi()):
+        assert check_physics_maps(terrain, Physics(soil=soil), "plains") == []
+    with_laws = replace(terrain, slope_law=lambda slopes_deg: slopes_deg)
+    assert check_physics_maps(with_laws, Physics(), "plains") == []
 
 
 def test_a_world_names_the_setting_that_is_wrong() -> None:
